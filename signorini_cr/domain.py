@@ -1,0 +1,344 @@
+r"""Domains: a mesh and the parts of its boundary.
+
+The boundary of Ω consists of Γ0 (Dirichlet), Γ1 (contact) and, beyond the paper, Γg (Neumann).
+A `Domain` comes from a `Polygon`, from a gmsh file or from a mesh and facet tags of the user's own.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import basix.ufl
+import numpy as np
+import numpy.typing as npt
+
+from dolfinx.graph import adjacencylist
+from dolfinx.io.utils import distribute_entity_data
+from dolfinx.mesh import (
+    Mesh,
+    MeshTags,
+    create_mesh,
+    exterior_facet_indices,
+    meshtags,
+    meshtags_from_entities,
+)
+from mpi4py import MPI
+
+from signorini_cr import gmshmesh
+from signorini_cr.compat import unghosted_partitioner
+from signorini_cr.errors import InputError, on_root, raise_together
+
+CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
+PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """A mesh whose exterior facets are sorted into Γ0, Γ1 and Γg.
+
+    Attributes:
+        mesh: Affine simplices; no ghost cells when we make it.
+        tags: Facet tags; each exterior facet has one value of `PARTS`.
+    """
+
+    mesh: Mesh
+    tags: MeshTags
+
+    def facets(self, part: int) -> npt.NDArray[np.int32]:
+        """Local indices of the facets of one part that this rank owns.
+
+        Args:
+            part: CONTACT, DIRICHLET or NEUMANN.
+        """
+        found = self.tags.find(part)
+        return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
+
+    @classmethod
+    def from_tags(
+        cls,
+        mesh: Mesh,
+        facet_tags: MeshTags,
+        *,
+        contact: int | Sequence[int] = CONTACT,
+        dirichlet: int | Sequence[int] = DIRICHLET,
+        neumann: int | Sequence[int] | None = None,
+    ) -> Domain:
+        """Take a mesh and facet tags of the user's own; collective.
+
+        Exterior facets that are neither contact nor Dirichlet are Neumann facets, the weak
+        form's natural condition. Other values on interior facets are ignored.
+
+        Args:
+            mesh: Triangles or tetrahedra, straight-sided, any ghost mode.
+            facet_tags: Values on facets.
+            contact: The value or values that stand for Γ1.
+            dirichlet: The value or values that stand for Γ0.
+            neumann: The value or values that stand for Γg; named so that they can be checked.
+        """
+        fdim = mesh.topology.dim - 1
+        wanted = {
+            part: np.unique(np.atleast_1d(np.asarray(values, dtype=np.int32)))
+            for part, values in (
+                (CONTACT, contact),
+                (DIRICHLET, dirichlet),
+                (NEUMANN, [] if neumann is None else neumann),
+            )
+        }
+        for a, b in itertools.combinations(wanted, 2):
+            if len(both := np.intersect1d(wanted[a], wanted[b])):
+                raise InputError(
+                    f"the facet value {both[0]} stands for {_name(a)} and for {_name(b)}: "
+                    "a value can stand for one part only"
+                )
+        raise_together(mesh.comm, _unfit(mesh, facet_tags))
+        exterior = _exterior(mesh)
+        values = np.full(_count(mesh, fdim), NEUMANN, dtype=np.int32)
+        inside = np.ones(len(values), dtype=bool)
+        inside[exterior] = False
+        complaint = None
+        owned = mesh.topology.index_map(fdim).size_local
+        for part, numbers in wanted.items():
+            chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]
+            chosen = chosen[chosen < owned]
+            values[chosen] = part
+            if np.any(inside[chosen]):
+                complaint = (
+                    f"{np.count_nonzero(inside[chosen])} facets tagged {_name(part)} lie inside "
+                    "the domain: only exterior facets can be tagged"
+                )
+        raise_together(mesh.comm, complaint)
+        domain = cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
+        for part in (CONTACT, DIRICHLET):
+            if mesh.comm.allreduce(len(domain.facets(part))) == 0:
+                there = set().union(*mesh.comm.allgather(set(facet_tags.values.tolist())))
+                raise InputError(
+                    f"no exterior facet is tagged {_name(part)} (value {_list(wanted[part])}): "
+                    f"the values there are {_list(sorted(there))}"
+                )
+        return domain
+
+
+def _name(part: int) -> str:
+    return next(name for name, value in PARTS.items() if value == part)
+
+
+def _list(items: Iterable[object]) -> str:
+    return ", ".join(str(item) for item in items) or "none"
+
+
+def _count(mesh: Mesh, dim: int) -> int:
+    index_map = mesh.topology.index_map(dim)
+    return index_map.size_local + index_map.num_ghosts
+
+
+def _exterior(mesh: Mesh) -> npt.NDArray[np.int32]:
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    mesh.topology.create_connectivity(tdim, tdim - 1)
+    return exterior_facet_indices(mesh.topology)
+
+
+def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
+    """What keeps a user's mesh and tags from being used, if anything."""
+    tdim = mesh.topology.dim
+    kind = mesh.topology.cell_type.name
+    if kind not in ("triangle", "tetrahedron"):
+        return f"the mesh consists of {kind} cells: triangles or tetrahedra are needed"
+    if facet_tags.dim != tdim - 1:
+        return f"the tags have dimension {facet_tags.dim}: facets have dimension {tdim - 1}"
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon:
+    """A polygonal domain, holes allowed, with a boundary part for every edge.
+
+    Attributes:
+        vertices: Shape (n, 2), in either orientation.
+        boundary: Part of edge i, which runs from vertex i to vertex i + 1: a key of `PARTS`.
+        holes: Polygons inside this one, apart from each other.
+    """
+
+    vertices: npt.NDArray[np.float64]
+    boundary: tuple[str, ...]
+    holes: tuple[Polygon, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Take lists as well as arrays and check everything that can be checked at once."""
+        object.__setattr__(self, "vertices", _coordinates(self.vertices))
+        object.__setattr__(self, "boundary", tuple(self.boundary))
+        object.__setattr__(self, "holes", tuple(self.holes))
+        _check_labels(self.boundary, len(self.vertices))
+        _check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
+        if any(hole.holes for hole in self.holes):
+            raise InputError("a hole has holes of its own: describe what lies in them separately")
+
+    def check_parts(self) -> None:
+        """Insist on a Dirichlet and a contact part (a hole alone needs neither)."""
+        labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
+        for part in ("contact", "dirichlet"):
+            if part not in labels:
+                raise InputError(
+                    f"no edge is labelled {part!r}: the boundary needs a contact part and a "
+                    f"dirichlet part, found {_list(sorted(labels))}"
+                )
+
+    def mesh(self, size: float, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
+        """Triangulate with facets of about the length `size`; collective.
+
+        Every vertex becomes a mesh vertex; an edge is cut into equal facets no longer than
+        `size`. The same polygon and size give the same mesh.
+
+        Args:
+            size: Facet length wanted.
+            comm: The ranks that share the mesh.
+        """
+        if not (np.isfinite(size) and size > 0):
+            raise InputError(f"size is {size}: a positive number is needed")
+        self.check_parts()
+        loops = [self.vertices, *(hole.vertices for hole in self.holes)]
+        names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
+        labels = np.array([PARTS[name] for name in names], dtype=np.int32)
+        return _distribute(comm, gmshmesh.triangulate, loops, labels, float(size))
+
+
+def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
+    """Read a gmsh file (2.2 or 4.1, ASCII or binary) with named physical curves; collective.
+
+    The physical curves named dirichlet, contact and neumann (in any case) are Γ0, Γ1 and Γg.
+    Exterior facets in none of them are Neumann facets, the weak form's natural condition.
+
+    Args:
+        path: A planar mesh of straight-sided triangles.
+        comm: The ranks that share the mesh.
+    """
+    return _distribute(comm, gmshmesh.read, Path(path), PARTS)
+
+
+def _distribute(comm: MPI.Comm, make: object, *args: object) -> Domain:
+    """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
+    raw = None
+
+    def on_rank_0() -> None:
+        nonlocal raw
+        raw = make(*args)  # kept there: what on_root returns goes to every rank
+
+    on_root(comm, on_rank_0)
+    if raw is None:
+        none = np.empty(0, dtype=np.int64)
+        raw = gmshmesh.Triangulation(
+            np.empty((0, 2)), none.reshape(0, 3), none.reshape(0, 2), none.astype(np.int32)
+        )
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
+    mesh = create_mesh(
+        comm, cells=raw.triangles, x=raw.points, e=element, partitioner=unghosted_partitioner()
+    )
+    exterior = _exterior(mesh)
+    ends, labels = distribute_entity_data(mesh, 1, raw.facets, raw.labels)
+    mesh.topology.create_connectivity(1, 0)
+    found = meshtags_from_entities(mesh, 1, adjacencylist(ends), labels)
+    values = np.full(_count(mesh, 1), NEUMANN, dtype=np.int32)
+    values[found.indices] = found.values
+    return Domain(mesh, meshtags(mesh, 1, exterior, values[exterior]))
+
+
+def _coordinates(vertices: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    try:
+        points = np.array(vertices, dtype=np.float64)
+    except (TypeError, ValueError):
+        points = np.empty(0)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise InputError("vertices are not a list of [x, y] pairs of numbers")
+    if len(points) < 3:
+        raise InputError(f"{len(points)} vertices: a polygon has at least 3")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(f"vertex {bad[0]} is {_point(points[bad[0]])}: not a finite point")
+    points.flags.writeable = False
+    return points
+
+
+def _point(x: npt.NDArray[np.float64]) -> str:
+    return f"({x[0]:g}, {x[1]:g})"
+
+
+def _check_labels(labels: Sequence[str], edges: int) -> None:
+    if len(labels) != edges:
+        raise InputError(
+            f"{len(labels)} boundary labels for {edges} edges: one for each edge is needed"
+        )
+    for i, label in enumerate(labels):
+        if label not in PARTS:
+            raise InputError(f"edge {i} is labelled {label!r}: allowed are {_list(PARTS)}")
+
+
+def _check_loops(loops: Sequence[npt.NDArray[np.float64]]) -> None:
+    """Insist on simple loops, apart from each other, the first around all the others.
+
+    Edges touch if they come closer than 1e-12 of the polygon's extent.
+
+    Args:
+        loops: Vertices of the polygon and of each hole, shapes (n, 2).
+    """
+    a = np.concatenate(loops)
+    sizes = np.array([len(loop) for loop in loops])
+    starts = np.repeat(np.cumsum(sizes) - sizes, sizes)
+    local = np.arange(len(a)) - starts
+    ring = np.repeat(np.arange(len(loops)), sizes)
+    after = starts + (local + 1) % np.repeat(sizes, sizes)
+    b = a[after]
+    near = 1e-12 * np.ptp(loops[0], axis=0).max()
+
+    def vertex(i: int) -> str:
+        return f"vertex {local[i]}{_where(ring[i])} at {_point(a[i])}"
+
+    def edge(i: int) -> str:
+        return f"edge {local[i]}{_where(ring[i])}"
+
+    for i in range(len(a)):  # the polygon's own vertices: few
+        same = np.flatnonzero(np.abs(a[i + 1 :] - a[i]).max(axis=1) <= near)
+        if len(same):
+            raise InputError(f"{vertex(i)} is the same point as {vertex(i + 1 + same[0])}")
+    direction = b - a
+    length2 = (direction**2).sum(axis=1)
+    for i in range(len(a)):
+        t = np.clip(((a[i] - a) * direction).sum(axis=1) / length2, 0, 1)
+        gap = np.linalg.norm(a + t[:, None] * direction - a[i], axis=1)
+        gap[(np.arange(len(a)) == i) | (after == i)] = np.inf
+        if gap.min() <= near:
+            raise InputError(f"{vertex(i)} lies on {edge(int(gap.argmin()))}")
+        crossing = (_side(a[i], b[i], a) * _side(a[i], b[i], b) < 0) & (
+            _side(a, b, a[i]) * _side(a, b, b[i]) < 0
+        )
+        if crossing.any():
+            raise InputError(f"{edge(i)} crosses {edge(int(crossing.argmax()))}")
+    for k in range(1, len(loops)):
+        if not _inside(loops[k][0], loops[0]):
+            raise InputError(f"hole {k - 1} lies outside the polygon")
+        for j in range(1, len(loops)):
+            if j != k and _inside(loops[k][0], loops[j]):
+                raise InputError(f"hole {k - 1} lies inside hole {j - 1}")
+
+
+def _where(ring: int) -> str:
+    return f" of hole {ring - 1}" if ring else ""
+
+
+def _side(
+    a: npt.NDArray[np.float64], b: npt.NDArray[np.float64], x: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Sign of the area of the triangles a, b, x."""
+    u, v = b - a, x - a
+    return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+
+
+def _inside(x: npt.NDArray[np.float64], loop: npt.NDArray[np.float64]) -> bool:
+    """Whether a point, not on the loop, lies inside: a ray to the right crosses it oddly often."""
+    a, b = loop, np.roll(loop, -1, axis=0)
+    spans = (a[:, 1] > x[1]) != (b[:, 1] > x[1])
+    a, b = a[spans], b[spans]
+    hit = a[:, 0] + (x[1] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    return bool(np.count_nonzero(hit > x[0]) % 2)

@@ -1,0 +1,74 @@
+"""The two errors a user meets, and how ranks come to agree on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from mpi4py import MPI
+
+T = TypeVar("T")
+
+
+class InputError(ValueError):
+    """A mistake in what the user wrote: it says what was found and what is allowed."""
+
+
+class NotConverged(RuntimeError):
+    """The solver stopped short of a solution.
+
+    Attributes:
+        level: The mesh of the sequence it happened on, counted from 0, if known.
+        reason: What stopped it, in words.
+    """
+
+    def __init__(self, reason: str, level: int | None = None) -> None:
+        """Keep `reason` and `level` for whoever catches the error."""
+        where = "" if level is None else f"level {level}: "
+        super().__init__(where + reason)
+        self.reason = reason
+        self.level = level
+
+
+def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:
+    """Call `function(*args)` on rank 0 alone and give all ranks its result.
+
+    What it raises is raised on every rank, so that no rank is left waiting.
+
+    Args:
+        comm: The ranks that take part; all must call.
+        function: Returns something that can be pickled.
+        *args: Handed over to `function`.
+    """
+    result: T | None = None
+    error: Exception | None = None
+    if comm.rank == 0:
+        try:
+            result = function(*args)
+        except Exception as caught:
+            error = caught
+    # An exception need not survive pickling: send its kind and its words
+    sent = None if error is None else (isinstance(error, InputError), _words(error))
+    verdict, result = comm.bcast((sent, result), root=0)
+    if verdict is not None:
+        if error is not None:
+            raise error
+        is_input, words = verdict
+        raise InputError(words) if is_input else RuntimeError(f"rank 0 failed: {words}")
+    return result
+
+
+def raise_together(comm: MPI.Comm, complaint: str | None) -> None:
+    """Raise InputError on all ranks if any rank has a complaint (the lowest rank's is shown).
+
+    Args:
+        comm: The ranks that take part; all must call.
+        complaint: This rank's message, or None if it has nothing to say.
+    """
+    first = comm.allreduce(comm.size if complaint is None else comm.rank, op=MPI.MIN)
+    if first < comm.size:
+        raise InputError(comm.bcast(complaint, root=first))
+
+
+def _words(error: Exception) -> str:
+    return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
