@@ -1,0 +1,56 @@
+"""The Signorini problem with the Crouzeix-Raviart element, on DOLFINx.
+
+    import signorini_cr as scr
+
+    domain = scr.Domain.from_tags(mesh, facet_tags, contact=1, dirichlet=2)
+    solution = scr.solve(scr.Problem(f=1.0, obstacle=lambda x: 0.1 * x[0]), domain)
+    print(solution.contact.force)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .domain import Domain, Polygon, read_gmsh
+    from .errors import InputError, NotConverged
+    from .levels import Solution, solve, solve_levels
+    from .problem import Problem
+
+__version__ = "0.1.0"
+
+# Loaded when first used: `signorini-cr --help` must not wait for DOLFINx
+_ROOMS = {
+    "Domain": "domain",
+    "Polygon": "domain",
+    "read_gmsh": "domain",
+    "InputError": "errors",
+    "NotConverged": "errors",
+    "Solution": "levels",
+    "solve": "levels",
+    "solve_levels": "levels",
+    "Problem": "problem",
+}
+__all__ = [  # noqa: RUF022, in the order in which one meets them
+    "Domain",
+    "Polygon",
+    "read_gmsh",
+    "Problem",
+    "solve",
+    "solve_levels",
+    "Solution",
+    "InputError",
+    "NotConverged",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        return getattr(import_module(f".{_ROOMS[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,282 @@
+"""What happens on Γ1: active facets, pressure, transition points, and the KKT conditions.
+
+All figures come from the solution: the residual r = A u_h − b gives on a contact facet F the
+pressure λ_F = r_F / |F|, the piecewise constant ∂ₙu_h that the scheme knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.la import InsertMode
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from .domain import CONTACT, Domain
+from .space import closure_dofs, facet_entities, facet_measures, vertex_values
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Kkt:
+    """How well u_h satisfies the discrete conditions on Γ1.
+
+    Attributes:
+        min_gap: Smallest u_h − α at a contact dof; 0 or above when feasible.
+        min_pressure: Smallest λ_h at a contact dof; 0 or above, up to the solver's tolerance.
+        complementarity: Σ |λ_h (u_h − α)| over the contact dofs, weighted by their facets' measure.
+        residual: Norm of what is left of the equations, relative to the load.
+    """
+
+    min_gap: float
+    min_pressure: float
+    complementarity: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact facets of this rank, and figures over all ranks.
+
+    Attributes:
+        facets: Local indices of the contact facets this rank owns, shape (n,).
+        vertices: Their vertices' coordinates, shape (n, d, 3).
+        measure: Their length, shape (n,).
+        obstacle: Bound on the facet, the mean of α for CR, shape (n,).
+        u: u_h at the facet's midpoint, shape (n,).
+        pressure: λ_h, shape (n,); for P1 the mean of the pressures at the vertices.
+        active: Whether the facet is in contact, shape (n,).
+        gap_at_vertices: u_h − α at the facet's vertices, shape (n, d); negative in places even for
+            a feasible CR function, which respects the bound at midpoints only.
+        force: Σ r over Γ1, the total contact force (per unit depth).
+        length: Total length of the active facets.
+        number: Number of contact facets.
+        number_active: Number of active ones.
+        transitions: Points where contact begins or ends, shape (m, 3), on all ranks.
+        kkt: The KKT figures.
+    """
+
+    comm: MPI.Comm
+    facets: npt.NDArray[np.int32]
+    vertices: FloatArray
+    measure: FloatArray
+    obstacle: FloatArray
+    u: FloatArray
+    pressure: FloatArray
+    active: npt.NDArray[np.bool_]
+    gap_at_vertices: FloatArray
+    force: float
+    length: float
+    number: int
+    number_active: int
+    transitions: FloatArray
+    kkt: Kkt
+    _table: dict[str, npt.NDArray] | None
+
+    @property
+    def midpoints(self) -> FloatArray:
+        """Midpoints of the facets, shape (n, 3)."""
+        return self.vertices.mean(axis=1)
+
+    def table(self) -> dict[str, npt.NDArray] | None:
+        """All contact facets in order along the boundary, on rank 0; None on the others.
+
+        Columns: part (connected piece of Γ1, from 0), arc_length (of the facet's midpoint, from
+        the part's beginning, Ω to the left), x, y, length, obstacle, u, pressure, active.
+        """
+        return self._table
+
+
+def contact_facts(
+    domain: Domain,
+    u: fem.Function,
+    residual: fem.Function,
+    diagonal: FloatArray,
+    lower: FloatArray,
+    obstacle_at_vertices: FloatArray,
+    load: float,
+) -> Contact:
+    """Read the state of Γ1 off a solution.
+
+    Args:
+        domain: Mesh and boundary parts.
+        u: u_h, ghosts up to date.
+        residual: r = A u_h − b, ghosts up to date.
+        diagonal: Diagonal of A, owned dofs.
+        lower: Bound of each dof, `PETSc.NINFINITY` where there is none, ghosts included.
+        obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
+        load: What the residual is measured against.
+    """
+    V = u.function_space
+    mesh, facets = domain.mesh, domain.facets(CONTACT)
+    comm, owned = mesh.comm, V.dofmap.index_map.size_local
+    vertices, measure = facet_measures(mesh, facets)
+    dofs = closure_dofs(V, facets)
+
+    def shared(values: FloatArray) -> FloatArray:
+        """Spread the owned values to the ghosts."""
+        field = fem.Function(V)
+        field.x.array[:owned] = values
+        field.x.scatter_forward()
+        return field.x.array
+
+    weight = fem.Function(V)
+    np.add.at(weight.x.array, dofs, (measure / dofs.shape[1])[:, None])
+    weight.x.scatter_reverse(InsertMode.add)
+    bounded = lower[:owned] > PETSc.NINFINITY
+    gap = np.where(bounded, u.x.array[:owned] - np.where(bounded, lower[:owned], 0.0), 0.0)
+    force = np.where(bounded, residual.x.array[:owned], 0.0)
+    pressure = np.where(bounded, force / np.where(bounded, weight.x.array[:owned], 1.0), 0.0)
+    # The primal-dual criterion: it tells gap from pressure also where both are nearly zero
+    active = bounded & (force > diagonal * gap)
+    # What is left of the equations: all of r off Γ1, min(r, a_ii gap) on it
+    left = np.where(bounded, np.minimum(force, diagonal * gap), residual.x.array[:owned])
+    on_facets = shared(pressure)[dofs].mean(axis=1)
+    is_active = (shared(active | ~bounded)[dofs] > 0.5).all(axis=1) & (
+        shared(active)[dofs] > 0.5
+    ).any(axis=1)
+
+    local = _cells_values(u, facets)
+    total = _Totals(comm)
+    kkt = Kkt(
+        min_gap=total.min(gap[bounded]),
+        min_pressure=total.min(pressure[bounded]),
+        complementarity=total.sum(np.abs(force * gap)),
+        residual=float(np.sqrt(total.sum(left**2))) / (load or 1.0),
+    )
+    fields = {
+        "vertices": vertices,
+        "measure": measure,
+        "obstacle": obstacle_at_vertices.mean(axis=1) if dofs.shape[1] > 1 else lower[dofs[:, 0]],
+        "u": local.mean(axis=1),
+        "pressure": on_facets,
+        "active": is_active,
+        "gap_at_vertices": local - obstacle_at_vertices,
+    }
+    table, transitions = _along_boundary(mesh, facets, fields)
+    return Contact(
+        comm=comm,
+        facets=facets,
+        **fields,
+        force=total.sum(force),
+        length=total.sum(measure[is_active]),
+        number=int(total.sum(np.ones(len(facets)))),
+        number_active=int(total.sum(is_active)),
+        transitions=transitions,
+        kkt=kkt,
+        _table=table,
+    )
+
+
+class _Totals:
+    """Reductions over all ranks of arrays that may be empty on some."""
+
+    def __init__(self, comm: MPI.Comm):
+        self.comm = comm
+
+    def sum(self, values: npt.NDArray) -> float:
+        return float(self.comm.allreduce(float(np.sum(values))))
+
+    def min(self, values: npt.NDArray) -> float:
+        return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), op=MPI.MIN))
+
+
+def _cells_values(u: fem.Function, facets: npt.NDArray[np.int32]) -> FloatArray:
+    """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
+    mesh = u.function_space.mesh
+    cells, local = facet_entities(mesh, facets).T
+    corners = np.array(basix.topology(mesh.basix_cell())[-2])
+    return np.take_along_axis(vertex_values(u, cells), corners[local], axis=1)
+
+
+def _along_boundary(
+    mesh: Mesh, facets: npt.NDArray[np.int32], fields: dict[str, npt.NDArray]
+) -> tuple[dict[str, npt.NDArray] | None, FloatArray]:
+    """Sort the contact facets along the boundary and find the transition points.
+
+    Returns:
+        The table on rank 0 (None elsewhere), and the transition points on all ranks.
+    """
+    columns = dict(fields) | {"reverse": _clockwise(mesh, facets, fields["vertices"])}
+    gathered = mesh.comm.gather(columns, root=0)
+    table, transitions = None, np.zeros((0, 3))
+    if gathered is not None:
+        rows = {name: np.concatenate([part[name] for part in gathered]) for name in columns}
+        table, transitions = _ordered(rows)
+    return table, mesh.comm.bcast(transitions, root=0)
+
+
+def _clockwise(mesh: Mesh, facets: npt.NDArray[np.int32], vertices: FloatArray) -> npt.NDArray:
+    """Whether Ω lies to the right when a facet is walked from its first vertex to its second."""
+    cells, local = facet_entities(mesh, facets).T
+    apex = mesh.geometry.x[mesh.geometry.dofmap[cells, local]]
+    along, inward = vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]
+    return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
+
+
+def _ordered(rows: dict[str, npt.NDArray]) -> tuple[dict[str, npt.NDArray], FloatArray]:
+    """Put facets in the order in which the boundary passes through them, Ω to the left."""
+    flip = rows["reverse"]
+    ends, gaps = rows["vertices"], rows["gap_at_vertices"]
+    ends = np.where(flip[:, None, None], ends[:, ::-1], ends)
+    gaps = np.where(flip[:, None], gaps[:, ::-1], gaps)
+    number = len(ends)
+    midpoints = ends.mean(axis=1)
+    # The same order whatever the ranks held: by coordinates first
+    start = np.lexsort(midpoints.T[::-1])
+    rank = np.empty(number, dtype=np.int64)
+    rank[start] = np.arange(number)
+    _, vertex = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
+    tail, head = vertex.reshape(-1, 2).T
+    arriving = np.full(vertex.max(initial=-1) + 1, -1)
+    arriving[head] = np.arange(number)
+    before = np.where(arriving[tail] >= 0, arriving[tail], np.arange(number))
+    # Closed curves have no first facet: cut them at the one of lowest rank
+    lowest, jump = rank.copy(), before.copy()
+    for _ in range(max(number, 1).bit_length()):
+        lowest, jump = np.minimum(lowest, lowest[jump]), jump[jump]
+    closed = before[jump] != jump
+    cut = closed & (lowest == rank)
+    before = np.where(cut, np.arange(number), before)
+    # Distance to the first facet of the part, by doubling the stride
+    length = rows["measure"]
+    is_first = before == np.arange(number)
+    distance = np.where(is_first, 0.0, 0.5 * (length + length[before]))
+    steps, jump = (~is_first).astype(np.int64), before
+    for _ in range(max(number, 1).bit_length()):
+        distance, steps, jump = distance + distance[jump], steps + steps[jump], jump[jump]
+    order = np.lexsort([steps, rank[jump]])
+    part = np.unique(rank[jump], return_inverse=True)[1]
+    table = {
+        "part": part,
+        "arc_length": distance + 0.5 * length[jump],
+        "x": midpoints[:, 0],
+        "y": midpoints[:, 1],
+        "length": length,
+        "obstacle": rows["obstacle"],
+        "u": rows["u"],
+        "pressure": rows["pressure"],
+        "active": rows["active"],
+    }
+    # A transition lies between a facet and the one after it when just one of them is active;
+    # inside the free one if its trace changes sign there, at the vertex between them if not
+    later = np.flatnonzero(arriving[tail] >= 0)
+    earlier = arriving[tail[later]]
+    differ = rows["active"][later] != rows["active"][earlier]
+    later, earlier = later[differ], earlier[differ]
+    free_is_later = rows["active"][earlier]
+    free = np.where(free_is_later, later, earlier)
+    vertex_gap = gaps[free, np.where(free_is_later, 0, 1)]
+    middle_gap = rows["u"][free] - rows["obstacle"][free]
+    inside = (vertex_gap < 0) & (middle_gap > 0)
+    share = np.where(inside, middle_gap / np.where(inside, middle_gap - vertex_gap, 1.0), 1.0)
+    between = ends[later, 0]
+    points = midpoints[free] + share[:, None] * (between - midpoints[free])
+    along = np.lexsort([steps[free], part[free]])
+    return {name: column[order] for name, column in table.items()}, points[along]

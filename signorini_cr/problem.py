@@ -1,0 +1,248 @@
+"""The data of the Signorini problem and the forms of the paper.
+
+Find u with −∇·(κ∇u) = f in Ω, u = u_D on Γ0, κ∂ₙu = g on Γg and, on the contact boundary Γ1,
+
+    u ≥ α,  κ∂ₙu ≥ 0,  κ∂ₙu (u − α) = 0                                              (1.4)
+
+with κ = 1 unless a coefficient is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+
+from . import compat
+from .domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from .errors import InputError
+from .space import facet_entities, ufl_element
+
+Expr = ufl.core.expr.Expr
+Data = float | Expr | Callable[[Expr], Any]
+"""A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Data of the problem, free of any mesh.
+
+    Attributes:
+        f: Volume load, the right-hand side of (1.4).
+        g: Normal flux κ∂ₙu on Γg.
+        obstacle: α, the lower bound of u on Γ1.
+        dirichlet: u_D, the value of u on Γ0.
+        coefficient: κ, positive scalar (or symmetric positive definite tensor).
+        exact: The exact solution, where it is known. f, g and u_D that are None are then
+            derived from it by differentiation; without it, None means 0.
+        quadrature_degree: Polynomial degree up to which the loads are integrated exactly.
+        error_degree: The same for the errors against ``exact``.
+    """
+
+    f: Data | None = None
+    g: Data | None = None
+    obstacle: Data = 0.0
+    dirichlet: Data | None = None
+    coefficient: Data = 1.0
+    exact: Data | None = None
+    quadrature_degree: int = 4
+    error_degree: int = 6
+
+
+def as_expression(data: Data, x: Expr) -> Expr:
+    """Turn ``data`` into a UFL expression in the coordinates x."""
+    return ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+
+
+class Kernel:
+    """A form compiled once and bound to any number of meshes of the same cell type.
+
+    Args:
+        form: UFL form on the mesh that the data were written for.
+        mesh: That mesh.
+        stand_ins: The UFL coefficients in ``form`` that get their values when it is bound.
+    """
+
+    def __init__(self, form: ufl.Form, mesh: Mesh, stand_ins: Sequence[ufl.Coefficient] = ()):
+        self._compiled = fem.compile_form(mesh.comm, form)
+        self._mesh = mesh
+        self._stand_ins = tuple(stand_ins)
+        self._own = {
+            w: w
+            for w in ufl.algorithms.extract_coefficients(form)
+            if not any(w is s for s in self._stand_ins)
+        }
+        self._constants = {c: c for c in ufl.algorithms.analysis.extract_constants(form)}
+        self._types = {i.integral_type() for i in form.integrals()}
+
+    def on(
+        self,
+        domain: Domain,
+        spaces: Sequence[fem.FunctionSpace] = (),
+        functions: Sequence[fem.Function] = (),
+    ) -> fem.Form:
+        """Bind to a mesh, argument spaces and one function per stand-in.
+
+        Raises:
+            InputError: The data hold a Function on another mesh.
+        """
+        if self._own and domain.mesh is not self._mesh:
+            raise InputError(
+                "data given as a dolfinx Function live on one mesh only; give a function of x "
+                "to solve on a sequence of meshes"
+            )
+        subdomains: dict[Any, list[tuple[int, npt.NDArray[np.int32]]]] = {}
+        if "exterior_facet" in self._types:
+            subdomains[fem.IntegralType.exterior_facet] = [
+                (part, facet_entities(domain.mesh, domain.facets(part)).ravel())
+                for part in sorted((DIRICHLET, NEUMANN))
+            ]
+        return fem.create_form(
+            self._compiled,
+            list(spaces),
+            domain.mesh,
+            subdomains,
+            self._own | dict(zip(self._stand_ins, functions, strict=True)),
+            self._constants,
+        )
+
+
+class Forms:
+    """The forms of the paper for one problem and element, compiled when first asked for.
+
+    Args:
+        problem: The data.
+        mesh: A mesh of the kind they will be used on; data tied to a mesh must be tied to this one.
+        element: "CR" or "P1".
+    """
+
+    def __init__(self, problem: Problem, mesh: Mesh, element: str = "CR"):
+        self.problem, self.mesh, self.element = problem, mesh, element
+        cell = mesh.ufl_domain()
+        self.space = ufl.FunctionSpace(cell, ufl_element(mesh, element))
+        self.w = ufl.Coefficient(self.space)
+        self.dx, self.ds = ufl.Measure("dx", cell), ufl.Measure("ds", cell)
+        self.x = ufl.SpatialCoordinate(cell)
+        self.kappa = as_expression(problem.coefficient, self.x)
+        self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
+        flux = None if self.exact is None else self.kappa * ufl.grad(self.exact)
+        n = ufl.FacetNormal(cell)
+
+        def given(data: Data | None, derived: Callable[[], Expr]) -> Expr:
+            if data is not None:
+                return as_expression(data, self.x)
+            return ufl.as_ufl(0.0) if flux is None else derived()
+
+        self.f = given(problem.f, lambda: -ufl.div(flux))
+        self.g = given(problem.g, lambda: ufl.dot(flux, n))
+        self.dirichlet = given(problem.dirichlet, lambda: self.exact)
+        self.obstacle = as_expression(problem.obstacle, self.x)
+
+    @cached_property
+    def a(self) -> Kernel:
+        """a_h(u, v) = Σ_T ∫_T κ∇u·∇v, (1.9)."""
+        u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        return Kernel(ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx, self.mesh)
+
+    @cached_property
+    def chi(self) -> Kernel | None:
+        """χ(v) = ∫_Ω f v + ∫_Γg g v, (1.10); None where f and g vanish."""
+        v = ufl.TestFunction(self.space)
+        degree = {"quadrature_degree": self.problem.quadrature_degree}
+        terms = [
+            data * v * measure(metadata=degree)
+            for data, measure in ((self.f, self.dx), (self.g, self.ds(NEUMANN)))
+            if not _is_zero(data)
+        ]
+        return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
+
+    @cached_property
+    def a_of_w(self) -> Kernel:
+        """a_h(w, w)."""
+        return Kernel(
+            ufl.inner(self.kappa * ufl.grad(self.w), ufl.grad(self.w)) * self.dx,
+            self.mesh,
+            [self.w],
+        )
+
+    @cached_property
+    def squared_errors(self) -> tuple[Kernel, Kernel]:
+        """‖w − u‖_h², in the broken norm (1.6), and ‖w − u‖² in L2, u the exact solution."""
+        if self.exact is None:
+            raise InputError("errors need an exact solution")
+        degree = {"quadrature_degree": self.problem.error_degree}
+        difference = self.exact - self.w
+        forms = (
+            ufl.inner(ufl.grad(difference), ufl.grad(difference)) * self.dx(metadata=degree),
+            difference**2 * self.dx(metadata=degree),
+        )
+        h1, l2 = (Kernel(form, self.mesh, [self.w]) for form in forms)
+        return h1, l2
+
+    @cached_property
+    def boundary_data(self) -> Mapping[int, FacetData]:
+        """u_D and α as they are needed on Γ0 and Γ1, by the part's number."""
+        return {
+            DIRICHLET: FacetData(self.dirichlet, self),
+            CONTACT: FacetData(self.obstacle, self),
+        }
+
+
+class FacetData:
+    """Means over facets, or values at their vertices, of an expression.
+
+    The bounds and boundary values of CR are facet means, because Π_h K ⊂ K_h then holds for any
+    α and u_D; those of P1 are values at vertices.
+    """
+
+    def __init__(self, expression: Expr, forms: Forms):
+        cell = forms.mesh.basix_cell()
+        facet = basix.cell.subentity_types(cell)[-2][0]
+        corners = basix.geometry(facet)
+        points, weights = basix.make_quadrature(facet, forms.problem.quadrature_degree)
+        self._weights = weights / weights.sum()
+        self._size = len(corners)
+        self._constant = float(expression) if _is_constant(expression) else None
+        if self._constant is None:
+            self._expression = fem.Expression(
+                expression, np.vstack([corners, points]), forms.mesh.comm
+            )
+
+    def at(self, domain: Domain, facets: npt.NDArray[np.int32]) -> tuple[Any, Any]:
+        """Evaluate on facets.
+
+        Args:
+            domain: Where.
+            facets: Local indices, shape (n,).
+
+        Returns:
+            The mean over each facet, shape (n,), and the values at its vertices in the order of
+            the cell's closure, shape (n, d).
+        """
+        if self._constant is not None:
+            return (
+                np.full(len(facets), self._constant),
+                np.full((len(facets), self._size), self._constant),
+            )
+        values = compat.evaluate_on_facets(
+            self._expression, domain.mesh, facet_entities(domain.mesh, facets)
+        ).reshape(len(facets), -1)
+        return values[:, self._size :] @ self._weights, values[:, : self._size]
+
+
+def _is_zero(expression: Expr) -> bool:
+    return isinstance(expression, ufl.constantvalue.Zero) or (
+        _is_constant(expression) and float(expression) == 0.0
+    )
+
+
+def _is_constant(expression: Expr) -> bool:
+    return isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero)
