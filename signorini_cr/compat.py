@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem
-from dolfinx.mesh import GhostMode, Mesh, create_cell_partitioner
+from dolfinx import cpp
+from dolfinx.mesh import CellType, GhostMode, Mesh, create_cell_partitioner
+from mpi4py import MPI
+
+IntArray = npt.NDArray[np.int32]
 
 
 def unghosted_partitioner() -> Callable:
@@ -18,19 +22,70 @@ def unghosted_partitioner() -> Callable:
         return create_cell_partitioner(GhostMode.none, 2)
 
 
-def evaluate_on_facets(
-    expression: fem.Expression, mesh: Mesh, entities: npt.NDArray[np.int32]
-) -> npt.NDArray[np.float64]:
-    """Evaluate an Expression with points on the reference facet.
+def cell_nodes(mesh: Mesh) -> IntArray:
+    """Rows of `mesh.geometry.x` for every local cell, shape (cells, nodes)."""
+    geometry = mesh.geometry
+    return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+
+
+def coordinate_map(mesh: Mesh) -> Any:
+    """The map from the reference cell, as the C++ object."""
+    geometry = mesh.geometry
+    cmap = geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
+    return cmap._cpp_object
+
+
+def create_topology(
+    comm: MPI.Comm, cell_type: CellType, vertices: Any, cells: Any, corners: IntArray
+) -> Any:
+    """A C++ topology that knows its vertices and cells only.
 
     Args:
-        expression: Compiled on a mesh of the same kind.
-        mesh: Where to evaluate.
-        entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+        comm: The ranks that share the mesh.
+        cell_type: The one type of cell.
+        vertices: Index map of the vertices.
+        cells: Index map of the cells.
+        corners: Local vertices of every cell, shape (cells, d + 1).
     """
-    if not len(entities):
-        return np.zeros((0, len(expression.X()) * expression.value_size))
-    try:
-        return expression.eval(mesh, entities)
-    except (AssertionError, TypeError, ValueError, RuntimeError):  # 0.9 wants them flattened
-        return expression.eval(mesh, entities.ravel())
+    links = cpp.graph.AdjacencyList_int32(corners)
+    if not hasattr(cpp.mesh.Topology, "set_connectivity"):
+        # since 0.10 the constructor takes it all
+        number = np.arange(*cells.local_range, dtype=np.int64)
+        return cpp.mesh.Topology(cell_type, vertices, cells, links, number)
+    topology = cpp.mesh.Topology(comm, cell_type)
+    count = vertices.size_local + vertices.num_ghosts
+    none = cpp.graph.AdjacencyList_int32(np.empty(0, np.int32), np.zeros(count + 1, np.int32))
+    topology.set_index_map(0, vertices)
+    topology.set_connectivity(none, 0, 0)
+    topology.set_index_map(topology.dim, cells)
+    topology.set_connectivity(links, topology.dim, 0)
+    return topology
+
+
+def can_take_facets(comm: MPI.Comm) -> bool:
+    """Whether a topology can be given facets of our own numbering.
+
+    Later versions can't be given any. With several ranks it can't be told which facets lie
+    between ranks, so that it would take them for exterior ones.
+    """
+    return comm.size == 1 and hasattr(cpp.mesh.Topology, "set_connectivity")
+
+
+def set_facets(
+    topology: Any, facets: Any, of_cells: IntArray, ends: IntArray, cells: IntArray, start: IntArray
+) -> None:
+    """Give a topology its facets, where `can_take_facets` allows it.
+
+    Args:
+        topology: From `create_topology`.
+        facets: Index map of the facets.
+        of_cells: Facets of every cell, shape (cells, d + 1); facet i is opposite vertex i.
+        ends: Vertices of every facet, shape (facets, d), in the order of their indices.
+        cells: Cells of every facet, one facet after the other.
+        start: Where each facet's cells begin, shape (facets + 1,).
+    """
+    tdim = topology.dim
+    topology.set_index_map(tdim - 1, facets)
+    topology.set_connectivity(cpp.graph.AdjacencyList_int32(of_cells), tdim, tdim - 1)
+    topology.set_connectivity(cpp.graph.AdjacencyList_int32(ends), tdim - 1, 0)
+    topology.set_connectivity(cpp.graph.AdjacencyList_int32(cells, start), tdim - 1, tdim)

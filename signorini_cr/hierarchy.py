@@ -1,0 +1,252 @@
+"""Nested meshes: every triangle into four, or marked triangles only.
+
+Both keep the children of a cell on its rank and carry the boundary parts along.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import cpp
+from dolfinx.mesh import CellType, Mesh, meshtags
+
+from signorini_cr import compat
+from signorini_cr.domain import Domain
+from signorini_cr.errors import InputError
+
+IntArray = npt.NDArray[np.int32]
+
+
+def refine(domain: Domain) -> tuple[Domain, IntArray]:
+    """Cut every triangle into four similar ones; collective.
+
+    Child k < 3 of a cell keeps its vertex k, child 3 lies in the middle; m_i is the midpoint of
+    the facet opposite vertex i:
+
+                 v2
+                / 2 \\
+              m1 --- m0
+             / 0 \\ 3 / 1 \\
+           v0 --- m2 --- v1
+
+    Args:
+        domain: Straight-sided triangles; ghost cells are left behind.
+
+    Returns:
+        The fine domain, without ghost cells, and the parent of every fine cell, both local
+        indices: the children of cell c are 4 c, …, 4 c + 3.
+    """
+    coarse = domain.mesh
+    _check(coarse)
+    cells = coarse.topology.index_map(2).size_local
+    corners = _table(coarse.topology.connectivity(2, 0))[:cells]
+    facets = _table(coarse.topology.connectivity(2, 1))[:cells]
+    vertices = _number_vertices(coarse, corners, facets)
+
+    v, m = vertices.corner[corners], vertices.middle[facets]
+    children = np.empty((cells, 4, 3), dtype=np.int32)
+    for k in range(3):
+        children[:, k] = m[:, [_third(k, j) for j in range(3)]]
+        children[:, k, k] = v[:, k]
+    children[:, 3] = m
+    children = children.reshape(-1, 3)
+
+    cell_map = cpp.common.IndexMap(coarse.comm, 4 * cells)
+    topology = compat.create_topology(
+        coarse.comm, CellType.triangle, vertices.index_map, cell_map, children
+    )
+    if compat.can_take_facets(coarse.comm):
+        _give_facets(topology, coarse, corners, facets, m)
+    else:
+        topology.create_entities(1)
+        topology.create_connectivity(1, 2)
+    fine = _wrap(coarse, topology, vertices, children)
+    parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
+    return Domain(fine, _child_tags(domain, fine, facets)), parent
+
+
+def _third(k: int, j: int) -> int:
+    """The local number that is neither k nor j."""
+    return 3 - k - j if k != j else k
+
+
+def _table(links: Any) -> IntArray:
+    """A connectivity with equally many links for each entity, as a table."""
+    array: IntArray = links.array
+    return array.reshape(links.num_nodes, -1) if links.num_nodes else array.reshape(0, 3)
+
+
+def _check(mesh: Mesh) -> None:
+    if mesh.topology.cell_type != CellType.triangle:
+        raise NotImplementedError(
+            f"the mesh consists of {mesh.topology.cell_type.name} cells: only triangles can be "
+            "refined so far"
+        )
+    if compat.coordinate_map(mesh).degree != 1:
+        raise InputError("the mesh has curved cells: only straight-sided ones can be refined")
+    mesh.topology.create_connectivity(2, 1)
+    mesh.topology.create_connectivity(1, 2)
+    mesh.topology.create_connectivity(1, 0)
+
+
+class _Vertices(NamedTuple):
+    """The fine vertices: owned corners, owned midpoints, ghost corners, ghost midpoints.
+
+    Attributes:
+        index_map: Their distribution over the ranks.
+        corner: Number of every coarse vertex, shape (coarse vertices,).
+        middle: Number of every coarse facet's midpoint, shape (coarse facets,).
+        x: Their coordinates, shape (fine vertices, gdim).
+    """
+
+    index_map: Any
+    corner: IntArray
+    middle: IntArray
+    x: npt.NDArray[np.floating]
+
+
+def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertices:
+    """Number the fine vertices; each stays with the rank of its coarse vertex or facet.
+
+    A rank's fine vertices follow those of the ranks before it. With V and F the ranges of coarse
+    vertices and facets of its owner, the vertex with the global number n becomes n + F.start and
+    the midpoint of the facet n becomes n + V.stop: counts are all that ranks have to exchange.
+    """
+    vertex_map, facet_map = mesh.topology.index_map(0), mesh.topology.index_map(1)
+    owned_v, owned_f = vertex_map.size_local, facet_map.size_local
+    kept_v, kept_f = _ghosts_in(vertex_map, corners), _ghosts_in(facet_map, facets)
+    starts = np.array(
+        mesh.comm.allgather((facet_map.local_range[0], vertex_map.local_range[1])), dtype=np.int64
+    )
+    ghosts = np.concatenate(
+        [
+            vertex_map.ghosts[kept_v] + starts[vertex_map.owners[kept_v], 0],
+            facet_map.ghosts[kept_f] + starts[facet_map.owners[kept_f], 1],
+        ]
+    )
+    owners = np.concatenate([vertex_map.owners[kept_v], facet_map.owners[kept_f]])
+    owned = owned_v + owned_f
+    index_map = cpp.common.IndexMap(mesh.comm, owned, ghosts, owners)
+
+    corner = np.full(owned_v + vertex_map.num_ghosts, -1, dtype=np.int32)
+    corner[:owned_v] = np.arange(owned_v)
+    corner[owned_v + kept_v] = owned + np.arange(len(kept_v))
+    middle = np.full(owned_f + facet_map.num_ghosts, -1, dtype=np.int32)
+    middle[:owned_f] = owned_v + np.arange(owned_f)
+    middle[owned_f + kept_f] = owned + len(kept_v) + np.arange(len(kept_f))
+
+    node = np.zeros(len(corner), dtype=np.int32)
+    node[corners] = compat.cell_nodes(mesh)[: len(corners)]
+    x_coarse = mesh.geometry.x[:, : mesh.geometry.dim][node]
+    ends = mesh.topology.connectivity(1, 0).array.reshape(-1, 2)
+    x_middle = 0.5 * (x_coarse[ends[:, 0]] + x_coarse[ends[:, 1]])
+    x = np.concatenate(
+        [x_coarse[:owned_v], x_middle[:owned_f], x_coarse[owned_v + kept_v], x_middle[owned_f + kept_f]]
+    )
+    return _Vertices(index_map, corner, middle, x)
+
+
+def _ghosts_in(index_map: Any, entities: IntArray) -> IntArray:
+    """Which of the ghost entities belong to cells of this rank: all, unless it has ghost cells."""
+    seen = np.zeros(index_map.num_ghosts, dtype=bool)
+    seen[entities[entities >= index_map.size_local] - index_map.size_local] = True
+    return np.flatnonzero(seen).astype(np.int32)
+
+
+def _give_facets(
+    topology: Any, coarse: Mesh, corners: IntArray, facets: IntArray, m: IntArray
+) -> None:
+    """Hand over the fine facets: the halves 2 f and 2 f + 1 of facet f, then three in each cell.
+
+    Half 1 is the one at the end with the larger index; the facet opposite vertex k of child k is
+    number 2 F + 3 c + k and also belongs to the child in the middle.
+
+    Args:
+        topology: The fine topology.
+        coarse: The coarse mesh.
+        corners: Coarse vertices of the coarse cells, shape (cells, 3).
+        facets: Coarse facets of the coarse cells, shape (cells, 3).
+        m: Fine vertices in the middle of these, shape (cells, 3).
+    """
+    cells = len(corners)
+    count = coarse.topology.index_map(1).size_local
+    c = np.arange(cells, dtype=np.int32)
+    around = coarse.topology.connectivity(1, 2)
+    start, first = around.offsets, around.array[around.offsets[:-1]]
+    number = np.diff(start)
+
+    of_cells = np.empty((cells, 4, 3), dtype=np.int32)
+    of_cells[:, 3] = 2 * count + 3 * c[:, None] + np.arange(3, dtype=np.int32)
+    halves = np.empty(2 * len(around.array), dtype=np.int32)
+    for j in range(3):
+        f = facets[:, j]
+        links = 2 * start[f] + (first[f] != c)  # where the first half lists this cell's child
+        for k in (j + 1) % 3, (j + 2) % 3:
+            half = (corners[:, k] > corners[:, _third(j, k)]).astype(np.int32)
+            of_cells[:, k, j] = 2 * f + half
+            halves[links + half * number[f]] = 4 * c + k
+        of_cells[:, j, j] = of_cells[:, 3, j]
+
+    ends = np.empty((2 * count + 3 * cells, 2), dtype=np.int32)
+    old = coarse.topology.connectivity(1, 0).array.reshape(-1, 2)
+    vertices = coarse.topology.index_map(0).size_local
+    np.minimum(old[:, 0], old[:, 1], out=ends[0 : 2 * count : 2, 0])
+    np.maximum(old[:, 0], old[:, 1], out=ends[1 : 2 * count : 2, 0])
+    ends[: 2 * count, 1] = np.repeat(np.arange(vertices, vertices + count, dtype=np.int32), 2)
+    inner = ends[2 * count :].reshape(cells, 3, 2)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        np.minimum(m[:, i], m[:, j], out=inner[:, k, 0])
+        np.maximum(m[:, i], m[:, j], out=inner[:, k, 1])
+
+    pairs = np.empty((cells, 3, 2), dtype=np.int32)
+    pairs[:, :, 0] = 4 * c[:, None] + np.arange(3, dtype=np.int32)
+    pairs[:, :, 1] = 4 * c[:, None] + 3
+    offsets = np.empty(len(ends) + 1, dtype=np.int32)
+    offsets[0 : 2 * count + 1 : 2] = 2 * start
+    offsets[1 : 2 * count : 2] = 2 * start[:-1] + number
+    offsets[2 * count :] = len(halves) + 2 * np.arange(3 * cells + 1, dtype=np.int32)
+    compat.set_facets(
+        topology,
+        cpp.common.IndexMap(coarse.comm, len(ends)),
+        of_cells.reshape(-1, 3),
+        ends,
+        np.concatenate([halves, pairs.reshape(-1)]),
+        offsets,
+    )
+
+
+def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: IntArray) -> Mesh:
+    """Put a mesh together whose nodes are numbered like its vertices."""
+    kind = "float32" if vertices.x.dtype == np.float32 else "float64"
+    index_map = vertices.index_map
+    number = np.concatenate([np.arange(*index_map.local_range, dtype=np.int64), index_map.ghosts])
+    geometry = getattr(cpp.mesh, f"Geometry_{kind}")(
+        index_map, children, compat.coordinate_map(coarse), vertices.x, number
+    )
+    mesh = getattr(cpp.mesh, f"Mesh_{kind}")(coarse.comm, topology, geometry)
+    # a new UFL domain, because it carries a reference to the C++ mesh
+    return Mesh(mesh, ufl.Mesh(coarse.ufl_domain().ufl_coordinate_element()))
+
+
+def _child_tags(domain: Domain, fine: Mesh, facets: IntArray) -> Any:
+    """The boundary parts on the fine mesh: facet j of a cell is shared out to two of its children.
+
+    Args:
+        domain: The coarse domain.
+        fine: The fine mesh.
+        facets: Coarse facets of the coarse cells, shape (cells, 3).
+    """
+    topology, tags = domain.mesh.topology, domain.tags
+    owned = tags.indices < topology.index_map(1).size_local
+    tagged, values = tags.indices[owned], tags.values[owned]
+    around = topology.connectivity(1, 2)
+    cell = around.array[around.offsets[tagged]]
+    j = np.argmax(facets[cell] == tagged[:, None], axis=1)
+    of_cells = _table(fine.topology.connectivity(2, 1))
+    found = np.concatenate([of_cells[4 * cell + (j + i) % 3, j] for i in (1, 2)])
+    order = np.argsort(found)
+    return meshtags(fine, 1, found[order], np.tile(values, 2)[order])
