@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 from dolfinx import cpp
 from dolfinx.mesh import CellType, GhostMode, Mesh, create_cell_partitioner
 from mpi4py import MPI
@@ -89,3 +90,21 @@ def set_facets(
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(of_cells), tdim, tdim - 1)
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(ends), tdim - 1, 0)
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(cells, start), tdim - 1, tdim)
+
+
+def evaluate_on_facets(
+    expression: fem.Expression, mesh: Mesh, entities: npt.NDArray[np.int32]
+) -> npt.NDArray[np.float64]:
+    """Evaluate an Expression with points on the reference facet.
+
+    Args:
+        expression: Compiled on a mesh of the same kind.
+        mesh: Where to evaluate.
+        entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+    """
+    if not len(entities):
+        return np.zeros((0, len(expression.X()) * expression.value_size))
+    try:
+        return expression.eval(mesh, entities)
+    except (AssertionError, TypeError, ValueError, RuntimeError):  # 0.9 wants them flattened
+        return expression.eval(mesh, entities.ravel())
