@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem
-from dolfinx import cpp
+from dolfinx import cpp, fem
 from dolfinx.mesh import CellType, GhostMode, Mesh, create_cell_partitioner
 from mpi4py import MPI
 

@@ -1,0 +1,111 @@
+"""The solver: bounds where they belong, errors with names, options under the prefix."""
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from signorini_cr import NotConverged, Polygon, Problem, solve, solve_levels
+from signorini_cr.domain import CONTACT
+from signorini_cr.space import closure_dofs
+
+SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
+PROBLEM = Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0]))
+
+
+@pytest.fixture
+def options():
+    """Set options under the prefix; they are gone after the test."""
+    database = PETSc.Options("signorini_")
+    names = []
+
+    def set_option(name, value):
+        names.append(name)
+        database.setValue(name, value)
+
+    yield set_option
+    for name in names:
+        database.delValue(name)
+
+
+def test_bounds_on_contact_facets_only():
+    solution = solve(PROBLEM, SQUARE.mesh(0.1))
+    lower = solution.level.system.lower
+    V = solution.u.function_space
+    bounded = np.flatnonzero(lower > PETSc.NINFINITY)
+    owned = bounded[bounded < V.dofmap.index_map.size_local]
+    expected = closure_dofs(V, solution.domain.facets(CONTACT)).ravel()
+    assert np.array_equal(owned, np.sort(expected))
+    assert np.all(lower[bounded] == 0.0)
+
+
+def test_failure_names_the_reason(options):
+    options("snes_max_it", 1)
+    with pytest.raises(NotConverged, match="DIVERGED_MAX_IT") as caught:
+        solve(PROBLEM, SQUARE.mesh(0.05))
+    assert caught.value.level == 0
+
+
+def test_linear_failure_is_named(options):
+    options("ksp_max_it", 1)
+    options("ksp_rtol", 1e-12)
+    options("pc_type", "none")
+    with pytest.raises(NotConverged, match=r"DIVERGED_LINEAR_SOLVE \(KSP DIVERGED_(MAX_IT|ITS)\)"):
+        solve(PROBLEM, SQUARE.mesh(0.05))
+
+
+def test_options_choose_another_solver(options):
+    reference = solve(PROBLEM, SQUARE.mesh(0.1))
+    options("ksp_type", "minres")
+    options("pc_type", "jacobi")
+    other = solve(PROBLEM, SQUARE.mesh(0.1))
+    assert other.iterations.preconditioner == "jacobi"
+    assert other.iterations.linear > reference.iterations.linear
+    assert np.allclose(other.u.x.array, reference.u.x.array, atol=1e-7)
+
+
+def test_no_option_is_left_behind():
+    before = PETSc.Options().getAll()
+    solve(PROBLEM, SQUARE.mesh(0.2))
+    assert PETSc.Options().getAll() == before
+
+
+def test_monitor_sees_every_step():
+    seen = []
+    solution = solve(PROBLEM, SQUARE.mesh(0.05), monitor=lambda *facts: seen.append(facts))
+    steps = [fact[1] for fact in seen]
+    assert steps == list(range(solution.iterations.newton + 1))
+    assert seen[-1][2] <= 1e-8 * solution.level.system.load
+    assert seen[-1][3] == solution.contact.number_active
+    assert seen[-1][4] == solution.iterations.linear
+    assert all(MPI.COMM_WORLD.bcast(fact) == fact for fact in seen)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_data_of_any_magnitude(scale):
+    """u is linear in the data while the obstacle is 0: nothing in the solver is absolute."""
+    one = solve(PROBLEM, SQUARE.mesh(0.1))
+    scaled = solve(
+        Problem(f=lambda x: scale * 2 * np.pi * ufl.sin(2 * np.pi * x[0])), SQUARE.mesh(0.1)
+    )
+    assert np.allclose(scaled.u.x.array / scale, one.u.x.array, atol=1e-7)
+    assert scaled.contact.number_active == one.contact.number_active
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_zero_data_give_zero(element):
+    solution = solve(Problem(), SQUARE.mesh(0.25), element)
+    assert np.all(solution.u.x.array == 0.0)
+    assert solution.energy == 0.0
+
+
+def test_levels_start_where_the_one_below_ended():
+    """Each mesh has four times the cells, and energies of CR approach J from below (numerics E)."""
+    solutions = list(solve_levels(PROBLEM, SQUARE.mesh(0.25), 4))
+    cells = [solution.cells for solution in solutions]
+    assert cells == [cells[0] * 4**k for k in range(4)]
+    energies = np.array([solution.energy for solution in solutions])
+    assert np.all(np.diff(energies) > 0)
+    assert energies[-1] == pytest.approx(-0.461754, rel=2e-3)
+    assert [solution.level.number for solution in solutions] == [0, 1, 2, 3]

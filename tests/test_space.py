@@ -1,0 +1,87 @@
+"""The CR space: its dofs are facet means, its vertex values those of the affine pieces."""
+
+import numpy as np
+import pytest
+from dolfinx.mesh import GhostMode, create_rectangle, locate_entities_boundary
+from mpi4py import MPI
+
+from signorini_cr.errors import InputError
+from signorini_cr.space import (
+    closure_dofs,
+    facet_entities,
+    facet_measures,
+    facet_to_dof,
+    function_space,
+    shared_maximum,
+    vertex_values,
+)
+
+
+@pytest.fixture(params=[GhostMode.none, GhostMode.shared_facet], ids=lambda mode: mode.name)
+def mesh(request):
+    return create_rectangle(
+        MPI.COMM_WORLD, [[-1.0, 0.0], [1.0, 1.0]], [7, 5], ghost_mode=request.param
+    )
+
+
+def bottom(mesh):
+    return locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 0.0))
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_vertex_values_of_an_affine_function_are_its_own(mesh, element):
+    from dolfinx.fem import Function
+
+    u = Function(function_space(mesh, element))
+    u.interpolate(lambda x: 2.0 - 3.0 * x[0] + 5.0 * x[1])
+    x = mesh.geometry.x[mesh.geometry.dofmap]
+    assert np.allclose(vertex_values(u), 2.0 - 3.0 * x[..., 0] + 5.0 * x[..., 1], atol=1e-13)
+
+
+def test_facet_dof_sits_at_the_midpoint(mesh):
+    V = function_space(mesh)
+    facets = bottom(mesh)
+    vertices, _ = facet_measures(mesh, facets)
+    points = V.tabulate_dof_coordinates()
+    assert np.allclose(points[facet_to_dof(V)[facets]], vertices.mean(axis=1))
+    assert np.array_equal(closure_dofs(V, facets)[:, 0], facet_to_dof(V)[facets])
+
+
+def test_measures_add_up_to_the_side(mesh):
+    fdim = mesh.topology.dim - 1
+    facets = bottom(mesh)
+    facets = facets[facets < mesh.topology.index_map(fdim).size_local]
+    _, measure = facet_measures(mesh, facets)
+    assert np.isclose(mesh.comm.allreduce(measure.sum()), 2.0)
+
+
+def test_facet_entities_name_the_facet_within_its_cell(mesh):
+    facets = bottom(mesh)
+    cells, local = facet_entities(mesh, facets).T
+    assert np.array_equal(mesh.topology.connectivity(2, 1).array.reshape(-1, 3)[cells, local], facets)
+
+
+def test_p1_closure_are_the_vertices_of_the_facet(mesh):
+    V = function_space(mesh, "P1")
+    facets = bottom(mesh)
+    vertices, _ = facet_measures(mesh, facets)
+    assert np.allclose(V.tabulate_dof_coordinates()[closure_dofs(V, facets)], vertices)
+
+
+def test_shared_maximum_agrees_on_all_copies(mesh):
+    V = function_space(mesh, "P1")
+    index_map = V.dofmap.index_map
+    number = index_map.local_to_global(
+        np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    )
+    values = 1000.0 * mesh.comm.rank + number
+    shared_maximum(V, values)
+    rank = np.floor((values - number) / 1000.0 + 0.5)
+    holders = mesh.comm.allgather(number)
+    highest = [max(r for r, held in enumerate(holders) if n in held) for n in number]
+    assert np.array_equal(rank, highest)
+
+
+def test_unknown_element_is_named(mesh):
+    with pytest.raises(InputError, match=r"'P7' is unknown; allowed: CR, P1"):
+        function_space(mesh, "P7")
