@@ -1,0 +1,102 @@
+"""Files that appear whole or not at all, written by all ranks together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from mpi4py import MPI
+
+from .errors import InputError, on_root
+
+Writer = Callable[[Path], object]
+"""Writes one file; called on every rank, and raises on every rank if at all."""
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn the system's refusal to write `path` into the InputError a user understands."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write {path.name}: {error.strerror or error}") from error
+
+
+def check_writable(
+    folder: str | os.PathLike[str], names: Iterable[str] = (), comm: MPI.Comm = MPI.COMM_WORLD
+) -> None:
+    """Raise InputError on all ranks if files could not be put into a folder; touch nothing.
+
+    Args:
+        folder: Need not be there.
+        names: The files to come; none of them may be a folder.
+        comm: The ranks that take part; all must call.
+    """
+
+    def look() -> None:
+        path = Path(folder)
+        anchor = _nearest(path)
+        if not anchor.is_dir():
+            raise InputError(f"cannot write to {path}: {anchor} is not a folder")
+        if not os.access(anchor, os.W_OK | os.X_OK):
+            raise InputError(f"cannot write to {path}: {anchor} is not writable")
+        for name in names:
+            if (path / name).is_dir():
+                raise InputError(f"cannot write {path / name}: a folder of that name is there")
+
+    on_root(comm, look)
+
+
+def write_files(
+    folder: str | os.PathLike[str],
+    writers: Mapping[str, Writer],
+    removed: Iterable[str] = (),
+    comm: MPI.Comm = MPI.COMM_WORLD,
+) -> None:
+    """Put files into a folder: all of them or, if a writer raises, none.
+
+    They are written into a hidden folder on the same file system and renamed into place.
+
+    Args:
+        folder: Made if it is not there. Other files in it are left alone.
+        writers: What writes the file of each name to the path that it is given.
+        removed: Names that shall not be there afterwards unless they are among `writers`.
+        comm: The ranks that take part; all must call.
+    """
+    path = Path(folder)
+
+    def prepare() -> str:
+        with disk_errors(path):
+            return tempfile.mkdtemp(prefix=".signorini-cr-", dir=_nearest(path))
+
+    def publish() -> None:
+        with disk_errors(path):
+            path.mkdir(parents=True, exist_ok=True)
+            for name in writers:
+                os.replace(stage / name, path / name)
+            for name in set(removed) - set(writers):
+                (path / name).unlink(missing_ok=True)
+
+    stage = Path(on_root(comm, prepare))
+    try:
+        for name, write in writers.items():
+            write(stage / name)
+        on_root(comm, publish)
+    finally:
+        if comm.rank == 0:
+            shutil.rmtree(stage, ignore_errors=True)
+
+
+def write_text(path: Path, make: Callable[[], str]) -> None:
+    """Write what `make` returns; called on one rank."""
+    with disk_errors(path):
+        path.write_text(make(), encoding="utf-8")
+
+
+def _nearest(path: Path) -> Path:
+    """The path itself if it is there, or else the nearest of the folders it would be made in."""
+    return next(place for place in (path, *path.absolute().parents) if place.exists())
