@@ -1,0 +1,40 @@
+"""What all tests share: a time limit, one folder for all ranks, the marker `serial`."""
+
+import faulthandler
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+SECONDS = float(os.environ.get("SIGNORINI_TEST_SECONDS", "300"))
+_stderr = 2
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Here fd 2 is the real one; while a test runs it is the capture file
+    global _stderr
+    _stderr = os.dup(2)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("serial") and MPI.COMM_WORLD.size > 1:
+        pytest.skip("one process is enough")
+
+
+@pytest.fixture(autouse=True)
+def time_limit() -> Iterator[None]:
+    """End the process of a test that hangs: mpirun then ends the other ranks as well.
+
+    A rank that waits inside MPI never gets back to Python, so no signal handler would run.
+    """
+    faulthandler.dump_traceback_later(SECONDS, exit=True, file=_stderr)
+    yield
+    faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.fixture
+def shared_tmp_path(tmp_path: Path) -> Path:
+    """Rank 0's `tmp_path`, on every rank."""
+    return MPI.COMM_WORLD.bcast(tmp_path, root=0)
