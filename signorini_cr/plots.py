@@ -1,0 +1,317 @@
+"""Pictures: the mesh and its boundary parts, u_h, what happens on Γ1, convergence.
+
+Matplotlib is loaded when a picture is drawn, on rank 0 alone, and used through its objects:
+nothing global is touched. Functions that take a domain or a solution are collective.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx.mesh import Mesh, entities_to_geometry
+from mpi4py import MPI
+
+from .canvas import (
+    BLUE,
+    GREY,
+    RED,
+    YELLOW,
+    draw_lines,
+    grouped,
+    headline,
+    legend,
+    new_figure,
+    plane_axes,
+    save,
+)
+from .domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from .errors import InputError, on_root
+from .raster import raster
+from .space import facet_measures
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from .levels import Solution
+
+FloatArray = npt.NDArray[np.float64]
+Table = Mapping[str, npt.NDArray]
+Where = str | os.PathLike[str]
+
+PARTS: dict[int, dict[str, Any]] = {
+    DIRICHLET: {"color": BLUE, "linewidth": 2.5, "label": r"$\Gamma_0$: Dirichlet"},
+    NEUMANN: {"color": YELLOW, "linewidth": 3.5, "label": r"$\Gamma_g$: Neumann"},
+    CONTACT: {"color": RED, "linewidth": 4.5, "label": r"$\Gamma_1$: contact"},
+}
+SERIES = {
+    "error_h1": {"color": BLUE, "marker": "o", "label": r"$\|\nabla_h(u-u_h)\|$"},
+    "bound_h1": {
+        "color": YELLOW,
+        "marker": "D",
+        "linestyle": "--",
+        "label": r"certified bound of $\|\nabla_h(u-u_h)\|$",
+    },
+    "error_l2": {"color": RED, "marker": "s", "label": r"$\|u-u_h\|$"},
+}
+MOST_EDGES = 40_000
+"""A mesh with more edges is drawn without those inside."""
+MOST_PARTS = 6
+"""Contact parts with panels of their own: the longest ones."""
+
+
+def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
+    """Draw the mesh with Γ0, Γ1 and Γg.
+
+    Args:
+        domain: A plane domain.
+        path: The PNG to write.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: The domain is not plane, or the file can't be written.
+    """
+    mesh = _plane(domain)
+    cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
+    parts = {part: _segments(domain, part) for part in PARTS}
+
+    def draw() -> None:
+        figure, axes = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2))
+        draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
+        for part, style in PARTS.items():
+            if len(parts[part]):
+                draw_lines(axes, parts[part], zorder=3, capstyle="round", **style)
+        legend(figure, ncols=3)
+        hidden = "" if len(edges) else ", too many to draw"
+        axes.set_title(headline(title, f"mesh of {grouped(cells)} cells{hidden}"), fontsize=14)
+        save(figure, path)
+
+    on_root(mesh.comm, draw)
+
+
+def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
+    """Draw u_h as it is, jumps across the edges included, and where it is in contact.
+
+    Args:
+        solution: On a plane domain.
+        path: The PNG to write.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: The domain is not plane, or the file can't be written.
+    """
+    domain, contact = solution.domain, solution.contact
+    mesh = _plane(domain)
+    image, box, limits = raster(solution.u)
+    edges = _edges(mesh) if solution.cells <= 2000 else np.zeros((0, 2, 2))
+    boundary = np.concatenate([_segments(domain, part) for part in PARTS])
+    touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
+
+    def draw() -> None:
+        figure, axes = plane_axes(box, room=1.0)
+        shown = axes.imshow(
+            image, extent=box.T.ravel(), origin="lower", vmin=limits[0], vmax=limits[1]
+        )
+        draw_lines(axes, edges, color="white", linewidth=0.3, alpha=0.5)
+        draw_lines(axes, boundary, color="black", linewidth=1.2, capstyle="round")
+        where = " at facet midpoints" if solution.element == "CR" else ""
+        label = rf"contact: $u_h = \alpha${where}" if len(touching) else "no contact"
+        draw_lines(axes, touching, color=RED, linewidth=5.0, label=label, zorder=3)
+        points = contact.transitions
+        if len(points):
+            axes.plot(points[:, 0], points[:, 1], linestyle="none", marker="o", markersize=7,
+                      color="white", markeredgecolor="black", zorder=4, clip_on=False,
+                      label="contact begins or ends")  # fmt: skip
+        bar = figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.035, 1.0)))
+        bar.ax.set_title("$u_h$", fontsize=14)
+        bar.ax.tick_params(labelsize=11)
+        bar.formatter.set_powerlimits((-3, 4))
+        legend(figure, ncols=2)
+        axes.set_title(headline(title, f"$u_h$ on {grouped(solution.cells)} cells"), fontsize=14)
+        save(figure, path)
+
+    on_root(mesh.comm, draw)
+
+
+def plot_contact(solution: Solution, path: Where, title: str = "") -> None:
+    """Draw u_h with the obstacle, and the pressure λ_h below it, along Γ1.
+
+    Args:
+        solution: On a plane domain with a contact boundary.
+        path: The PNG to write.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: The domain is not plane or has no Γ1, or the file can't be written.
+    """
+    comm, contact = _plane(solution.domain).comm, solution.contact
+    table = contact.table()
+    if contact.number == 0:
+        raise InputError("a picture of the contact needs a contact boundary")
+
+    def draw() -> None:
+        assert table is not None
+        parts, lengths = _parts(table)
+        figure = new_figure(9.0, 6.6)
+        panels = figure.subplots(
+            2,
+            len(parts),
+            sharex="col",
+            sharey="row",
+            squeeze=False,
+            width_ratios=np.maximum(lengths / lengths.max(), 0.2),
+        )
+        for number, (column, rows) in enumerate(zip(panels.T, parts, strict=True)):
+            _contact_part(column, rows, contact.transitions)
+            if len(parts) > 1:
+                column[0].set_title(f"part {number}", fontsize=12)
+        panels[0, 0].set_ylabel(r"$u_h$ and $\alpha$, facet means", fontsize=13)
+        panels[1, 0].set_ylabel(r"contact pressure $\lambda_h$", fontsize=13)
+        entries: dict[str, Any] = {}
+        for axes in panels.ravel():
+            handles, labels = axes.get_legend_handles_labels()
+            entries |= dict(zip(labels, handles, strict=True))
+        legend(figure, list(entries.values()), list(entries), ncols=5)
+        count = f"{grouped(contact.number_active)} of {grouped(contact.number)} facets in contact"
+        figure.suptitle(headline(title, count), fontsize=14)
+        save(figure, path)
+
+    on_root(comm, draw)
+
+
+def convergence_series(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The keys of the records that `plot_convergence` has something to draw of."""
+    return [key for key in SERIES if sum(bool(record[key]) for record in records) > 1]
+
+
+def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: str = "") -> None:
+    """Draw errors, and the certified bound, with the slopes of an undisturbed convergence.
+
+    They are drawn against h, or against the number of dofs where refinement was adaptive and h
+    says little.
+
+    Args:
+        records: From `output.level_record`; two at least with an error or a bound.
+        path: The PNG to write, by this rank.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: There is nothing to draw, or the file can't be written.
+    """
+    keys = convergence_series(records)
+    if not keys:
+        raise InputError("a picture of convergence needs two levels with an error or a bound")
+    sizes = np.array([record["h"] for record in records])
+    uniform = bool(np.all(sizes[1:] < 0.7 * sizes[:-1]))
+    figure = new_figure(7.5, 6.0)
+    axes = figure.subplots()
+    for key in keys:
+        used = [record for record in records if record[key]]
+        x = np.array([record["h" if uniform else "dofs"] for record in used])
+        values = np.array([record[key] for record in used])
+        style = dict(SERIES[key])
+        rate = used[-1].get(key.replace("error", "rate")) if uniform else None
+        style["label"] += (
+            f", last rate {rate:.2f}" if rate is not None and key != "bound_h1" else ""
+        )
+        axes.loglog(x, values, markersize=7, linewidth=2, **style)
+        if key == "bound_h1" and "error_h1" in keys:
+            continue
+        # A slope beside the curve, through its last point but for the factor
+        order = (2 if key == "error_l2" else 1) * (1.0 if uniform else -0.5)
+        slope = 0.6 * values[-1] * (x / x[-1]) ** order
+        power = {1.0: "$h$", 2.0: "$h^2$", -0.5: "$N^{-1/2}$", -1.0: "$N^{-1}$"}[order]
+        axes.loglog(x, slope, ":", color="black")
+        axes.annotate(power, (np.sqrt(x[0] * x[-1]), np.sqrt(slope[0] * slope[-1])), fontsize=14,
+                      xytext=(0, -8), textcoords="offset points", va="top")  # fmt: skip
+    if uniform and len(sizes) <= 8:
+        axes.set_xticks(sizes, [f"{h:.2g}" for h in sizes])
+        axes.set_xticks([], minor=True)
+    axes.set_xlabel("$h$" if uniform else "number $N$ of degrees of freedom", fontsize=14)
+    axes.set_ylabel("error", fontsize=13)
+    axes.tick_params(labelsize=11)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(fontsize=12)
+    axes.set_title(headline(title, "convergence"), fontsize=14)
+    save(figure, path)
+
+
+def _plane(domain: Domain) -> Mesh:
+    if domain.mesh.geometry.dim != 2 or domain.mesh.topology.dim != 2:
+        raise InputError("pictures are of plane domains only; for others open solution.vtu")
+    return domain.mesh
+
+
+def _gather(comm: MPI.Comm, array: FloatArray) -> FloatArray:
+    """The rows of all ranks on rank 0, none elsewhere."""
+    pieces = comm.gather(array, root=0)
+    return array[:0] if pieces is None else np.concatenate(pieces)
+
+
+def _edges(mesh: Mesh) -> FloatArray:
+    """Ends of all edges, on rank 0, shape (n, 2, 2); none if there are too many to draw."""
+    mesh.topology.create_entities(1)
+    mesh.topology.create_connectivity(1, 2)
+    mesh.topology.create_connectivity(2, 1)
+    edges = mesh.topology.index_map(1)
+    number = edges.size_local if edges.size_global <= MOST_EDGES else 0
+    ends = entities_to_geometry(mesh, 1, np.arange(number, dtype=np.int32)).reshape(-1, 2)
+    return _gather(mesh.comm, mesh.geometry.x[ends, :2])
+
+
+def _segments(domain: Domain, part: int) -> FloatArray:
+    """Ends of the facets of a boundary part, on rank 0, shape (n, 2, 2)."""
+    ends, _ = facet_measures(domain.mesh, domain.facets(part))
+    return _gather(domain.mesh.comm, ends[..., :2])
+
+
+def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
+    """The rows of the longest parts in the order along the boundary, and their lengths."""
+    lengths = np.bincount(table["part"], weights=table["length"])
+    longest = np.sort(np.argsort(-lengths, kind="stable")[:MOST_PARTS])
+    rows = [{name: column[table["part"] == part] for name, column in table.items()}
+            for part in longest]  # fmt: skip
+    return rows, lengths[longest]
+
+
+def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) -> None:
+    """Draw one connected piece of Γ1: u_h above, the pressure below."""
+    from matplotlib.collections import PolyCollection
+
+    upper, lower = panels
+    arc, length, active = rows["arc_length"], rows["length"], rows["active"].astype(int)
+    middle = np.stack([rows["x"], rows["y"]], axis=1)
+    edges = np.append(arc - length / 2, arc[-1] + length[-1] / 2)
+    step = np.diff(active, prepend=0, append=0)
+    begin, end = edges[np.flatnonzero(step == 1)], edges[np.flatnonzero(step == -1)]
+    # Facet by facet along the boundary: where on this part are the transition points?
+    along = np.gradient(middle, arc, axis=0) if len(arc) > 1 else np.zeros((1, 2))
+    offset = transitions[:, None, :2] - middle
+    near = np.argmin(np.linalg.norm(offset, axis=2), axis=1)
+    shift = offset[np.arange(len(near)), near]
+    here = np.linalg.norm(shift, axis=1) <= 0.75 * length[near]
+    points = (arc[near] + np.sum(shift * along[near], axis=1))[here]
+    runs = np.stack([begin, begin, end, end], axis=1)
+    runs = np.stack([runs, np.broadcast_to([0.0, 1.0, 1.0, 0.0], runs.shape)], axis=2)
+    lines = np.stack([np.stack([points, points], axis=1), [[0.0, 1.0]] * len(points)], axis=2)
+    for axes in panels:
+        across = axes.get_xaxis_transform()
+        shaded = PolyCollection(runs, transform=across, color=RED, alpha=0.15, linewidth=0)
+        shaded.set_label("contact" if len(runs) else None)
+        axes.add_collection(shaded, autolim=False)
+        draw_lines(axes, lines, transform=across, color="black", linestyle=":", linewidth=1.5,
+                   label="contact begins or ends" if len(points) else None)  # fmt: skip
+        axes.set_xlim(edges[0], edges[-1])
+        axes.tick_params(labelsize=11)
+        axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+        axes.grid(alpha=0.25)
+    marker = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
+    upper.plot(arc, rows["u"], color=BLUE, linewidth=2, label="$u_h$", **marker)
+    upper.plot(arc, rows["obstacle"], color="black", linestyle="--", label=r"obstacle $\alpha$")
+    lower.stairs(rows["pressure"], edges, color=RED, linewidth=2, label=r"$\lambda_h$")
+    ends = middle[[0, -1]] + along[[0, -1]] * (edges[[0, -1]] - arc[[0, -1]])[:, None]
+    start, stop = (f"({x:.3g}, {y:.3g})" for x, y in ends + 0.0)
+    lower.set_xlabel(f"arc length along $\\Gamma_1$\nfrom {start} to {stop}", fontsize=12)

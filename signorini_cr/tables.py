@@ -1,0 +1,121 @@
+"""The tables: levels on a terminal, in Markdown and as CSV, contact facets as CSV.
+
+The records are those of `output.level_record`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy.typing as npt
+
+Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
+
+
+def table_header(first: Mapping[str, Any]) -> str:
+    """The head of the printed table; `first` is the record that decides on the columns."""
+    return " ".join(f"{name:>{width}}" for name, width, _ in _columns(first))
+
+
+def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None) -> str:
+    """The row of `record` in the printed table (80 columns at most below 10⁷ cells)."""
+    return " ".join(f"{cell(record):>{width}}" for _, width, cell in _columns(first or record))
+
+
+def markdown_table(records: Sequence[Mapping[str, Any]]) -> str:
+    """The printed table in Markdown."""
+    columns = _columns(records[0]) if records else []
+    rows = [[name for name, _, _ in columns], [(w - 1) * "-" + ":" for _, w, _ in columns]]
+    rows += [[cell(record) for _, _, cell in columns] for record in records]
+    lines = (
+        " | ".join(f"{text:>{width}}" for text, (_, width, _) in zip(row, columns, strict=True))
+        for row in rows
+    )
+    return "".join(f"| {line} |\n" for line in lines)
+
+
+def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
+    """One line a level, all of the record: `kkt_min_gap` is `min_gap` in `kkt`, and so on.
+
+    What is null is left empty; the transition points read `x y; x y`.
+    """
+
+    def cells(record: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        for key, value in record.items():
+            if isinstance(value, Mapping):
+                yield from ((f"{key}_{name}", cell) for name, cell in cells(value))
+            elif isinstance(value, list):
+                yield key, "; ".join(" ".join(map(repr, point)) for point in value)
+            else:
+                yield key, value
+
+    rows = [dict(cells(record)) for record in records]
+    return _csv(rows[0] if rows else (), (row.values() for row in rows))
+
+
+def contact_csv(table: Mapping[str, npt.NDArray]) -> str:
+    """One line a contact facet, in order along the boundary; `active` is 0 or 1.
+
+    Args:
+        table: From `Contact.table`.
+    """
+    columns = [column.astype(int) if column.dtype == bool else column for column in table.values()]
+    return _csv(table, zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _csv(names: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(names)
+    lines.writerows(rows)
+    return text.getvalue()
+
+
+def _columns(first: Mapping[str, Any]) -> list[Column]:
+    """Name, width and contents of the printed columns, for records like `first`."""
+    bound, exact = first["bound_h1"] is not None, first["error_h1"] is not None
+    columns: list[Column] = [
+        ("level", 5, lambda r: str(r["level"])),
+        ("cells", 7, lambda r: str(r["cells"])),
+        ("dofs", 7, lambda r: str(r["dofs"])),
+        ("h", 7, lambda r: _short(r["h"])),
+        ("newton", 6, lambda r: str(r["newton_iterations"])),
+        ("cg", 3, lambda r: str(r["linear_iterations"])),
+        ("active", 6, lambda r: str(r["contact"]["active"])),
+    ]
+    if exact:
+        columns += [
+            ("H1 error", 8, lambda r: _short(r["error_h1"])),
+            ("rate", 4, lambda r: _fixed(r["rate_h1"])),
+            ("L2 error", 8, lambda r: _short(r["error_l2"])),
+            ("rate", 4, lambda r: _fixed(r["rate_l2"])),
+        ]
+    else:
+        columns += [
+            ("energy", 12, lambda r: "-" if r["energy"] is None else f"{r['energy']:.7g}"),
+            ("contact", 8, lambda r: _short(r["contact"]["length"])),
+        ]
+    if bound:
+        columns.append(("bound", 7, lambda r: _short(r["bound_h1"])))
+    if bound and exact:
+        # Eighty columns: the number of cells gives way, it is in levels.csv
+        del columns[1]
+        columns.append(("eff.", 4, lambda r: _fixed(r["effectivity"])))
+    return columns
+
+
+def _short(value: float | None) -> str:
+    """Three digits in at most seven characters (below 1e10)."""
+    if value is None:
+        return "-"
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:#.3g}".rstrip(".")
+    mantissa, power = f"{value:.2e}".split("e")
+    return f"{mantissa}e{int(power)}"
+
+
+def _fixed(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
