@@ -1,0 +1,32 @@
+"""Exit with 0 where this Python can run signorini_cr: DOLFINx >= 0.9, real petsc4py, gmsh.
+
+Prints the folders Python imports from, one a line: as long as none of them changes, neither does
+the answer.
+"""
+
+import importlib.util
+import os
+import sys
+
+for folder in sys.path[1:]:
+    if os.path.isdir(folder):
+        print(folder)
+sys.stdout.flush()
+
+if sys.version_info < (3, 11):
+    sys.exit(1)
+if not all(importlib.util.find_spec(name) for name in ("dolfinx", "petsc4py", "gmsh")):
+    sys.exit(1)
+
+try:
+    import dolfinx
+    import dolfinx.fem.petsc
+    import gmsh  # noqa: F401
+    import numpy as np
+    from petsc4py import PETSc
+except Exception as error:
+    sys.exit(f"container/run: {sys.executable} has DOLFINx, but cannot load it: {error}")
+
+version = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
+if version < (0, 9) or np.issubdtype(PETSc.ScalarType, np.complexfloating):
+    sys.exit(1)
