@@ -121,6 +121,156 @@ def triangulate(
         )
 
 
+def read(path: Path, parts: dict[str, int]) -> Triangulation:
+    """Read a planar triangle mesh with named physical curves.
+
+    Args:
+        path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
+        parts: Label of each name; case does not matter.
+    """
+    _check_header(path)
+    with _session() as gmsh:
+        try:
+            gmsh.merge(str(path))
+        except UnicodeDecodeError:  # gmsh quotes what it could not read
+            raise InputError(f"{path}: damaged gmsh file") from None
+        except Exception as error:
+            raise InputError(f"{path}: gmsh cannot read it: {error}") from error
+        _check_cells(gmsh, path)
+        names = [
+            (tag, gmsh.model.getPhysicalName(dim, tag)) for dim, tag in gmsh.model.getPhysicalGroups(1)
+        ]
+        found: dict[str, list[npt.NDArray[np.int64]]] = {name: [] for name in parts}
+        for tag, name in names:
+            if (key := name.strip().lower()) in parts:
+                for curve in gmsh.model.getEntitiesForPhysicalGroup(1, tag):
+                    found[key].append(_elements(gmsh, 1, _LINE, curve))
+        for needed in ("contact", "dirichlet"):
+            if not sum(map(len, found[needed])):
+                there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
+                raise InputError(
+                    f"{path}: no physical curve is named {needed!r}; the physical curves there "
+                    f"are: {there}"
+                )
+        facets = np.concatenate([part for key in parts for part in found[key]])
+        labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])
+        raw = _compact(gmsh, _elements(gmsh, 2, _TRIANGLE), facets, labels)
+    _check_facets(raw, path, {label: name for name, label in parts.items()})
+    return raw
+
+
+def _check_header(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    before, mark, after = head.partition(b"$MeshFormat")
+    version = after.split(maxsplit=1)[0].decode("ascii", "replace") if after.split() else ""
+    if not mark or (before.strip() and not before.lstrip().startswith(b"$Comments")):
+        raise InputError(f"{path}: not a gmsh mesh file (formats 2.2 and 4.1 are read)")
+    if version.split(".")[0] not in ("2", "4"):
+        raise InputError(f"{path}: gmsh format {version}: formats 2.2 and 4.1 are read")
+
+
+def _check_cells(gmsh: Any, path: Path) -> None:
+    """Insist on triangles in the x-y plane, with straight sides, and nothing else."""
+    kinds = gmsh.model.mesh.getElementTypes()
+    properties = [gmsh.model.mesh.getElementProperties(kind) for kind in kinds]
+    wrong = [p[0] for p in properties if p[1] == 3]
+    if wrong:
+        raise InputError(f"{path}: a mesh in three dimensions ({wrong[0]}): a planar one is needed")
+    plane = [(kind, p[0]) for kind, p in zip(kinds, properties) if p[1] == 2]
+    if not plane:
+        raise InputError(
+            f"{path}: no triangles: gmsh saves what has a physical group, so that the surface "
+            "needs one as soon as the curves have one"
+        )
+    for kind, name in plane:
+        if kind != _TRIANGLE:
+            raise InputError(
+                f"{path}: it contains cells of the kind {name!r}: only straight-sided triangles "
+                "are possible"
+            )
+    z = gmsh.model.mesh.getNodes()[1][2::3]
+    if np.ptp(z) > 0:
+        raise InputError(f"{path}: the mesh does not lie in the x-y plane: z takes several values")
+
+
+def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None:
+    """Insist on labels of exterior facets, one each, and on a Dirichlet facet in every piece."""
+    count = len(raw.points)
+    u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
+    area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    flat = np.flatnonzero(~(area > 1e-14 * ((u**2).sum(axis=1) + (v**2).sum(axis=1))))
+    if len(flat):
+        x, y = raw.points[raw.triangles[flat[0], 0]]
+        raise InputError(f"{path}: the triangle at ({x:g}, {y:g}) has no area")
+
+    def key(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return ends.min(axis=-1) * count + ends.max(axis=-1)
+
+    def facet(number: int) -> str:
+        a, b = raw.points[raw.facets[number]]
+        return f"the facet from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g})"
+
+    sides = key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]])
+    edges, where, cells = np.unique(sides, return_inverse=True, return_counts=True)
+    where = where.reshape(sides.shape)
+    labelled = key(raw.facets)
+    position = np.minimum(np.searchsorted(edges, labelled), len(edges) - 1)
+    strange = np.flatnonzero(edges[position] != labelled)
+    inside = np.flatnonzero(cells[position] > 1)
+    for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
+        if len(bad):
+            name = names[int(raw.labels[bad[0]])]
+            raise InputError(f"{path}: {facet(bad[0])} is labelled {name} but {fault}")
+    order = np.lexsort((raw.labels, labelled))
+    one, two = order[:-1], order[1:]
+    twice = np.flatnonzero(
+        (labelled[one] == labelled[two]) & (raw.labels[one] != raw.labels[two])
+    )
+    if len(twice):
+        i, j = one[twice[0]], two[twice[0]]
+        raise InputError(
+            f"{path}: {facet(i)} belongs to {names[int(raw.labels[i])]} and to "
+            f"{names[int(raw.labels[j])]}: only one is possible"
+        )
+    if cells.max() > 2:
+        raise InputError(f"{path}: {cells.max()} triangles meet in one facet: at most 2 can")
+    fixed = np.zeros(len(edges), dtype=bool)
+    fixed[position[raw.labels == next(k for k, v in names.items() if v == "dirichlet")]] = True
+    piece = _pieces(where, len(edges))
+    held = np.zeros(len(raw.triangles), dtype=bool)
+    held[piece[fixed[where].any(axis=1)]] = True
+    loose = np.flatnonzero(~held[piece])
+    if len(loose):
+        x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
+        raise InputError(
+            f"{path}: the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
+            "Dirichlet facet"
+        )
+
+
+def _pieces(sides: npt.NDArray[np.int64], edges: int) -> npt.NDArray[np.int64]:
+    """Number of the piece of every triangle: the lowest triangle it is connected with.
+
+    Args:
+        sides: Edges of every triangle, shape (triangles, 3).
+        edges: How many edges there are.
+    """
+    piece = np.arange(len(sides))
+    while True:
+        lowest = np.full(edges, len(sides))
+        np.minimum.at(lowest, sides, piece[:, None])
+        new = np.minimum(piece, lowest[sides].min(axis=1))
+        np.minimum.at(new, piece, new.copy())
+        new = new[new]
+        if np.array_equal(new, piece):
+            return piece
+        piece = new
+
+
 def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> npt.NDArray[np.int64]:
     """Node tags of the elements of one type, shape (elements, dim + 1)."""
     tags = gmsh.model.mesh.getElementsByType(kind, entity)[1]
