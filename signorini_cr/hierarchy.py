@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import cpp
-from dolfinx.mesh import CellType, Mesh, meshtags
+from dolfinx.mesh import CellType, Mesh, RefinementOption, meshtags
+from dolfinx.mesh import refine as refine_edges
 
 from signorini_cr import compat
 from signorini_cr.domain import Domain
@@ -66,6 +67,58 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
     return Domain(fine, _child_tags(domain, fine, facets)), parent
+
+
+def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, IntArray]:
+    """Halve the sides of the marked triangles and as much around them as conformity takes; collective.
+
+    Sides are halved by bisecting longest edges first, which keeps the angles bounded from below
+    however often it is repeated. A rank keeps the children of its cells: the load is not
+    balanced again.
+
+    Args:
+        domain: Straight-sided triangles; ghost cells are left behind.
+        marked_cells: Local indices of this rank's cells, or a truth value for each of them.
+
+    Returns:
+        The fine domain, without ghost cells, and the parent of every fine cell, both local
+        indices.
+    """
+    coarse = domain.mesh
+    _check(coarse)
+    owned = coarse.topology.index_map(2).size_local
+    marked = np.asarray(marked_cells)
+    if marked.dtype == bool:
+        marked = np.flatnonzero(marked[:owned])
+    marked = marked[(marked >= 0) & (marked < owned)]
+    of_cells = _table(coarse.topology.connectivity(2, 1))
+    edges = np.unique(of_cells[marked]).astype(np.int32)
+    fine, parent, parent_facet = refine_edges(
+        coarse,
+        edges,
+        partitioner=None,
+        option=RefinementOption.parent_cell_and_facet,
+    )
+    # what comes back is in the order the cells had before DOLFINx sorted them
+    cells = fine.topology.index_map(2)
+    before = fine.topology.original_cell_index - cells.local_range[0]
+    parent = parent[before]
+    parent_facet = parent_facet.reshape(-1, 3)[before]
+
+    label = np.zeros(_count(coarse.topology.index_map(1)), dtype=np.int32)
+    label[domain.tags.indices] = domain.tags.values
+    cell, j = np.nonzero(parent_facet >= 0)
+    value = label[of_cells[parent[cell], parent_facet[cell, j]]]
+    fine.topology.create_connectivity(2, 1)
+    fine.topology.create_connectivity(1, 2)
+    facet = _table(fine.topology.connectivity(2, 1))[cell, j][value > 0]
+    order = np.argsort(facet)
+    tags = meshtags(fine, 1, facet[order], value[value > 0][order])
+    return Domain(fine, tags), parent
+
+
+def _count(index_map: Any) -> int:
+    return int(index_map.size_local + index_map.num_ghosts)
 
 
 def _third(k: int, j: int) -> int:
