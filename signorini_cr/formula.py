@@ -1,0 +1,206 @@
+"""Formulas in x and y: a graph of operations on numbers and conditions, with two readings.
+
+- :meth:`Expression.ufl` on a spatial coordinate, for forms and for differentiation,
+- :meth:`Expression.numpy` on an array of points, for checks and tables.
+
+Every number is a float (``1/2`` is 0.5), and constants are folded when the graph is built, so that
+huge powers cost nothing and a constant that is not finite can be rejected at once.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+
+VARIABLES = ("x", "y")
+CONSTANTS = {"pi": math.pi}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Node:
+    """One operation; ``args`` holds nodes, or the value of a ``const`` or the index of an ``x``."""
+
+    op: str
+    args: tuple[Any, ...]
+    condition: bool = False
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    """``base**exponent`` in UFL, with small whole exponents as integers."""
+    if isinstance(exponent, float) and exponent.is_integer() and abs(exponent) <= 64:
+        exponent = int(exponent)
+    return _inside(lambda b: b**exponent, base)
+
+
+def _inside(function: Callable[[Any], Any], value: Any) -> Any:
+    """``function(value)``, taken into the branches of a conditional.
+
+    Differentiation then stays within a branch: the derivative of ``max(0, x)**1.5`` for x < 0 is 0
+    rather than the 0 times infinity of the chain rule.
+    """
+    if isinstance(value, ufl.classes.Conditional):
+        condition, yes, no = value.ufl_operands
+        return ufl.conditional(condition, _inside(function, yes), _inside(function, no))
+    return function(value)
+
+
+# name: (arguments as the user counts them, NumPy, UFL); None means two or more.
+FUNCTIONS: dict[str, tuple[int | None, Callable[..., Any], Callable[..., Any]]] = {
+    "sqrt": (1, np.sqrt, lambda a: _inside(ufl.sqrt, a)),
+    "exp": (1, np.exp, ufl.exp),
+    "log": (1, np.log, ufl.ln),
+    "sin": (1, np.sin, ufl.sin),
+    "cos": (1, np.cos, ufl.cos),
+    "tan": (1, np.tan, ufl.tan),
+    "asin": (1, np.arcsin, ufl.asin),
+    "acos": (1, np.arccos, ufl.acos),
+    "atan": (1, np.arctan, ufl.atan),
+    "atan2": (2, np.arctan2, ufl.atan2),
+    "sinh": (1, np.sinh, ufl.sinh),
+    "cosh": (1, np.cosh, ufl.cosh),
+    "tanh": (1, np.tanh, ufl.tanh),
+    "abs": (1, np.abs, abs),
+    "sign": (1, np.sign, ufl.sign),
+    "min": (None, np.minimum, lambda a, b: ufl.conditional(ufl.lt(a, b), a, b)),
+    "max": (None, np.maximum, lambda a, b: ufl.conditional(ufl.gt(a, b), a, b)),
+    "where": (3, np.where, ufl.conditional),
+}
+_OPERATORS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    "+": (np.add, operator.add),
+    "-": (np.subtract, operator.sub),
+    "*": (np.multiply, operator.mul),
+    "/": (np.divide, operator.truediv),
+    "**": (np.power, _power),
+    "neg": (np.negative, operator.neg),
+    "<": (np.less, ufl.lt),
+    "<=": (np.less_equal, ufl.le),
+    ">": (np.greater, ufl.gt),
+    ">=": (np.greater_equal, ufl.ge),
+    "==": (np.equal, ufl.eq),
+    "!=": (np.not_equal, ufl.ne),
+    "and": (np.logical_and, ufl.And),
+    "or": (np.logical_or, ufl.Or),
+    "not": (np.logical_not, ufl.Not),
+}
+_NUMPY = {name: row[0] for name, row in _OPERATORS.items()}
+_NUMPY |= {name: row[1] for name, row in FUNCTIONS.items()}
+_UFL = {name: row[1] for name, row in _OPERATORS.items()}
+_UFL |= {name: row[2] for name, row in FUNCTIONS.items()}
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A number or a condition that depends on the point (x, y).
+
+    Attributes:
+        text: What was written.
+        root: The operation that gives the value.
+    """
+
+    text: str
+    root: Node = field(repr=False)
+
+    @property
+    def is_condition(self) -> bool:
+        """Whether the value is true or false rather than a number."""
+        return self.root.condition
+
+    @property
+    def constant(self) -> float | bool | None:
+        """The value where it is the same at every point, else None."""
+        return self.root.args[0] if self.root.op == "const" else None
+
+    @cached_property
+    def _order(self) -> tuple[Node, ...]:
+        """All operations, each after those it needs."""
+        return tuple(operands_first(self.root))
+
+    def ufl(self, x: Any) -> Any:
+        """The expression in UFL.
+
+        Args:
+            x: The spatial coordinate, with at least two components.
+
+        Returns:
+            A scalar UFL expression (a UFL condition for a condition); a constant stays as it is.
+        """
+        return self._value(_UFL, x)
+
+    def numpy(self, points: npt.ArrayLike) -> npt.NDArray[Any]:
+        """The values at points; what is not finite there comes out as inf or nan.
+
+        Args:
+            points: Coordinates, shape (n, 2) or wider.
+
+        Returns:
+            Floats, or booleans for a condition, shape (n,).
+        """
+        points = np.asarray(points, dtype=np.float64)
+        with np.errstate(all="ignore"):
+            value = self._value(_NUMPY, points.T)
+        return np.array(np.broadcast_to(value, points.shape[:1]))
+
+    def _value(self, table: Mapping[str, Callable[..., Any]], x: Any) -> Any:
+        values: dict[int, Any] = {}
+        for node in self._order:
+            if node.op == "const":
+                values[id(node)] = node.args[0]
+            elif node.op == "variable":
+                values[id(node)] = x[node.args[0]]
+            else:
+                values[id(node)] = table[node.op](*(values[id(arg)] for arg in node.args))
+        return values[id(self.root)]
+
+
+def operands_first(root: Node) -> Iterator[Node]:
+    """Walk the graph below ``root``, each operation once and after its operands."""
+    seen: set[int] = set()
+    stack = [(root, False)]
+    while stack:
+        node, ready = stack.pop()
+        if ready:
+            yield node
+        elif id(node) not in seen:
+            seen.add(id(node))
+            stack.append((node, True))
+            stack.extend((arg, False) for arg in node.args if isinstance(arg, Node))
+
+
+def constant(value: float | bool) -> Node:
+    """The node of a number, or of true or false."""
+    return Node("const", (value,), isinstance(value, bool))
+
+
+def is_constant(node: Node, value: float | bool) -> bool:
+    """Whether a node is known to have this value."""
+    return node.op == "const" and node.args[0] == value
+
+
+def operation(op: str, *args: Node) -> Node:
+    """The node of an operation, folded where its value is known."""
+    condition = op in ("<", "<=", ">", ">=", "==", "!=", "and", "or", "not")
+    if op == "where" and args[0].op == "const":
+        return args[1] if args[0].args[0] else args[2]
+    if op in ("and", "or"):
+        stop = op == "or"
+        if any(is_constant(arg, stop) for arg in args):
+            return constant(stop)
+        if any(is_constant(arg, not stop) for arg in args):
+            return args[1] if is_constant(args[0], not stop) else args[0]
+    if (op == "*" and (is_constant(args[0], 0.0) or is_constant(args[1], 0.0))) or (
+        op == "/" and is_constant(args[0], 0)
+    ):
+        return constant(0.0)
+    if op == "**" and is_constant(args[1], 0.0):
+        return constant(1.0)
+    if all(arg.op == "const" for arg in args):
+        with np.errstate(all="ignore"):
+            value = _NUMPY[op](*(arg.args[0] for arg in args))
+        return constant(bool(value) if condition else float(value))
+    return Node(op, args, condition)
