@@ -1,0 +1,79 @@
+# %% [markdown]
+# # A Signorini problem with a known solution
+#
+# **Aim.** Solve the paper's problem on a sequence of meshes, see where there is contact, and see
+# the error fall like $h$ in the broken norm (1.6) and like $h^2$ in $L^2$.
+#
+# **Mathematics.** On $\Omega = (-1, 1) \times (0, 1)$ with $\Gamma_1 = \{y = 0\}$ and $u = 0$ on
+# the rest, $\Gamma_0$, the solution sought satisfies
+#
+# $$-\Delta u = f, \qquad u \ge 0, \quad \partial_\nu u \ge 0, \quad u\,\partial_\nu u = 0
+#   \quad\text{on } \Gamma_1. \tag{1.4}$$
+#
+# With $f$ chosen to suit it is $u = (1 - x^2)(1 - y^2)\, r^{3/2} \cos(3\theta/2)$: in contact for
+# $x < 0$ and free for $x > 0$, with the regularity to expect where contact ends. The
+# Crouzeix–Raviart function $u_h$ respects the obstacle at the midpoints of the facets on
+# $\Gamma_1$ (1.7) and solves the discrete variational inequality (1.8).
+#
+# Run it alone or on several ranks; the pictures go to `demo-output` or to the folder named:
+#
+#     mpirun -n 2 python3 demos/demo_s1.py [FOLDER]
+
+# %%
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from signorini_cr import exact, plots, solve_levels
+from signorini_cr.output import level_record, table_header, table_row
+
+comm = MPI.COMM_WORLD
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
+levels = int(os.environ.get("SIGNORINI_DEMO_LEVELS", "6"))
+
+# %% [markdown]
+# ## Solve
+# The coarsest mesh comes from gmsh; each of the others cuts every triangle into four, and is
+# solved from where the one below it ended.
+
+# %%
+domain = exact.S1.mesh(0.25)
+records = []
+for solution in solve_levels(exact.S1.problem, domain, levels):
+    records.append(level_record(solution, records[-1] if records else None))
+    if comm.rank == 0:
+        if len(records) == 1:
+            print(table_header(records[0]))
+        print(table_row(records[-1], records[0]), flush=True)
+
+# %% [markdown]
+# ## Look
+# The first picture shows $u_h$ and the facets in contact, the second $u_h$ and the pressure
+# $\lambda_h$ along $\Gamma_1$, the third the errors.
+
+# %%
+if comm.rank == 0:
+    folder.mkdir(parents=True, exist_ok=True)
+comm.barrier()
+plots.plot_solution(solution, folder / "s1-solution.png", "S1")
+plots.plot_contact(solution, folder / "s1-contact.png", "S1")
+if comm.rank == 0:
+    plots.plot_convergence(records, folder / "s1-convergence.png", "S1")
+    print(f"pictures: {folder}/s1-solution.png, s1-contact.png, s1-convergence.png")
+
+# %% [markdown]
+# ## Check
+# Over the last three levels both rates are those of the theory, contact ends within a facet of the
+# origin, and the energy comes close to $J(u) = -0.48587761266$, from below.
+
+# %%
+h1, l2 = (np.array([record[f"rate_{norm}"] for record in records[-2:]]) for norm in ("h1", "l2"))
+assert np.all(abs(h1 - 1.0) < 0.05), h1
+assert np.all(abs(l2 - 2.0) < 0.10), l2
+(transition,) = solution.contact.transitions
+assert np.linalg.norm(transition) < solution.h, transition
+gap = exact.S1.energy - solution.energy
+assert 0.0 < gap < 3.0 * records[-1]["error_h1"] ** 2, gap
