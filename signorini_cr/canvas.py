@@ -36,22 +36,39 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def plane_axes(points: FloatArray, room: float = 0.0) -> tuple[Figure, Axes]:
-    """Axes of equal scale for what lies in the box of `points`, `room` inches free beside it."""
+def plane_axes(points: FloatArray, room: float = 0.0) -> tuple[Figure, Axes, float]:
+    """Axes of equal scale for what lies in the box of `points`.
+
+    Only a very slender domain is stretched, and its axis says so.
+
+    Args:
+        points: Shape (n, 2).
+        room: Inches left free beside the axes.
+
+    Returns:
+        The figure, the axes and their width in inches.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
-    size = high - low
-    size = np.clip(size * (7.5 / size.max()), 1.5, None)
-    figure = new_figure(max(size[0] + 1.0, 6.0) + room, size[1] + 1.6)
-    axes = figure.subplots()
-    axes.set_aspect("equal")
     margin = 0.03 * (high - low).max()
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_xlabel("$x$", fontsize=13)
-    axes.set_ylabel("$y$", fontsize=13)
+    inches = 7.0 * (high - low) / (high - low).max()
+    stretch = np.where(inches < 0.7, 2.2 / inches, 1.0)
+    figure = new_figure(max((inches * stretch)[0] + 1.2, 6.0) + room, (inches * stretch)[1] + 2.0)
+    axes = figure.subplots()
+    axes.set_aspect(stretch[1] / stretch[0])
+    margins = margin / stretch
+    axes.set_xlim(low[0] - margins[0], high[0] + margins[0])
+    axes.set_ylim(low[1] - margins[1], high[1] + margins[1])
+    labels = (
+        f"${name}$" if factor == 1.0 else f"${name}$ (stretched)"
+        for name, factor in zip("xy", stretch, strict=True)
+    )
+    axes.set_xlabel(next(labels), fontsize=13)
+    axes.set_ylabel(next(labels), fontsize=13)
     axes.tick_params(labelsize=11)
+    if inches[0] * stretch[0] < 3.0:
+        axes.locator_params(nbins=4, axis="x")
     axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
-    return figure, axes
+    return figure, axes, float(inches[0] * stretch[0])
 
 
 def draw_lines(axes: Axes, segments: FloatArray, **style: Any) -> None:
@@ -61,9 +78,17 @@ def draw_lines(axes: Axes, segments: FloatArray, **style: Any) -> None:
     axes.add_collection(LineCollection(segments, **style), autolim=False)
 
 
-def legend(figure: Figure, *entries: Any, ncols: int) -> None:
-    """Put a legend below everything."""
-    figure.legend(*entries, loc="outside lower center", ncols=ncols, fontsize=12, frameon=False)
+def legend(figure: Figure, *entries: Any, ncols: int, above: str = "") -> None:
+    """Put a legend below everything, and a text above it."""
+    figure.legend(
+        *entries,
+        loc="outside lower center",
+        ncols=ncols,
+        fontsize=12,
+        frameon=False,
+        title=above or None,
+        title_fontsize=12,
+    )
 
 
 def headline(title: str, what: str) -> str:

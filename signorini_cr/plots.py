@@ -79,13 +79,13 @@ def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
     parts = {part: _segments(domain, part) for part in PARTS}
 
     def draw() -> None:
-        figure, axes = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2))
+        figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2))
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
         for part, style in PARTS.items():
             if len(parts[part]):
                 draw_lines(axes, parts[part], zorder=3, capstyle="round", **style)
         legend(figure, ncols=3)
-        hidden = "" if len(edges) else ", too many to draw"
+        hidden = "" if len(edges) else ", inner edges not drawn"
         axes.set_title(headline(title, f"mesh of {grouped(cells)} cells{hidden}"), fontsize=14)
         save(figure, path)
 
@@ -111,24 +111,33 @@ def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
     touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
 
     def draw() -> None:
-        figure, axes = plane_axes(box, room=1.0)
+        figure, axes, width = plane_axes(box, room=1.2)
         shown = axes.imshow(
-            image, extent=box.T.ravel(), origin="lower", vmin=limits[0], vmax=limits[1]
+            image,
+            extent=box.T.ravel(),
+            origin="lower",
+            aspect=axes.get_aspect(),
+            vmin=limits[0],
+            vmax=limits[1],
         )
         draw_lines(axes, edges, color="white", linewidth=0.3, alpha=0.5)
         draw_lines(axes, boundary, color="black", linewidth=1.2, capstyle="round")
         where = " at facet midpoints" if solution.element == "CR" else ""
-        label = rf"contact: $u_h = \alpha${where}" if len(touching) else "no contact"
-        draw_lines(axes, touching, color=RED, linewidth=5.0, label=label, zorder=3)
+        if len(touching):
+            draw_lines(axes, touching, color=RED, linewidth=5.0, zorder=3,
+                       label=rf"contact: $u_h = \alpha${where}")  # fmt: skip
+        else:
+            axes.plot([], [], linestyle="none", label="no contact")
         points = contact.transitions
         if len(points):
             axes.plot(points[:, 0], points[:, 1], linestyle="none", marker="o", markersize=7,
                       color="white", markeredgecolor="black", zorder=4, clip_on=False,
                       label="contact begins or ends")  # fmt: skip
-        bar = figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.035, 1.0)))
-        bar.ax.set_title("$u_h$", fontsize=14)
+        beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
+        bar = figure.colorbar(shown, cax=beside)
+        bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=2, ha="left", va="center")
         bar.ax.tick_params(labelsize=11)
-        bar.formatter.set_powerlimits((-3, 4))
+        bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
         legend(figure, ncols=2)
         axes.set_title(headline(title, f"$u_h$ on {grouped(solution.cells)} cells"), fontsize=14)
         save(figure, path)
@@ -151,30 +160,36 @@ def plot_contact(solution: Solution, path: Where, title: str = "") -> None:
     table = contact.table()
     if contact.number == 0:
         raise InputError("a picture of the contact needs a contact boundary")
+    size = comm.allreduce(float(np.abs(solution.u.x.array).max(initial=0.0)), op=MPI.MAX)
 
     def draw() -> None:
         assert table is not None
         parts, lengths = _parts(table)
-        figure = new_figure(9.0, 6.6)
+        shares = np.maximum(lengths / lengths.max(), 0.2)
+        figure = new_figure(9.0, 6.6 + 0.2 * (len(parts) - 1))
         panels = figure.subplots(
-            2,
-            len(parts),
-            sharex="col",
-            sharey="row",
-            squeeze=False,
-            width_ratios=np.maximum(lengths / lengths.max(), 0.2),
+            2, len(parts), sharex="col", sharey="row", squeeze=False, width_ratios=shares
         )
-        for number, (column, rows) in enumerate(zip(panels.T, parts, strict=True)):
-            _contact_part(column, rows, contact.transitions)
+        lines = []
+        for column, rows, share in zip(panels.T, parts, shares / shares.sum(), strict=True):
+            course = _contact_part(column, rows, contact.transitions)
             if len(parts) > 1:
+                number = rows["part"][0]
                 column[0].set_title(f"part {number}", fontsize=12)
+                course = f"part {number} {course}"
+            column[1].locator_params(axis="x", nbins=max(int(9 * share), 1))
+            lines.append(course)
+        along = "arc length along $\\Gamma_1$, " + ",\n".join(lines)
+        # Not the rounding errors of a function that is zero
+        _enlarge(panels[0, 0], np.append(table["u"], table["obstacle"]), size)
+        _enlarge(panels[1, 0], table["pressure"], size / lengths.sum())
         panels[0, 0].set_ylabel(r"$u_h$ and $\alpha$, facet means", fontsize=13)
         panels[1, 0].set_ylabel(r"contact pressure $\lambda_h$", fontsize=13)
         entries: dict[str, Any] = {}
         for axes in panels.ravel():
             handles, labels = axes.get_legend_handles_labels()
             entries |= dict(zip(labels, handles, strict=True))
-        legend(figure, list(entries.values()), list(entries), ncols=5)
+        legend(figure, list(entries.values()), list(entries), ncols=5, above=along)
         count = f"{grouped(contact.number_active)} of {grouped(contact.number)} facets in contact"
         figure.suptitle(headline(title, count), fontsize=14)
         save(figure, path)
@@ -258,7 +273,9 @@ def _edges(mesh: Mesh) -> FloatArray:
     mesh.topology.create_connectivity(2, 1)
     edges = mesh.topology.index_map(1)
     number = edges.size_local if edges.size_global <= MOST_EDGES else 0
-    ends = entities_to_geometry(mesh, 1, np.arange(number, dtype=np.int32)).reshape(-1, 2)
+    ends = np.zeros((0, 2), dtype=np.int32)
+    if number:  # entities_to_geometry divides by it
+        ends = entities_to_geometry(mesh, 1, np.arange(number, dtype=np.int32)).reshape(-1, 2)
     return _gather(mesh.comm, mesh.geometry.x[ends, :2])
 
 
@@ -270,15 +287,15 @@ def _segments(domain: Domain, part: int) -> FloatArray:
 
 def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
     """The rows of the longest parts in the order along the boundary, and their lengths."""
-    lengths = np.bincount(table["part"], weights=table["length"])
+    lengths = np.bincount(table["part"], weights=table["length"]).astype(np.float64)
     longest = np.sort(np.argsort(-lengths, kind="stable")[:MOST_PARTS])
     rows = [{name: column[table["part"] == part] for name, column in table.items()}
             for part in longest]  # fmt: skip
     return rows, lengths[longest]
 
 
-def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) -> None:
-    """Draw one connected piece of Γ1: u_h above, the pressure below."""
+def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) -> str:
+    """Draw one connected piece of Γ1, u_h above, the pressure below; say where it runs."""
     from matplotlib.collections import PolyCollection
 
     upper, lower = panels
@@ -294,9 +311,9 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
     shift = offset[np.arange(len(near)), near]
     here = np.linalg.norm(shift, axis=1) <= 0.75 * length[near]
     points = (arc[near] + np.sum(shift * along[near], axis=1))[here]
-    runs = np.stack([begin, begin, end, end], axis=1)
-    runs = np.stack([runs, np.broadcast_to([0.0, 1.0, 1.0, 0.0], runs.shape)], axis=2)
-    lines = np.stack([np.stack([points, points], axis=1), [[0.0, 1.0]] * len(points)], axis=2)
+    # Corners of the shaded boxes and ends of the lines, heights as shares of the panel's
+    runs = _upright(np.stack([begin, begin, end, end], axis=1), [0.0, 1.0, 1.0, 0.0])
+    lines = _upright(np.stack([points, points], axis=1), [0.0, 1.0])
     for axes in panels:
         across = axes.get_xaxis_transform()
         shaded = PolyCollection(runs, transform=across, color=RED, alpha=0.15, linewidth=0)
@@ -313,5 +330,18 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
     upper.plot(arc, rows["obstacle"], color="black", linestyle="--", label=r"obstacle $\alpha$")
     lower.stairs(rows["pressure"], edges, color=RED, linewidth=2, label=r"$\lambda_h$")
     ends = middle[[0, -1]] + along[[0, -1]] * (edges[[0, -1]] - arc[[0, -1]])[:, None]
-    start, stop = (f"({x:.3g}, {y:.3g})" for x, y in ends + 0.0)
-    lower.set_xlabel(f"arc length along $\\Gamma_1$\nfrom {start} to {stop}", fontsize=12)
+    ends[np.abs(ends) < 1e-9 * np.abs(middle).max()] = 0.0
+    start, stop = (f"({x:.3g}, {y:.3g})" for x, y in ends)
+    closed = np.linalg.norm(ends[1] - ends[0]) < 0.25 * length.min()
+    return f"round from {start}" if closed else f"from {start} to {stop}"
+
+
+def _enlarge(axes: Axes, values: npt.NDArray, size: float) -> None:
+    """See that the vertical axis shows more than differences of 1e-6 of `size`."""
+    if np.ptp(values) < 1e-6 * size:
+        axes.set_ylim(values[0] - size, values[0] + size)
+
+
+def _upright(x: FloatArray, heights: Sequence[float]) -> FloatArray:
+    """Points at abscissas of shape (n, k), row by row at the same k heights, shape (n, k, 2)."""
+    return np.stack([x, np.broadcast_to(heights, x.shape)], axis=2)

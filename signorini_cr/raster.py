@@ -43,7 +43,7 @@ def raster(
     comm.Allreduce(MPI.IN_PLACE, highest, op=MPI.MAX)
     box = np.stack([lowest[:2], highest[:2]])
     size = box[1] - box[0]
-    columns, rows = np.maximum(np.rint(pixels * size / size.max()), 16).astype(int)
+    columns, rows = np.maximum(np.rint(pixels * size / size.max()), pixels // 5).astype(int)
     image = np.full((rows, columns), -np.inf)
     # In these coordinates pixel (i, j) has its centre at (i, j)
     _paint(image, (corners - box[0]) * (np.array([columns, rows]) / size) - 0.5, values)
