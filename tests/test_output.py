@@ -1,0 +1,331 @@
+"""The report, the tables, the files: do they say what the solution says?"""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_rectangle,
+    create_unit_cube,
+    exterior_facet_indices,
+    meshtags,
+)
+from mpi4py import MPI
+
+from signorini_cr import Domain, InputError, Problem, output, solve, solve_levels
+from signorini_cr.files import check_writable, write_files
+from signorini_cr.space import function_space
+from signorini_cr.vtu import write_vtu
+
+WORLD = MPI.COMM_WORLD
+
+LEVEL = {
+    "level", "cells", "dofs", "h", "newton_iterations", "linear_iterations", "energy", "kkt",
+    "contact", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1", "effectivity", "seconds",
+}  # fmt: skip
+CONTACT_HEADER = ["part", "arc_length", "x", "y", "length", "obstacle", "u", "pressure", "active"]
+
+
+def rectangle(n, comm=WORLD):
+    """(−1, 1) × (0, 1) with Γ1 below and Γ0 elsewhere."""
+    mesh = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [2 * n, n])
+    mesh.topology.create_connectivity(1, 2)
+    facets = exterior_facet_indices(mesh.topology)
+    below = compute_midpoints(mesh, 1, facets)[:, 1] < 1e-12
+    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, np.where(below, 1, 2).astype(np.int32)))
+
+
+# Contact on x < 0
+def exact(x):
+    plus = ufl.conditional(ufl.gt(x[0], 0), x[0], 0.0)
+    minus = ufl.conditional(ufl.lt(x[0], 0), -x[0], 0.0)
+    return plus**3 - x[1] * minus**3
+
+
+PROBLEM = Problem(exact=exact)
+
+
+def run(comm=WORLD, levels=3):
+    records = []
+    for solution in solve_levels(PROBLEM, rectangle(4, comm), levels):
+        records.append(output.level_record(solution, records[-1] if records else None))
+    return solution, output.make_report("A", "CR", comm, records)
+
+
+@pytest.fixture(scope="module")
+def finished():
+    return run()
+
+
+@pytest.fixture
+def folder(shared_tmp_path, finished):
+    solution, report = finished
+    output.write_output(shared_tmp_path / "out", report, solution, pictures=False)
+    return shared_tmp_path / "out"
+
+
+def test_the_report_has_the_keys_that_others_rely_on(folder):
+    report = json.loads((folder / "report.json").read_text())
+    assert set(report) == {"title", "element", "ranks", "versions", "levels"}
+    assert set(report["versions"]) == {"signorini_cr", "dolfinx", "petsc", "gmsh"}
+    for record in report["levels"]:
+        assert set(record) == LEVEL
+        assert set(record["kkt"]) == {"min_gap", "min_pressure", "complementarity", "residual"}
+        assert set(record["contact"]) == {"facets", "active", "length", "force", "transitions"}
+        assert set(record["seconds"]) == {"mesh", "assemble", "solve", "estimate"}
+    assert report["ranks"] == WORLD.size
+    assert [record["level"] for record in report["levels"]] == [0, 1, 2]
+
+
+def test_the_report_says_what_the_solution_says(finished, folder):
+    solution, _ = finished
+    record = json.loads((folder / "report.json").read_text())["levels"][-1]
+    assert (record["cells"], record["contact"]["facets"]) == (1024, 32)
+    assert record["energy"] == solution.energy
+    assert record["contact"]["force"] == solution.contact.force
+    # ∫ |x|³ over (−1, 0), and the end of contact, at the origin
+    assert record["contact"]["force"] == pytest.approx(0.25, rel=0.02)
+    (point,) = record["contact"]["transitions"]
+    assert len(point) == 2
+    assert point == pytest.approx([0, 0], abs=0.15)
+    assert record["rate_h1"] == pytest.approx(1, abs=0.1)
+    assert record["rate_l2"] == pytest.approx(2, abs=0.1)
+    assert record["bound_h1"] is None
+
+
+def test_rates_need_two_errors_on_two_meshes(finished):
+    solution, report = finished
+    last = report["levels"][-1]
+    assert output.level_record(solution)["rate_h1"] is None
+    assert output.level_record(solution, last)["rate_h1"] is None
+    coarser = last | {"h": 4 * last["h"], "error_h1": 8 * last["error_h1"], "error_l2": None}
+    record = output.level_record(solution, coarser)
+    assert record["rate_h1"] == pytest.approx(1.5)
+    assert record["rate_l2"] is None
+
+
+def test_without_an_exact_solution_errors_are_null():
+    record = output.level_record(solve(Problem(f=1.0), rectangle(4)))
+    assert all(record[key] is None for key in ("error_h1", "error_l2", "rate_h1", "rate_l2"))
+
+
+def test_what_json_does_not_know_is_null():
+    odd = {"a": np.float64("nan"), "b": (np.inf, np.int32(3)), "c": np.array([[1.0, -np.inf]])}
+    assert output.plain(odd) == {"a": None, "b": [None, 3], "c": [[1.0, None]]}
+    json.dumps(output.plain(odd), allow_nan=False)
+
+
+def test_one_rank_reports_what_all_ranks_report(finished):
+    alone = output.plain(run(MPI.COMM_SELF)[1])["levels"]
+
+    def figures(value):
+        if isinstance(value, dict):
+            # Iterations of the linear solver, times and what rounding leaves of zero may differ
+            skip = ("linear_iterations", "seconds", "kkt")
+            return [x for key, item in value.items() if key not in skip for x in figures(item)]
+        return [x for item in value for x in figures(item)] if isinstance(value, list) else [value]
+
+    for mine, all_of_us in zip(alone, finished[1]["levels"], strict=True):
+        assert figures(mine) == pytest.approx(figures(all_of_us), rel=1e-6, abs=1e-9)
+
+
+def variants(record):
+    """The record with and without an exact solution and a bound, its numbers large."""
+    large = record | {"cells": 9_999_999, "dofs": 9_999_999, "linear_iterations": 999, "level": 12}
+    large["contact"] = record["contact"] | {"active": 123_456}
+    for exact_known in (True, False):
+        known = {} if exact_known else dict.fromkeys(("error_h1", "error_l2"), None)
+        for bound in (1.234e-7, None):
+            yield large | known | {"bound_h1": bound, "effectivity": bound and 1.4}
+
+
+def test_the_table_fits_eighty_columns_and_is_aligned(finished):
+    for record in variants(finished[1]["levels"][-1]):
+        header, row = output.table_header(record), output.table_row(record)
+        assert len(header) == len(row) <= 80
+        # Every column ends where its title ends
+        ends = [match.end() for match in re.finditer(r"\S+", row)]
+        assert len(ends) >= 9
+        assert all(header[end - 1] != " " for end in ends)
+        assert ("bound" in header) == (record["bound_h1"] is not None)
+        assert ("H1 error" in header) == (record["error_h1"] is not None)
+        assert ("energy" in header) == (record["error_h1"] is None)
+
+
+def test_rows_keep_the_columns_of_the_first(finished):
+    record = finished[1]["levels"][-1]
+    without = record | {"error_h1": None, "error_l2": None}
+    assert len(output.table_row(without, record)) == len(output.table_header(record))
+
+
+def test_the_markdown_table_is_the_printed_one(finished, folder):
+    levels = finished[1]["levels"]
+    head, rule, *rows = (folder / "levels.md").read_text().splitlines()
+    assert len(rows) == len(levels)
+    assert re.fullmatch(r"\|( -+: \|)+", rule)
+    assert head.replace("|", " ").split() == output.table_header(levels[0]).split()
+    for row, record in zip(rows, levels, strict=True):
+        assert row.replace("|", " ").split() == output.table_row(record, levels[0]).split()
+
+
+def test_levels_csv_holds_the_whole_record(finished, folder):
+    with (folder / "levels.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [
+        "level", "cells", "dofs", "h", "newton_iterations", "linear_iterations", "energy",
+        "kkt_min_gap", "kkt_min_pressure", "kkt_complementarity", "kkt_residual",
+        "contact_facets", "contact_active", "contact_length", "contact_force",
+        "contact_transitions", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1",
+        "effectivity", "seconds_mesh", "seconds_assemble", "seconds_solve", "seconds_estimate",
+    ]  # fmt: skip
+    for row, record in zip(rows, finished[1]["levels"], strict=True):
+        assert float(row["contact_force"]) == record["contact"]["force"]
+        assert float(row["error_h1"]) == record["error_h1"]
+        points = [[float(x) for x in p.split()] for p in row["contact_transitions"].split(";") if p]
+        assert points == record["contact"]["transitions"]
+    assert rows[0]["rate_h1"] == ""
+
+
+def test_contact_csv_runs_along_the_boundary_and_adds_up(finished, folder):
+    contact = finished[1]["levels"][-1]["contact"]
+    with (folder / "contact.csv").open() as file:
+        assert next(csv.reader(file)) == CONTACT_HEADER
+    rows = np.loadtxt(folder / "contact.csv", delimiter=",", skiprows=1)
+    column = dict(zip(CONTACT_HEADER, rows.T, strict=True))
+    assert len(rows) == contact["facets"]
+    assert np.all(column["part"] == 0)
+    assert np.all(np.diff(column["arc_length"]) > 0)
+    assert column["arc_length"] == pytest.approx(column["x"] + 1)
+    assert column["y"] == pytest.approx(0)
+    assert column["pressure"] @ column["length"] == pytest.approx(contact["force"], rel=1e-10)
+    assert column["active"].sum() == contact["active"]
+    assert column["active"] @ column["length"] == pytest.approx(contact["length"])
+    assert set(column["active"]) == {0.0, 1.0}
+
+
+def read_vtu(path):
+    """The arrays of a .vtu file with raw appended data, by name."""
+    content = path.read_bytes()
+    head, data = content.split(b'<AppendedData encoding="raw">\n_', 1)
+    pattern = r'<DataArray type="(\w+)" Name="(\w+)" NumberOfComponents="(\d)" .*?offset="(\d+)"/>'
+    arrays = {}
+    for kind, name, components, offset in re.findall(pattern, head.decode()):
+        start = int(offset) + 8
+        size = int.from_bytes(data[start - 8 : start], "little")
+        array = np.frombuffer(data[start : start + size], dtype=kind.lower())
+        arrays[name] = array.reshape(-1, int(components)) if int(components) > 1 else array
+        end = start + size
+    assert data[end:] == b"\n</AppendedData>\n</VTKFile>\n"
+    assert f'NumberOfPoints="{len(arrays["points"])}"' in head.decode()
+    assert f'NumberOfCells="{len(arrays["types"])}"' in head.decode()
+    return arrays
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_field_for_paraview_is_the_cr_function_itself(shared_tmp_path, dim):
+    mesh = rectangle(4).mesh if dim == 2 else create_unit_cube(WORLD, 2, 2, 2)
+    u = fem.Function(function_space(mesh, "CR"))
+
+    def wave(x):
+        return np.sin(3 * x[0]) * np.cos(2 * x[1]) + x[2]
+
+    u.interpolate(wave)
+    u.x.scatter_forward()
+    write_vtu(u, shared_tmp_path / "u.vtu")
+    arrays = read_vtu(shared_tmp_path / "u.vtu")
+    cells = mesh.topology.index_map(dim).size_global
+    points, values = arrays["points"], arrays["u"]
+    assert len(points) == len(values) == (dim + 1) * cells
+    assert np.array_equal(arrays["connectivity"], np.arange(len(points)))
+    assert np.array_equal(arrays["offsets"], (dim + 1) * np.arange(1, cells + 1))
+    assert set(arrays["types"]) == {5 if dim == 2 else 10}
+    # The cells fill the domain, and on the middle of each facet stands the facet's dof
+    corners, at_corners = points.reshape(cells, dim + 1, 3), values.reshape(cells, dim + 1)
+    edges = (corners[:, 1:] - corners[:, :1])[:, :, :dim]
+    volume = np.abs(np.linalg.det(edges)).sum() / (2 if dim == 2 else 6)
+    assert volume == pytest.approx(2.0 if dim == 2 else 1.0)
+    for opposite in range(dim + 1):
+        middle = np.delete(corners, opposite, axis=1).mean(axis=1)
+        means = np.delete(at_corners, opposite, axis=1).mean(axis=1)
+        assert means == pytest.approx(wave(middle.T))
+    # The jumps are there
+    _, which = np.unique(points.round(9), axis=0, return_inverse=True)
+    at_first = [values[which.ravel() == 0].min(), values[which.ravel() == 0].max()]
+    spread = max(np.ptp(values[which.ravel() == i]) for i in range(which.max() + 1))
+    assert np.all(np.isfinite(at_first))
+    assert spread > 1e-3
+
+
+def test_a_writer_that_fails_leaves_everything_as_it_was(shared_tmp_path):
+    folder = shared_tmp_path / "kept"
+    if WORLD.rank == 0:
+        folder.mkdir()
+        (folder / "report.json").write_text("old")
+        (folder / "notes.txt").write_text("mine")
+    WORLD.barrier()
+
+    def good(path):
+        if WORLD.rank == 0:
+            path.write_text("new")
+
+    def bad(path):
+        raise InputError("no")
+
+    for target in (folder, shared_tmp_path / "not" / "there"):
+        with pytest.raises(InputError, match="no"):
+            write_files(target, {"report.json": good, "levels.csv": bad}, removed=["notes.txt"])
+        WORLD.barrier()
+    assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", "report.json"]
+    assert (folder / "report.json").read_text() == "old"
+    assert sorted(path.name for path in shared_tmp_path.iterdir()) == ["kept"]
+
+
+def test_only_our_own_leftovers_are_removed(finished, shared_tmp_path):
+    if WORLD.rank == 0:
+        for name in ("convergence.png", "notes.txt", "report.json"):
+            (shared_tmp_path / name).write_text("old")
+    WORLD.barrier()
+    solution, report = finished
+    names = output.write_output(shared_tmp_path, report, solution, pictures=False)
+    WORLD.barrier()
+    there = {path.name for path in shared_tmp_path.iterdir()}
+    assert there == {*names, "notes.txt"}
+    assert "convergence.png" not in there
+    assert (shared_tmp_path / "notes.txt").read_text() == "old"
+    assert json.loads((shared_tmp_path / "report.json").read_text())["title"] == "A"
+
+
+def test_a_folder_that_cannot_be_written_is_found_out_first(shared_tmp_path, monkeypatch):
+    if WORLD.rank == 0:
+        (shared_tmp_path / "file").write_text("")
+        (shared_tmp_path / "taken" / "report.json").mkdir(parents=True)
+    WORLD.barrier()
+    check_writable(shared_tmp_path / "a" / "b")
+    assert not (shared_tmp_path / "a").exists()
+    with pytest.raises(InputError, match="file is not a folder"):
+        check_writable(shared_tmp_path / "file" / "out")
+    with pytest.raises(InputError, match="of that name"):
+        check_writable(shared_tmp_path / "taken", output.FILES)
+    if WORLD.rank == 0:
+        monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(InputError, match="not writable"):
+        check_writable(shared_tmp_path)
+
+
+def test_a_full_disk_is_told_in_words(finished, shared_tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    if WORLD.rank == 0:
+        monkeypatch.setattr(Path, "write_text", full)
+    solution, report = finished
+    with pytest.raises(InputError, match=r"cannot write report.json: No space left"):
+        output.write_output(shared_tmp_path / "out", report, solution)
+    WORLD.barrier()
+    assert not (shared_tmp_path / "out").exists()
