@@ -88,8 +88,7 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
     _check(coarse)
     owned = coarse.topology.index_map(2).size_local
     marked = np.asarray(marked_cells)
-    if marked.dtype == bool:
-        marked = np.flatnonzero(marked[:owned])
+    marked = np.flatnonzero(marked) if marked.dtype == bool else marked.astype(np.int32)
     marked = marked[(marked >= 0) & (marked < owned)]
     of_cells = _table(coarse.topology.connectivity(2, 1))
     edges = np.unique(of_cells[marked]).astype(np.int32)
