@@ -1,0 +1,135 @@
+"""What is measured of u − u_h: the broken norm (1.6), L2, λ on Γ1, and the rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import basix
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
+
+from . import compat
+from .levels import Solution
+from .problem import Data, Forms, as_expression
+from .space import facet_entities, vertex_values
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def rates(h: Sequence[float], errors: Sequence[float]) -> FloatArray:
+    """Orders observed between successive levels, log(e_k / e_{k+1}) / log(h_k / h_{k+1}).
+
+    Returns:
+        One less than there are levels; not a number where an error is 0.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.diff(np.log(np.asarray(errors))) / np.diff(np.log(np.asarray(h)))
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+def errors(solution: Solution, degree: int) -> tuple[float, float]:
+    """Like `Solution.errors`, with a quadrature of another degree; collective.
+
+    Returns:
+        ‖u − u_h‖_h in the broken norm (1.6) and ‖u − u_h‖ in L2.
+    """
+    problem = replace(solution.problem, error_degree=degree)
+    forms = Forms(problem, solution.domain.mesh, solution.element)
+    h1, l2 = (
+        _total(
+            solution.domain.mesh,
+            fem.assemble_scalar(kernel.on(solution.domain, (), [solution.u])),
+        )
+        for kernel in forms.squared_errors
+    )
+    return h1**0.5, l2**0.5
+
+
+def pressure_error(solution: Solution, pressure: Data, degree: int = 12) -> float:
+    """‖λ − λ_h‖ in L2(Γ1), with λ_h constant on each facet; collective.
+
+    Args:
+        solution: u_h and λ_h.
+        pressure: λ = ∂ₙu, a function of x.
+        degree: Degree of the quadrature on the facets.
+    """
+    mesh, contact = solution.domain.mesh, solution.contact
+    points, weights = facet_quadrature(mesh, degree)
+    difference = facet_values(mesh, pressure, contact.facets, points) - contact.pressure[:, None]
+    return _total(mesh, float(np.sum((difference**2 @ weights) * contact.measure))) ** 0.5
+
+
+def distance(coarse: Solution, fine: Solution) -> float:
+    """‖u_H − u_h‖_h of the solutions on a mesh and on the next in its sequence; collective.
+
+    Where u is not known, these distances fall as the errors do.
+
+    Args:
+        coarse: u_H, the solution that the fine one started from.
+        fine: u_h.
+    """
+    parent = fine.level.parent_cell
+    if parent is None or fine.level.coarser is not coarse.level:
+        raise ValueError("the second solution isn't from the level after the first one's")
+    mesh = fine.domain.mesh
+    gradients, volumes = cell_gradients(fine.u)
+    coarse_gradients, _ = cell_gradients(coarse.u)
+    difference = gradients - coarse_gradients[parent[: len(gradients)]]
+    return _total(mesh, float(volumes @ (difference**2).sum(axis=1))) ** 0.5
+
+
+def cell_gradients(u: fem.Function) -> tuple[FloatArray, FloatArray]:
+    """The gradient of a CR or P1 function on each cell of this rank.
+
+    Returns:
+        Gradients, shape (cells, gdim), and the cells' volumes, shape (cells,).
+    """
+    mesh = u.function_space.mesh
+    tdim, gdim = mesh.topology.dim, mesh.geometry.dim
+    cells = slice(mesh.topology.index_map(tdim).size_local)
+    values = vertex_values(u, cells)
+    x = mesh.geometry.x[mesh.geometry.dofmap[cells], :gdim]
+    edges = x[:, 1:] - x[:, :1]
+    rises = (values[:, 1:] - values[:, :1])[..., None]
+    volumes = np.abs(np.linalg.det(edges)) / np.prod(np.arange(1, tdim + 1))
+    return np.linalg.solve(edges, rises)[..., 0], volumes
+
+
+def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Points on the reference facet, shape (q, d − 1), and weights that add up to 1."""
+    facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
+    points, weights = basix.make_quadrature(facet, degree)
+    return points, weights / weights.sum()
+
+
+def facet_values(
+    mesh: Mesh, data: Data, facets: npt.NDArray[np.int32], points: FloatArray
+) -> FloatArray:
+    """Evaluate data at the same points of each facet; collective.
+
+    Args:
+        mesh: Where.
+        data: A function of x, say.
+        facets: Local indices, shape (n,).
+        points: On the reference facet, shape (q, d − 1).
+
+    Returns:
+        Shape (n, q).
+    """
+    x = ufl.SpatialCoordinate(mesh)
+    # A constant is not an expression in x that could be compiled
+    expression = as_expression(data, x) + 0.0 * x[0]
+    if not ufl.domain.extract_domains(expression):
+        return np.full((len(facets), len(points)), float(expression))
+    compiled = fem.Expression(expression, points, mesh.comm)
+    entities = facet_entities(mesh, facets)
+    return compat.evaluate_on_facets(compiled, mesh, entities).reshape(len(facets), len(points))
+
+
+def _total(mesh: Mesh, share: float) -> float:
+    return float(mesh.comm.allreduce(share, op=MPI.SUM))
