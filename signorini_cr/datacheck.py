@@ -1,0 +1,129 @@
+"""The data tried out on a mesh, before anything is solved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx.mesh import compute_midpoints, entities_to_geometry
+
+from .domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain
+from .errors import InputError
+from .expressions import Expression, parse
+
+Array = npt.NDArray[np.float64]
+_ZERO = parse("0")
+
+USED_ON: dict[str, int | None] = {
+    "data.coefficient": None,
+    "data.f": None,
+    "data.g": NEUMANN,
+    "data.obstacle": CONTACT,
+    "data.dirichlet": DIRICHLET,
+    "exact.u": None,
+}
+"""Where each expression is used: a part of the boundary, or None for the whole domain."""
+
+
+def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
+    """Insist on finite data, and on a positive coefficient; collective.
+
+    Args:
+        expressions: The data by key, ``data.f`` … ``exact.u``.
+        domain: They are evaluated at vertices and midpoints of its cells or, where they belong to
+            a part of the boundary, of that part's facets.
+
+    Raises:
+        InputError: The message names the key and the first such point from the left.
+    """
+    bad: tuple[Any, ...] = (math.inf,)
+    for number, (key, expression) in enumerate(expressions.items()):
+        points = _points(domain, USED_ON[key])
+        values = expression.numpy(points)
+        wrong = ~np.isfinite(values)
+        if key == "data.coefficient":
+            wrong |= values <= 0
+        if wrong.any():
+            found = np.column_stack([points[:, :2], values])[wrong]
+            first = found[np.lexsort((found[:, 1], found[:, 0]))[0]]
+            bad = (number, *first.tolist())
+            break
+    bad = min(domain.mesh.comm.allgather(bad), key=lambda found: found[:3])
+    if len(bad) == 1:
+        return
+    key = list(expressions)[bad[0]]
+    message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
+    if math.isfinite(bad[3]):
+        raise InputError(f"{message}; the coefficient must be above 0 everywhere")
+    part = USED_ON[key]
+    where = "in the domain" if part is None else f"on the {_name(part)} part"
+    raise InputError(
+        f"{message}; it must be finite everywhere {where}"
+        " (where(condition, a, b) can set a value apart)"
+    )
+
+
+def check_meeting_points(expressions: Mapping[str, Expression], domain: Domain) -> None:
+    """Insist on α ≤ u_D where Γ0 meets Γ1, or else K would be empty; collective.
+
+    Args:
+        expressions: The data by key; what is left out is 0, or comes from ``exact.u``.
+        domain: Mesh and boundary parts.
+
+    Raises:
+        InputError: The message names the point and both values.
+    """
+    comm = domain.mesh.comm
+    u_D = expressions.get("data.dirichlet", expressions.get("exact.u", _ZERO))
+    alpha = expressions.get("data.obstacle", _ZERO)
+    facets, fixed = domain.facets(CONTACT), domain.facets(DIRICHLET)
+    nodes = _vertices(domain, facets)
+    others = comm.allgather(_global(domain, _vertices(domain, fixed)))
+    shared = nodes[np.isin(_global(domain, nodes), np.concatenate(others))]
+    points = domain.mesh.geometry.x[shared]
+    above, below = alpha.numpy(points), u_D.numpy(points)
+    on_contact = alpha.numpy(domain.mesh.geometry.x[nodes])
+    scale = max(comm.allgather(np.abs([*on_contact, *below]).max(initial=0.0)))
+    found = np.column_stack([points[:, :2], above, below])[above - below > 1e-9 * scale]
+    bad = min(comm.allgather(min(found.tolist(), default=[math.inf])))
+    if len(bad) > 1:
+        raise InputError(
+            f"data.obstacle: at {_point(bad[:2])}, where contact and dirichlet meet, the"
+            f" obstacle is {bad[2]:.10g} but the dirichlet value is only {bad[3]:.10g};"
+            " the obstacle must not be above it"
+        )
+
+
+def _points(domain: Domain, part: int | None) -> Array:
+    """Vertices and midpoints of the cells, or of the facets of one part, shape (n, 3)."""
+    mesh = domain.mesh
+    tdim = mesh.topology.dim
+    if part is None:
+        cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
+        return np.vstack([mesh.geometry.x, compute_midpoints(mesh, tdim, cells)])
+    facets = domain.facets(part)
+    vertices = mesh.geometry.x[_vertices(domain, facets)]
+    return np.vstack([vertices, compute_midpoints(mesh, tdim - 1, facets)])
+
+
+def _vertices(domain: Domain, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Geometry nodes of the facets' vertices, each once."""
+    mesh = domain.mesh
+    if len(facets) == 0:
+        return np.empty(0, dtype=np.int32)
+    return np.unique(entities_to_geometry(mesh, mesh.topology.dim - 1, facets))
+
+
+def _global(domain: Domain, nodes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+    return domain.mesh.geometry.index_map().local_to_global(nodes.astype(np.int32))
+
+
+def _name(part: int) -> str:
+    return next(name for name, value in PARTS.items() if value == part)
+
+
+def _point(x: Collection[float]) -> str:
+    return "(" + ", ".join(f"{value:.10g}" for value in x) + ")"

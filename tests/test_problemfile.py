@@ -1,0 +1,184 @@
+"""Problem files: what they say is what one gets, and what they leave out has its default."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
+from signorini_cr.errors import InputError
+from signorini_cr.levels import solve, solve_levels
+from signorini_cr.problemfile import ProblemFile, load
+
+SQUARE = """
+[domain]
+vertices = [[0, 0], [1, 0], [1, 1], [0, 1]]
+boundary = ["contact", "neumann", "dirichlet", "neumann"]
+size = 0.5
+"""
+MESH = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+1 1 "contact"
+1 2 "dirichlet"
+2 3 "body"
+$EndPhysicalNames
+$Nodes
+4
+1 0 0 0
+2 1 0 0
+3 1 1 0
+4 0 1 0
+$EndNodes
+$Elements
+4
+1 1 2 1 1 1 2
+2 1 2 2 2 3 4
+3 2 2 3 1 1 2 3
+4 2 2 3 1 1 3 4
+$EndElements
+"""
+
+
+@pytest.fixture
+def read(shared_tmp_path: Path):
+    def read(text: str, name: str = "case.toml") -> ProblemFile:
+        path = shared_tmp_path / name
+        if MPI.COMM_WORLD.rank == 0:
+            path.write_text(text, encoding="utf-8")
+        MPI.COMM_WORLD.Barrier()
+        return load(path)
+
+    return read
+
+
+def test_defaults(read) -> None:
+    case = read(SQUARE + "[data]\n")
+    assert (case.title, case.mode, case.levels, case.tolerance) == ("case", "uniform", 1, 0.0)
+    assert case.max_dofs >= 10**5
+    problem = case.problem
+    assert (problem.f, problem.g, problem.dirichlet, problem.exact) == (None,) * 4
+    assert (problem.obstacle, problem.coefficient) == (0.0, 1.0)
+
+
+def test_everything_is_taken_over(read) -> None:
+    case = read(
+        '\ufefftitle = "All of it"\r\n'
+        + SQUARE
+        + """
+        [[domain.holes]]
+        vertices = [[0.4, 0.4], [0.6, 0.4], [0.5, 0.6]]
+        boundary = ["neumann", "dirichlet", "contact"]
+        [define]
+        a = 2
+        b = "a*x"
+        [data]
+        f = "b + 1"
+        g = 3
+        obstacle = -1.5
+        dirichlet = "where(x < 0.5, b,\\n 1)"
+        coefficient = "1 + x**2"
+        [exact]
+        u = "sin(x)*y"
+        [refine]
+        mode = "adaptive"
+        levels = 7
+        tolerance = 1e-2
+        max_dofs = 5000
+        """
+    )
+    assert isinstance(case.domain, Polygon)
+    assert len(case.domain.holes) == 1 and case.domain.holes[0].boundary[1] == "dirichlet"
+    assert (case.title, case.size) == ("All of it", 0.5)
+    assert (case.mode, case.levels, case.tolerance) == ("adaptive", 7, 0.01)
+    assert case.max_dofs == 5000
+    assert (case.problem.g, case.problem.obstacle) == (3.0, -1.5)
+    assert case.problem.f((2.0, 0.0)) == 5.0  # any coordinates will do
+    points = np.array([[0.25, 0.0], [0.75, 0.0]])
+    assert np.allclose(case.expressions["data.dirichlet"].numpy(points), [0.5, 1.0])
+    assert np.allclose(case.expressions["exact.u"].numpy([[1.0, 2.0]]), 2 * np.sin(1.0))
+
+
+def test_expressions_and_numbers_are_the_same(read) -> None:
+    """-Δu = 2 on the strip with u = 0 at the top: the energy is the same either way."""
+    energies = []
+    for f in ("2", '"1 + 1"', '"2 + 0*x"', '"where(y < 2, 2, x)"'):
+        case = read(SQUARE + f"[data]\nf = {f}\n")
+        energies.append(solve(case.problem, case.mesh()).energy)
+    assert np.ptp(energies) < 1e-12 * abs(energies[0])
+
+
+def test_what_is_left_out_follows_from_the_exact_solution(read) -> None:
+    """u = x (1 − y)², in contact with α = x on all of Γ1 under the pressure 2 x."""
+    case = read(SQUARE + '[exact]\nu = "x*(1 - y)**2"\n[data]\nobstacle = "x"\n')
+    domain = case.mesh()
+    case.check(domain)
+    errors = [s.errors[0] for s in solve_levels(case.problem, domain, 3)]
+    assert np.allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.1)
+
+
+def test_a_mesh_file_lies_beside_the_problem_file(read, shared_tmp_path: Path) -> None:
+    if MPI.COMM_WORLD.rank == 0:
+        (shared_tmp_path / "two.msh").write_text(MESH)
+    case = read('domain.mesh = "two.msh"\n[data]\nf = 1\n')
+    domain = case.mesh()
+    numbers = [
+        MPI.COMM_WORLD.allreduce(len(domain.facets(p))) for p in (CONTACT, DIRICHLET, NEUMANN)
+    ]
+    assert numbers == [1, 1, 2]
+    case.check(domain)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        'f = "1/y"',  # at a vertex
+        'f = "1/(y - 1)"',
+        'g = "sqrt(x - 0.5)"',  # on x = 0
+        'obstacle = "1/x"',
+        'dirichlet = "log(x)"',
+        'coefficient = "x"',
+        "coefficient = 0",
+        'coefficient = "1/y"',
+    ],
+)
+def test_data_are_tried_out_where_they_are_used(read, data: str) -> None:
+    case = read(SQUARE + f"[data]\n{data}\n")
+    domain = case.mesh()
+    with pytest.raises(InputError, match=rf"data\.{data.split(' ')[0]}: the value at \("):
+        case.check(domain)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        'g = "1/(x - 0.5)"',  # on x = 0 and x = 1 only
+        'obstacle = "1/(1 - y)"',  # on y = 0
+        'dirichlet = "1/y"',  # on y = 1
+        'f = "where(y > 0, 1/y, 0)"',
+    ],
+)
+def test_and_only_there(read, data: str) -> None:
+    case = read(SQUARE + f"[data]\n{data}\n")
+    case.check(case.mesh())
+
+
+def test_the_obstacle_may_touch_the_dirichlet_value_where_they_meet(read) -> None:
+    """sin(pi) is 1e-16, which is not above 0 for this purpose."""
+    triangle = SQUARE.replace('"neumann", "dirichlet"', '"dirichlet", "dirichlet"')
+    case = read(triangle + '[data]\nobstacle = "sin(pi*x)"\n')
+    case.check(case.mesh())
+    case = read(triangle + '[data]\nobstacle = "sin(pi*x) + x*1e-6"\n')
+    domain = case.mesh()
+    with pytest.raises(InputError, match=r"data\.obstacle: at \(1, 0\), where contact and diri"):
+        case.check(domain)
+
+
+def test_too_many_levels_are_told_before_anything_is_solved(read) -> None:
+    case = read(SQUARE + "[data]\n[refine]\nlevels = 40\n")
+    domain = case.mesh()
+    with pytest.raises(InputError, match="levels is 40"):
+        case.check(domain)
