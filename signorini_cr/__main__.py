@@ -1,0 +1,7 @@
+"""``python3 -m signorini_cr`` is the command ``signorini-cr``."""
+
+import sys
+
+from .cli import main
+
+sys.exit(main())

@@ -1,0 +1,89 @@
+"""What the command prints, on rank 0: results to stdout, progress and complaints to stderr."""
+
+from __future__ import annotations
+
+import os
+import sys
+import textwrap
+
+WIDTH = 80
+
+
+class Screen:
+    """Standard output and error of one run.
+
+    Args:
+        root: Whether this rank prints.
+
+    Attributes:
+        quiet: Print complaints only.
+        verbose: Print every step of the solver for good.
+    """
+
+    def __init__(self, root: bool) -> None:
+        """Take everything as it comes at first."""
+        self.root, self.quiet, self.verbose = root, False, False
+        self.passing = 0  # width of the progress line that stands on the terminal
+
+    def line(self, text: str) -> None:
+        """A line of results."""
+        if self.root and not self.quiet:
+            self.clear()
+            self._put(text + "\n")
+
+    def text(self, text: str) -> None:
+        """Results as a paragraph."""
+        self.line(wrapped(text))
+
+    def step(self, text: str) -> None:
+        """A step of the solver: for good with -v, else as the progress line."""
+        if self.verbose:
+            self.line(text)
+        else:
+            self.progress(text.strip())
+
+    def progress(self, text: str) -> None:
+        """What is going on, on a terminal, until the next line."""
+        if self.root and not self.quiet and sys.stderr.isatty():
+            self.clear()
+            sys.stderr.write(text[: WIDTH - 1])
+            sys.stderr.flush()
+            self.passing = len(text[: WIDTH - 1])
+
+    def clear(self) -> None:
+        """Take the progress line away."""
+        if self.passing:
+            sys.stderr.write("\r" + " " * self.passing + "\r")
+            sys.stderr.flush()
+            self.passing = 0
+
+    def complain(self, message: str) -> None:
+        """Say what went wrong, quiet or not."""
+        if self.root:
+            self.clear()
+            self.flush()
+            print(wrapped(f"signorini-cr: {message}"), file=sys.stderr, flush=True)
+
+    def flush(self) -> None:
+        """Bring out what was printed, and take away the progress line."""
+        self.clear()
+        if self.root:
+            self._put("")
+
+    def _put(self, text: str) -> None:
+        try:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+        except BrokenPipeError:  # the reader has left; the results are still wanted
+            self.quiet = True
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def wrapped(text: str) -> str:
+    """Fold to the width of a terminal; lines that begin with blanks are left as they are."""
+    return "\n".join(
+        line
+        if line.startswith(" ")
+        else textwrap.fill(line, WIDTH, break_long_words=False, break_on_hyphens=False)
+        for line in text.rstrip().split("\n")
+    )
