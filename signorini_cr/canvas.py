@@ -75,7 +75,7 @@ def draw_lines(axes: Axes, segments: FloatArray, **style: Any) -> None:
     """Draw straight lines given by their ends, shape (n, 2, 2)."""
     from matplotlib.collections import LineCollection
 
-    axes.add_collection(LineCollection(segments, **style), autolim=False)
+    axes.add_collection(LineCollection(list(segments), **style), autolim=False)
 
 
 def legend(figure: Figure, *entries: Any, ncols: int, above: str = "") -> None:

@@ -70,6 +70,8 @@ def level_record(
     h1, l2 = solution.errors or (None, None)
     gdim = solution.domain.mesh.geometry.dim
     bound = None if certificate is None else certificate.bound_h1
+    seconds = {phase: solution.seconds.get(phase, 0.0) for phase in PHASES}
+    seconds["estimate"] += 0.0 if certificate is None else certificate.seconds
     return plain(
         {
             "level": solution.level.number,
@@ -98,7 +100,7 @@ def level_record(
             "rate_l2": _rate("error_l2", l2, solution.h, previous),
             "bound_h1": bound,
             "effectivity": bound / h1 if bound is not None and h1 else None,
-            "seconds": {phase: solution.seconds.get(phase, 0.0) for phase in PHASES},
+            "seconds": seconds,
         }
     )
 

@@ -114,7 +114,7 @@ def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
         figure, axes, width = plane_axes(box, room=1.2)
         shown = axes.imshow(
             image,
-            extent=box.T.ravel(),
+            extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
             origin="lower",
             aspect=axes.get_aspect(),
             vmin=limits[0],
@@ -235,13 +235,15 @@ def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: s
         axes.loglog(x, values, markersize=7, linewidth=2, **style)
         if key == "bound_h1" and "error_h1" in keys:
             continue
-        # A slope beside the curve, through its last point but for the factor
+        # A slope below the curve, touching it but for the factor
         order = (2 if key == "error_l2" else 1) * (1.0 if uniform else -0.5)
-        slope = 0.6 * values[-1] * (x / x[-1]) ** order
+        slope = x**order
+        slope *= 0.6 * np.min(values / slope)
         power = {1.0: "$h$", 2.0: "$h^2$", -0.5: "$N^{-1/2}$", -1.0: "$N^{-1}$"}[order]
         axes.loglog(x, slope, ":", color="black")
         axes.annotate(power, (np.sqrt(x[0] * x[-1]), np.sqrt(slope[0] * slope[-1])), fontsize=14,
-                      xytext=(0, -8), textcoords="offset points", va="top")  # fmt: skip
+                      xytext=(8 * np.sign(order), -5), textcoords="offset points",
+                      ha="left" if uniform else "right", va="top")  # fmt: skip
     if uniform and len(sizes) <= 8:
         axes.set_xticks(sizes, [f"{h:.2g}" for h in sizes])
         axes.set_xticks([], minor=True)
@@ -316,7 +318,7 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
     lines = _upright(np.stack([points, points], axis=1), [0.0, 1.0])
     for axes in panels:
         across = axes.get_xaxis_transform()
-        shaded = PolyCollection(runs, transform=across, color=RED, alpha=0.15, linewidth=0)
+        shaded = PolyCollection(list(runs), transform=across, color=RED, alpha=0.15, linewidth=0)
         shaded.set_label("contact" if len(runs) else None)
         axes.add_collection(shaded, autolim=False)
         draw_lines(axes, lines, transform=across, color="black", linestyle=":", linewidth=1.5,
@@ -325,7 +327,7 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
         axes.tick_params(labelsize=11)
         axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
         axes.grid(alpha=0.25)
-    marker = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
+    marker: dict[str, Any] = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
     upper.plot(arc, rows["u"], color=BLUE, linewidth=2, label="$u_h$", **marker)
     upper.plot(arc, rows["obstacle"], color="black", linestyle="--", label=r"obstacle $\alpha$")
     lower.stairs(rows["pressure"], edges, color=RED, linewidth=2, label=r"$\lambda_h$")

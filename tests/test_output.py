@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -108,6 +109,18 @@ def test_rates_need_two_errors_on_two_meshes(finished):
     record = output.level_record(solution, coarser)
     assert record["rate_h1"] == pytest.approx(1.5)
     assert record["rate_l2"] is None
+
+
+def test_the_bound_and_its_time_are_reported(finished):
+    solution, report = finished
+    plain = report["levels"][-1]
+    certificate = SimpleNamespace(bound_h1=3 * plain["error_h1"], seconds=100.0)
+    record = output.level_record(solution, None, certificate)
+    assert record["bound_h1"] == pytest.approx(3 * plain["error_h1"])
+    assert record["effectivity"] == pytest.approx(3)
+    assert 100 <= record["seconds"]["estimate"] < 200
+    unknown = output.level_record(solution, None, SimpleNamespace(bound_h1=None, seconds=1.0))
+    assert unknown["bound_h1"] is unknown["effectivity"] is None
 
 
 def test_without_an_exact_solution_errors_are_null():
