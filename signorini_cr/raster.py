@@ -9,6 +9,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
+from .compat import cell_nodes
 from .space import vertex_values
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,7 +36,7 @@ def raster(
     """
     mesh = u.function_space.mesh
     comm, owned = mesh.comm, mesh.topology.index_map(2).size_local
-    corners = mesh.geometry.x[mesh.geometry.dofmap[:owned, :3], :2]
+    corners = mesh.geometry.x[cell_nodes(mesh)[:owned, :3], :2]
     values = vertex_values(u, slice(owned))
     lowest = np.append(corners.min(axis=(0, 1), initial=np.inf), values.min(initial=np.inf))
     highest = np.append(corners.max(axis=(0, 1), initial=-np.inf), values.max(initial=-np.inf))

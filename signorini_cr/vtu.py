@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
+from .compat import cell_nodes
 from .errors import on_root, raise_together
 from .files import disk_errors
 from .space import vertex_values
@@ -36,7 +37,7 @@ def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
     offset = mesh.topology.index_map(tdim).local_range[0]
     cells = mesh.topology.index_map(tdim).size_global
     corners = tdim + 1
-    x = mesh.geometry.x[mesh.geometry.dofmap[:owned, :corners]]
+    x = mesh.geometry.x[cell_nodes(mesh)[:owned, :corners]]
     points = np.arange(offset * corners, (offset + owned) * corners)
     # name, components, type, values of this rank, values per cell
     arrays = [
