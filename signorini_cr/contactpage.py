@@ -1,0 +1,122 @@
+"""The picture of what happens along Γ1: u_h and the obstacle above, the pressure λ_h below."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .canvas import BLUE, RED, draw_lines, legend, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FloatArray = npt.NDArray[np.float64]
+Table = Mapping[str, npt.NDArray]
+
+MOST_PARTS = 6
+"""Contact parts with panels of their own: the longest ones."""
+
+
+def contact_page(table: Table, transitions: FloatArray, size: float) -> Figure:
+    """Draw all of Γ1, each connected part in a column of its own.
+
+    Args:
+        table: From `Contact.table`.
+        transitions: Points where contact begins or ends, shape (m, 2 or 3).
+        size: The largest |u_h| anywhere: far smaller values are drawn as the zeros they are.
+    """
+    parts, lengths = _parts(table)
+    shares = np.maximum(lengths / lengths.max(), 0.2)
+    figure = new_figure(9.0, 6.6 + 0.2 * (len(parts) - 1))
+    panels = figure.subplots(
+        2, len(parts), sharex="col", sharey="row", squeeze=False, width_ratios=shares
+    )
+    lines = []
+    for column, rows, share in zip(panels.T, parts, shares / shares.sum(), strict=True):
+        course = _contact_part(column, rows, transitions)
+        if len(parts) > 1:
+            name = f"part {rows['part'][0]}"
+            column[0].set_title(name, fontsize=12)
+            course = f"{name} {course}"
+        column[1].locator_params(axis="x", nbins=max(int(9 * share), 1))
+        lines.append(course)
+    number = len(np.unique(table["part"]))
+    longest = f"its {MOST_PARTS} longest parts of {number}:\n" if number > MOST_PARTS else ""
+    along = f"arc length along $\\Gamma_1$, {longest}" + ",\n".join(lines)
+    # Not the rounding errors of a function that is zero
+    _enlarge(panels[0, 0], np.append(table["u"], table["obstacle"]), size)
+    _enlarge(panels[1, 0], table["pressure"], size / lengths.sum())
+    panels[0, 0].set_ylabel(r"$u_h$ and $\alpha$, facet means", fontsize=13)
+    panels[1, 0].set_ylabel(r"contact pressure $\lambda_h$", fontsize=13)
+    entries: dict[str, Any] = {}
+    for axes in panels.ravel():
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    legend(figure, list(entries.values()), list(entries), ncols=5, above=along)
+    return figure
+
+
+def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
+    """The rows of the longest parts in the order along the boundary, and their lengths."""
+    lengths = np.bincount(table["part"], weights=table["length"]).astype(np.float64)
+    longest = np.sort(np.argsort(-lengths, kind="stable")[:MOST_PARTS])
+    rows = [{name: column[table["part"] == part] for name, column in table.items()}
+            for part in longest]  # fmt: skip
+    return rows, lengths[longest]
+
+
+def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) -> str:
+    """Draw one connected piece of Γ1, u_h above, the pressure below; say where it runs."""
+    from matplotlib.collections import PolyCollection
+
+    upper, lower = panels
+    arc, length, active = rows["arc_length"], rows["length"], rows["active"].astype(int)
+    middle = np.stack([rows["x"], rows["y"]], axis=1)
+    edges = np.append(arc - length / 2, arc[-1] + length[-1] / 2)
+    step = np.diff(active, prepend=0, append=0)
+    begin, end = edges[np.flatnonzero(step == 1)], edges[np.flatnonzero(step == -1)]
+    # Facet by facet along the boundary: where on this part are the transition points?
+    along = np.gradient(middle, arc, axis=0) if len(arc) > 1 else np.zeros((1, 2))
+    offset = transitions[:, None, :2] - middle
+    near = np.argmin(np.linalg.norm(offset, axis=2), axis=1)
+    shift = offset[np.arange(len(near)), near]
+    here = np.linalg.norm(shift, axis=1) <= 0.75 * length[near]
+    points = (arc[near] + np.sum(shift * along[near], axis=1))[here]
+    # Corners of the shaded boxes and ends of the lines, heights as shares of the panel's
+    runs = _upright(np.stack([begin, begin, end, end], axis=1), [0.0, 1.0, 1.0, 0.0])
+    lines = _upright(np.stack([points, points], axis=1), [0.0, 1.0])
+    for axes in panels:
+        across = axes.get_xaxis_transform()
+        shaded = PolyCollection(list(runs), transform=across, color=RED, alpha=0.15, linewidth=0)
+        shaded.set_label("contact" if len(runs) else None)
+        axes.add_collection(shaded, autolim=False)
+        draw_lines(axes, lines, transform=across, color="black", linestyle=":", linewidth=1.5,
+                   label="contact begins or ends" if len(points) else None)  # fmt: skip
+        axes.set_xlim(edges[0], edges[-1])
+        axes.tick_params(labelsize=11)
+        axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+        axes.grid(alpha=0.25)
+    marker: dict[str, Any] = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
+    upper.plot(arc, rows["u"], color=BLUE, linewidth=2, label="$u_h$", **marker)
+    upper.plot(arc, rows["obstacle"], color="black", linestyle="--", label=r"obstacle $\alpha$")
+    lower.stairs(rows["pressure"], edges, color=RED, linewidth=2, label=r"$\lambda_h$")
+    ends = middle[[0, -1]] + along[[0, -1]] * (edges[[0, -1]] - arc[[0, -1]])[:, None]
+    ends[np.abs(ends) < 1e-9 * np.abs(middle).max()] = 0.0
+    start, stop = (f"({x:.3g}, {y:.3g})" for x, y in ends)
+    closed = np.linalg.norm(ends[1] - ends[0]) < 0.25 * length.min()
+    return f"round from {start}" if closed else f"from {start} to {stop}"
+
+
+def _enlarge(axes: Axes, values: npt.NDArray, size: float) -> None:
+    """See that the vertical axis shows more than differences of 1e-6 of `size`."""
+    if np.ptp(values) < 1e-6 * size:
+        axes.set_ylim(values[0] - size, values[0] + size)
+
+
+def _upright(x: FloatArray, heights: Sequence[float]) -> FloatArray:
+    """Points at abscissas of shape (n, k), row by row at the same k heights, shape (n, k, 2)."""
+    return np.stack([x, np.broadcast_to(heights, x.shape)], axis=2)

@@ -1,0 +1,184 @@
+"""The pictures: is there on them what the solution says?"""
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from dolfinx.geometry import bb_tree, compute_colliding_cells, compute_collisions_points
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_rectangle,
+    create_unit_cube,
+    exterior_facet_indices,
+    meshtags,
+)
+from mpi4py import MPI
+
+from signorini_cr import Domain, InputError, Polygon, Problem, canvas, plots, solve
+from signorini_cr.raster import raster
+from signorini_cr.space import function_space
+
+image = pytest.importorskip("matplotlib.image")
+WORLD = MPI.COMM_WORLD
+
+
+def rectangle(n, neumann=False):
+    mesh = create_rectangle(WORLD, [[-1.0, 0.0], [1.0, 1.0]], [2 * n, n])
+    mesh.topology.create_connectivity(1, 2)
+    facets = exterior_facet_indices(mesh.topology)
+    x = compute_midpoints(mesh, 1, facets)
+    values = np.where(x[:, 1] < 1e-12, 1, np.where(neumann & (x[:, 0] > 1 - 1e-12), 3, 2))
+    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, values.astype(np.int32)), neumann=3)
+
+
+def holed():
+    """A square, all of its square hole in contact."""
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    hole = Polygon(0.4 * square, ("contact",) * 4)
+    sides = ("dirichlet", "contact", "neumann", "contact")
+    return Polygon(square, sides, holes=(hole,)).mesh(0.2)
+
+
+def share(path, color):
+    """How much of a picture, in percent, has this colour; on rank 0, 0 elsewhere."""
+    if WORLD.rank != 0:
+        return 0.0
+    wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    pixels = image.imread(path)[..., :3]
+    return 100 * np.mean(np.abs(pixels - wanted).max(axis=-1) < 0.02)
+
+
+def on_rank_0(value):
+    return WORLD.bcast(value, root=0)
+
+
+def test_the_mesh_shows_each_boundary_part_in_its_colour(shared_tmp_path):
+    path = shared_tmp_path / "mesh.png"
+    for neumann in (False, True):
+        plots.plot_mesh(rectangle(4, neumann), path, "price in $, 5 % off")
+        assert on_rank_0(share(path, canvas.RED)) > 0.5
+        assert on_rank_0(share(path, canvas.BLUE)) > 0.3
+        assert (on_rank_0(share(path, canvas.YELLOW)) > 0.1) == neumann
+
+
+def test_a_mesh_of_too_many_edges_is_drawn_without(shared_tmp_path, monkeypatch):
+    path = shared_tmp_path / "mesh.png"
+    plots.plot_mesh(rectangle(16), path)
+    with_edges = on_rank_0(share(path, "#ffffff"))
+    monkeypatch.setattr(plots, "MOST_EDGES", 10)
+    plots.plot_mesh(rectangle(16), path)
+    assert on_rank_0(share(path, "#ffffff")) > with_edges + 3
+    assert on_rank_0(share(path, canvas.RED)) > 0.5
+
+
+def test_the_solution_shows_where_it_is_in_contact(shared_tmp_path):
+    path = shared_tmp_path / "solution.png"
+    reds = []
+    for f in (1.0, lambda x: -x[0], -1.0):
+        solution = solve(Problem(f=f), rectangle(8))
+        plots.plot_solution(solution, path)
+        reds.append((solution.contact.number_active, on_rank_0(share(path, canvas.RED))))
+    (none, white), (half, some), (every, all_red) = reds
+    assert none == 0 < half < every == 16
+    assert white == 0.0
+    assert 0.2 < some < all_red
+
+
+@pytest.mark.parametrize("f", [1.0, -1.0, lambda x: x[0]])
+def test_contact_is_drawn_on_a_domain_with_a_hole(shared_tmp_path, f):
+    solution = solve(Problem(f=f, obstacle=lambda x: -0.01 + 0 * x[0]), holed())
+    assert set(on_rank_0((solution.contact.table() or {"part": [0]})["part"])) == {0, 1, 2}
+    plots.plot_contact(solution, shared_tmp_path / "contact.png", "hole")
+    plots.plot_solution(solution, shared_tmp_path / "solution.png", "hole")
+    # λ_h is drawn in red, u_h in blue
+    for color in (canvas.RED, canvas.BLUE):
+        assert on_rank_0(share(shared_tmp_path / "contact.png", color)) > 0.05
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scales_do_not_matter(shared_tmp_path, scale):
+    sides = ("contact", "dirichlet", "dirichlet", "dirichlet")
+    domain = Polygon(scale * np.array([[5, 0], [25, 0], [25, 1], [5, 1.0]]), sides).mesh(scale / 2)
+    solution = solve(Problem(f=lambda x: x[0] / scale - 15), domain)
+    plots.plot_mesh(domain, shared_tmp_path / "mesh.png")
+    plots.plot_contact(solution, shared_tmp_path / "contact.png")
+    plots.plot_solution(solution, shared_tmp_path / "solution.png")
+    for name in ("mesh", "contact", "solution"):
+        assert on_rank_0(share(shared_tmp_path / f"{name}.png", canvas.RED)) > 0.2
+
+
+def test_the_raster_is_exact_for_an_affine_function_and_empty_outside():
+    domain = holed()
+    u = fem.Function(function_space(domain.mesh, "CR"))
+    u.interpolate(lambda x: 2 * x[0] - 3 * x[1])
+    u.x.scatter_forward()
+    pixels, box, limits = raster(u, 100)
+    assert box == pytest.approx(np.array([[-1, -1], [1, 1]]))
+    assert limits == pytest.approx((-5, 5))
+    if WORLD.rank == 0:
+        y, x = np.meshgrid(*2 * [np.linspace(-0.99, 0.99, 100)], indexing="ij")
+        in_hole = np.maximum(np.abs(x), np.abs(y)) < 0.4
+        assert np.array_equal(np.isnan(pixels), in_hole)
+        assert pixels[~in_hole] == pytest.approx((2 * x - 3 * y)[~in_hole])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("n", [2, 60])
+def test_the_raster_has_the_values_of_a_jumping_function(n):
+    mesh = create_rectangle(WORLD, [[0.0, 0.0], [np.pi, 1.0]], [n, n])
+    u = fem.Function(function_space(mesh, "CR"))
+    u.x.array[:] = np.random.default_rng(1).random(len(u.x.array))
+    pixels, _, _ = raster(u, 50)
+    rows, columns = pixels.shape
+    x = np.zeros((rows * columns, 3))
+    x[:, 0] = np.tile((np.arange(columns) + 0.5) * np.pi / columns, rows)
+    x[:, 1] = np.repeat((np.arange(rows) + 0.5) / rows, columns)
+    candidates = compute_collisions_points(bb_tree(mesh, 2), x)
+    cells = compute_colliding_cells(mesh, candidates, x)
+    alone = np.flatnonzero(np.diff(cells.offsets) == 1)
+    assert len(alone) > 0.7 * len(x)
+    values = u.eval(x[alone], cells.array[cells.offsets[alone]])
+    assert pixels.ravel()[alone] == pytest.approx(values.ravel())
+
+
+def record(h, h1, l2=None, bound=None, dofs=100):
+    return {"h": h, "dofs": dofs, "error_h1": h1, "error_l2": l2, "bound_h1": bound,
+            "rate_h1": 1.0, "rate_l2": 2.0}  # fmt: skip
+
+
+@pytest.mark.serial
+def test_convergence_draws_what_there_is(tmp_path):
+    path = tmp_path / "convergence.png"
+    uniform = [record(2.0**-k, 2.0**-k, 4.0**-k, 1.4 * 2.0**-k) for k in range(5)]
+    assert set(plots.convergence_series(uniform)) == {"error_h1", "error_l2", "bound_h1"}
+    plots.plot_convergence(uniform, path)
+    assert all(share(path, color) > 0.05 for color in (canvas.BLUE, canvas.RED, canvas.YELLOW))
+    bound_only = [record(0.5, None, None, 0.7, 100), record(0.5, None, None, 0.3, 400)]
+    plots.plot_convergence(bound_only, path)
+    assert share(path, canvas.BLUE) == share(path, canvas.RED) == 0.0 < share(path, canvas.YELLOW)
+    for nothing in (uniform[:1], [], [record(1.0, None), record(0.5, None)]):
+        assert plots.convergence_series(nothing) == []
+        with pytest.raises(InputError, match="two levels"):
+            plots.plot_convergence(nothing, path)
+
+
+def test_what_can_not_be_drawn_is_told_on_all_ranks(shared_tmp_path):
+    mesh = create_unit_cube(WORLD, 2, 2, 2)
+    mesh.topology.create_connectivity(2, 3)
+    facets = exterior_facet_indices(mesh.topology)
+    below = compute_midpoints(mesh, 2, facets)[:, 2] < 1e-12
+    cube = Domain.from_tags(mesh, meshtags(mesh, 2, facets, np.where(below, 1, 2).astype(np.int32)))
+    with pytest.raises(InputError, match="plane"):
+        plots.plot_mesh(cube, shared_tmp_path / "mesh.png")
+    with pytest.raises(InputError, match=r"cannot write mesh\.png"):
+        plots.plot_mesh(rectangle(2), shared_tmp_path / "nowhere" / "mesh.png")
+
+
+@pytest.mark.serial
+def test_nothing_global_is_touched(tmp_path):
+    import matplotlib
+    from matplotlib._pylab_helpers import Gcf
+
+    settings = dict(matplotlib.rcParams)
+    plots.plot_mesh(rectangle(2), tmp_path / "mesh.png")
+    assert dict(matplotlib.rcParams) == settings
+    assert Gcf.get_all_fig_managers() == []
