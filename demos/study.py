@@ -1,0 +1,298 @@
+"""What the demos share: runs over a sequence of meshes, tables, pictures, and where they go.
+
+A demo takes a folder as its argument (`demo-output` without one) and leaves there its pictures
+and its tables, as Markdown. SIGNORINI_DEMO_LEVELS in the environment limits the number of meshes.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from signorini_cr import canvas, exact, norms, solve, solve_levels
+from signorini_cr.errors import on_root
+from signorini_cr.exact import Example
+from signorini_cr.levels import Solution
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+comm = MPI.COMM_WORLD
+
+COLOURS = (canvas.BLUE, canvas.RED, canvas.YELLOW, "#117733", "#66A6D9", "#882255", canvas.GREY)
+MARKERS = "osD^vP*"
+
+FAMILIES = {
+    "structured": "squares cut in two",
+    "mapped": "the same, mapped by $x \\mapsto x + 0.31(1-x^2)$",
+    "gmsh": "unstructured, from gmsh, refined",
+    "jitter": "squares cut in two, every vertex moved at random",
+}
+"""Kinds of mesh sequences that `run` knows."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is kept of a solution; None or not a number where it is not known."""
+
+    h: float
+    cells: int
+    dofs: int
+    h1: float
+    l2: float
+    pressure: float
+    distance: float
+    energy: float
+    newton: int
+    active: int
+    facets: int
+
+
+def levels_wanted(default: int) -> int:
+    """The number of meshes, limited by SIGNORINI_DEMO_LEVELS."""
+    return min(default, int(os.environ.get("SIGNORINI_DEMO_LEVELS", default)))
+
+
+def solutions(
+    example: Example, element: str, family: str, levels: int, coarsest: int = 4
+) -> Iterator[Solution]:
+    """Solve on a sequence of meshes, each with half the facet length of the one before.
+
+    Args:
+        example: What to solve.
+        element: "CR" or "P1".
+        family: A key of `FAMILIES`.
+        levels: Number of meshes.
+        coarsest: Squares (or gmsh facets) per unit length on the first.
+    """
+    if family == "jitter":
+        # These meshes are not nested: each is solved from nothing
+        for level in range(levels):
+            domain = example.structured(coarsest * 2**level, jitter=0.2, seed=level)
+            yield solve(example.problem, domain, element)
+        return
+    domain = {
+        "structured": lambda: example.structured(coarsest),
+        "mapped": lambda: example.structured(coarsest, shift=0.31),
+        "gmsh": lambda: example.mesh(1 / coarsest),
+    }[family]()
+    yield from solve_levels(example.problem, domain, levels, element)
+
+
+@cache
+def run(
+    name: str, element: str = "CR", family: str = "structured", levels: int = 8
+) -> tuple[Row, ...]:
+    """Solve `exact.ALL[name]` on a sequence of meshes; asked again, the answer is there."""
+    example = exact.ALL[name]
+    rows: list[Row] = []
+    before: Solution | None = None
+    for solution in solutions(example, element, family, levels):
+        h1, l2 = solution.errors or (np.nan, np.nan)
+        pressure = distance = np.nan
+        if example.pressure is not None:
+            pressure = norms.pressure_error(solution, example.pressure)
+        if example.problem.exact is None and before is not None:
+            distance = norms.distance(before, solution)
+        rows.append(
+            Row(
+                solution.h,
+                solution.cells,
+                solution.dofs,
+                h1,
+                l2,
+                pressure,
+                distance,
+                solution.energy,
+                solution.iterations.newton,
+                solution.contact.number_active,
+                solution.contact.number,
+            )
+        )
+        before = solution
+    del before, solution
+    gc.collect()
+    return tuple(rows)
+
+
+def column(rows: Sequence[Row], name: str) -> np.ndarray:
+    """One attribute of all rows."""
+    return np.array([getattr(row, name) for row in rows], dtype=float)
+
+
+def orders(rows: Sequence[Row], name: str) -> np.ndarray:
+    """The rates of one attribute in h, not a number on the first level."""
+    return np.append(np.nan, norms.rates(column(rows, "h"), column(rows, name)))
+
+
+class Study:
+    """The tables and pictures of one demo.
+
+    Args:
+        name: The demo's file name without ending; its tables go to `name.md`.
+        title: The heading.
+    """
+
+    def __init__(self, name: str, title: str):
+        """Take the folder from the command line and make it; collective."""
+        self.name = name
+        self.folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
+        self._parts = [f"## {title}\n"]
+        on_root(comm, lambda: self.folder.mkdir(parents=True, exist_ok=True))
+        if comm.rank == 0:
+            print(f"\n{title}\n{'=' * len(title)}", flush=True)
+
+    def say(self, text: str) -> None:
+        """Add a paragraph."""
+        self._parts.append(text + "\n")
+        if comm.rank == 0:
+            print("\n" + text, flush=True)
+
+    def table(self, caption: str, columns: dict[str, tuple[str, Sequence]]) -> None:
+        """Print a table and keep it.
+
+        Args:
+            caption: What it shows.
+            columns: By heading a format, as in "{:.2f}", and the values; what is not a number
+                shows as a dash.
+        """
+        cells = [
+            [heading, *(_cell(form, value) for value in values)]
+            for heading, (form, values) in columns.items()
+        ]
+        widths = [max(len(cell) for cell in column) for column in cells]
+        lines = [
+            " | ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+            for line in zip(*cells, strict=True)
+        ]
+        rule = " | ".join("-" * (width - 1) + ":" for width in widths)
+        markdown = [f"| {line} |" for line in (lines[0], rule, *lines[1:])]
+        self._parts.append("\n".join([f"{caption}\n", *markdown]) + "\n")
+        if comm.rank == 0:
+            print("\n".join(["", caption, *(line.replace(" | ", "  ") for line in lines)]))
+            sys.stdout.flush()
+
+    def picture(
+        self,
+        file: str,
+        caption: str,
+        draw: Callable[..., None],
+        panels: int = 1,
+        size: tuple[float, float] = (7.5, 6.0),
+    ) -> None:
+        """Draw a picture on rank 0 and keep a reference to it.
+
+        Args:
+            file: Name of the PNG.
+            caption: What it shows.
+            draw: Called with as many axes as there are panels.
+            panels: Axes side by side.
+            size: Inches of one panel.
+        """
+
+        def paint() -> None:
+            figure = canvas.new_figure(size[0] * panels, size[1])
+            draw(*np.atleast_1d(figure.subplots(1, panels)))
+            canvas.save(figure, self.folder / file)
+
+        on_root(comm, paint)
+        self._parts.append(f"![{caption}]({file})\n\n*{caption}*\n")
+
+    def finish(self) -> None:
+        """Write what was kept."""
+        on_root(
+            comm,
+            lambda: (self.folder / f"{self.name}.md").write_text(
+                "\n".join(self._parts), encoding="utf-8"
+            ),
+        )
+        if comm.rank == 0:
+            print(f"\nwritten: {self.folder}/{self.name}.md and the pictures it shows", flush=True)
+
+
+def _cell(form: str, value: object) -> str:
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return "–"
+    return form.format(value)
+
+
+def loglog(
+    axes: Axes,
+    curves: dict[str, tuple[Sequence[float], Sequence[float]]],
+    slopes: dict[float, str],
+    *,
+    title: str,
+    x: str = "$h$",
+    y: str = "error",
+    below: float = 0.5,
+    dashed: Sequence[str] = (),
+) -> None:
+    """Draw curves in logarithmic scales, and dotted lines of given slopes below the last ones.
+
+    Args:
+        axes: Where.
+        curves: By label the abscissae and ordinates.
+        slopes: By exponent the label of a dotted line, drawn below the curves.
+        title: The heading.
+        x: Label of the abscissa.
+        y: Label of the ordinate.
+        below: The dotted lines pass so far below the lowest end of a curve.
+        dashed: Labels of curves to draw dashed.
+    """
+    for k, (label, (abscissae, ordinates)) in enumerate(curves.items()):
+        axes.loglog(
+            abscissae,
+            ordinates,
+            "--" if label in dashed else "-",
+            color=COLOURS[k % len(COLOURS)],
+            marker=MARKERS[k % len(MARKERS)],
+            markersize=6,
+            linewidth=1.8,
+            label=label,
+        )
+    for slope, label in slopes.items():
+        guide(axes, list(curves.values()), slope, label, below)
+    axes.set_xlabel(x, fontsize=14)
+    axes.set_ylabel(y, fontsize=13)
+    axes.tick_params(labelsize=11)
+    axes.grid(which="major", alpha=0.3)
+    axes.legend(
+        fontsize=11, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, frameon=False
+    )
+    if x == "$h$":
+        ticks = next(iter(curves.values()))[0]
+        axes.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
+        axes.set_xticks([], minor=True)
+    axes.set_title(title, fontsize=14)
+
+
+def guide(axes: Axes, curves: Sequence[tuple], slope: float, label: str, below: float) -> None:
+    """A dotted line of one slope, below the curve whose own slope at the end is nearest to it."""
+
+    def steepness(curve: tuple) -> float:
+        (x0, x1), (y0, y1) = (np.log(np.asarray(values, dtype=float)[-2:]) for values in curve)
+        return float((y1 - y0) / (x1 - x0))
+
+    near = min(abs(steepness(curve) - slope) for curve in curves)
+    alike = [curve for curve in curves if abs(steepness(curve) - slope) < near + 0.2]
+    x, y = (np.asarray(v, dtype=float) for v in min(alike, key=lambda curve: curve[1][-1]))
+    line = below * y[-1] * (x / x[-1]) ** slope
+    axes.loglog(x, line, ":", color="black", linewidth=1.5)
+    middle = len(x) // 2
+    axes.annotate(
+        label,
+        (x[middle], line[middle]),
+        fontsize=13,
+        xytext=(5, -5),
+        textcoords="offset points",
+        va="top",
+    )
