@@ -19,9 +19,12 @@ from .contact import Contact, contact_facts
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import InputError, raise_together
 from .hierarchy import refine
+from .multigrid import Grid, cr_grid
+from .nested import Coarse, nested_start
 from .problem import Forms, Problem
-from .solver import Iterations, solve_vi
+from .solver import ContactRows, Iterations, solve_vi
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
+from .transfer import Layout, prolongation
 
 FloatArray = npt.NDArray[np.float64]
 LevelMonitor = Callable[[int, int, float, int, int], None]
@@ -55,6 +58,23 @@ class Level:
     def system(self) -> System:
         """The assembled variational inequality."""
         return System(self)
+
+    @cached_property
+    def grids(self) -> tuple[Grid, Grid, Layout]:
+        """The multigrid that starts here; in it P1 on this mesh, and the dofs of that."""
+        A, dofs = self.system.A, Layout.of_space(self.V)
+        dirichlet = self.system.dirichlet[self.system.dirichlet < dofs.size[0]]
+        below = None
+        if self.coarser is not None and self.parent_cell is not None:
+            below = (*self.coarser.grids[1:], self.parent_cell)
+        if dofs.cr:
+            grid, conforming, dofs = cr_grid(A, dofs, dirichlet, below)
+            return grid, conforming, dofs
+        if below is None:
+            grid = Grid(A, dirichlet)
+        else:
+            grid = Grid(A, dirichlet, prolongation(below[1], dofs, below[2]), below[0])
+        return grid, grid, dofs
 
 
 class System:
@@ -221,6 +241,7 @@ def solve_levels(
     levels: int,
     element: str = "CR",
     monitor: LevelMonitor | None = None,
+    nested: bool = True,
 ) -> Iterator[Solution]:
     """Solve on a mesh and its uniform refinements, each starting from the one below.
 
@@ -230,6 +251,7 @@ def solve_levels(
         levels: Number of meshes, the coarsest included.
         element: "CR" or "P1".
         monitor: Called after each step of the solver.
+        nested: Start from the solution on the mesh below; otherwise from zero, to compare.
 
     Yields:
         The solutions, coarsest first.
@@ -248,7 +270,7 @@ def solve_levels(
         fine, parent_cell = refine(level.domain)
         level = Level(level.forms, fine, number, level, parent_cell)
         seconds = {"mesh": time.perf_counter() - began}
-        solution = _solve(level, solution, monitor, seconds)
+        solution = _solve(level, solution if nested else None, monitor, seconds)
         yield solution
 
 
@@ -263,20 +285,28 @@ def _solve(
     system = level.system
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
     u, residual = system.start(), fem.Function(level.V)
-    vectors = [
-        ghosted_vector(level.V, array) for array in (system.b.x.array, system.lower, u.x.array)
-    ]
+    arrays = system.b.x.array, system.lower, u.x.array, residual.x.array
+    vectors = [ghosted_vector(level.V, array) for array in arrays]
+    rows = ContactRows(system.A, vectors[1])
+    if coarser is not None and level.parent_cell is not None:
+        below = Coarse(coarser.domain, coarser.u, coarser.residual, coarser.level.system.lower)
+        b, dirichlet = system.b.x.array, system.dirichlet
+        nested_start(below, level.domain, level.parent_cell, u, rows, b, dirichlet)
+    grid, conforming, _ = level.grids
     iterations = solve_vi(
-        system.A,
+        grid,
+        rows,
         *vectors,
         load=system.load,
         monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
         level=level.number,
     )
-    for vector in vectors:
-        vector.destroy()
-    u.x.scatter_forward()
-    system.residual(u, residual)
+    if grid is not conforming:
+        grid.free()  # the next level needs P1 alone
+    for thing in (rows, *vectors):
+        thing.destroy()
+    for function in (u, residual):
+        function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
     contact = contact_facts(
         level.domain,

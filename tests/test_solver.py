@@ -60,7 +60,7 @@ def test_options_choose_another_solver(options):
     options("ksp_type", "minres")
     options("pc_type", "jacobi")
     other = solve(PROBLEM, SQUARE.mesh(0.1))
-    assert other.iterations.preconditioner == "jacobi"
+    assert other.iterations.preconditioner.startswith("jacobi")
     assert other.iterations.linear > reference.iterations.linear
     assert np.allclose(other.u.x.array, reference.u.x.array, atol=1e-7)
 

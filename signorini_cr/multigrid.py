@@ -1,0 +1,192 @@
+"""Multigrid in the active set: one V-cycle from CR to P1 on the same mesh, and down the P1 meshes.
+
+A chain of grids, finest first: CR, then P1 on the same mesh and on all coarser ones. P1 ⊂ CR and
+coarse P1 ⊂ fine P1, so the coarse matrices are Galerkin products; each is computed once, on its own
+mesh. Dofs on the obstacle are taken out on every grid: the matrix has the identity there, and a
+coarse function that does not vanish at a fixed dof of the finer grid is fixed too, which leaves
+subspaces of the reduced space. Smoothing is one symmetric Gauss-Seidel sweep before and one after
+the coarse correction, local to each rank as in every parallel algebraic multigrid.
+
+Where there is no coarser mesh, P1 on the finest one is left to BoomerAMG: the auxiliary space
+method. Small bottom grids are solved directly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from .transfer import Layout, inclusion, prolongation
+
+DIRECT = 2000
+"""Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
+
+_SWEEP = PETSc.Mat.SORType.LOCAL_SYMMETRIC_SWEEP
+_FIRST_SWEEP = _SWEEP | PETSc.Mat.SORType.ZERO_INITIAL_GUESS
+
+
+class Grid:
+    """One space of the chain, and everything below it.
+
+    Attributes:
+        matrix: Its matrix, the identity in the rows and columns of the dofs on Γ0.
+        masked: The same, with the identity for the fixed dofs as well; `fix` keeps it so.
+        coarser: The next space, None at the bottom.
+    """
+
+    def __init__(
+        self,
+        matrix: PETSc.Mat,
+        dirichlet: npt.NDArray[np.int32],
+        transfer: PETSc.Mat | None = None,
+        coarser: Grid | None = None,
+    ):
+        """Join a space to the chain.
+
+        Args:
+            matrix: Its matrix.
+            dirichlet: Its owned dofs on Γ0, local numbers.
+            transfer: The matrix that writes functions of the coarser space in this one.
+            coarser: The next space.
+        """
+        self.matrix, self.coarser = matrix, coarser
+        self.masked = matrix.duplicate(copy=True)
+        self._transfer = transfer
+        self._dirichlet = dirichlet
+        self._fixed = np.empty(0, dtype=np.int32)
+        self._silent = dirichlet
+        self._changed = True
+        self._deep = False
+        self._bottom: PETSc.PC | None = None
+        self._r = matrix.createVecRight()
+        if coarser is not None:
+            self._b, self._x = (coarser.matrix.createVecRight() for _ in range(2))
+
+    def fix(self, dofs: npt.NDArray[np.int32], deep: bool = True) -> None:
+        """Take dofs out of the space, and what does not vanish there out of the coarser ones.
+
+        Args:
+            dofs: Owned dofs, local numbers; replaces those of the call before.
+            deep: Go on to the coarser spaces; without that the cycle may not be used.
+        """
+        comm = self.matrix.getComm().tompi4py()
+        if comm.allreduce(not np.array_equal(dofs, self._fixed)):
+            if comm.allreduce(len(self._fixed)):
+                self.matrix.copy(self.masked, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            first = self.matrix.getOwnershipRange()[0]
+            self.masked.zeroRowsColumns((dofs + first).astype(PETSc.IntType), 1.0)
+            self.masked.assemble()  # after a copy PETSc goes on with the old inverted diagonal
+            self._fixed = dofs
+            self._silent = np.concatenate([self._dirichlet, dofs])
+            self._changed = True
+        elif self._deep or not deep:
+            return
+        if self.coarser is not None and self._transfer is not None and deep:
+            self.coarser.fix(_touched(self._transfer, dofs))
+        self._deep = deep
+
+    def cycle(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """One V-cycle for masked x = b, from x = 0; b is 0 in the fixed dofs."""
+        if self.coarser is None or self._transfer is None:
+            self._solve_bottom(b, x)
+            return
+        self.masked.SOR(b, x, sortype=_FIRST_SWEEP)
+        self.masked.mult(x, self._r)
+        self._r.aypx(-1.0, b)
+        self._transfer.multTranspose(self._r, self._b)
+        self._b.array[self.coarser._silent] = 0.0
+        self.coarser.cycle(self._b, self._x)
+        self._transfer.multAdd(self._x, x, x)
+        self.masked.SOR(b, x, sortype=_SWEEP)
+
+    def apply(self, _: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """The V-cycle as PETSc's preconditioner of type python."""
+        self.cycle(b, x)
+
+    @property
+    def grids(self) -> int:
+        """Number of spaces in the chain."""
+        return 1 if self.coarser is None else 1 + self.coarser.grids
+
+    @property
+    def bottom_is_direct(self) -> bool:
+        """Whether the space at the bottom is small enough to be factorised."""
+        return (
+            self.matrix.getSize()[0] <= DIRECT
+            if self.coarser is None
+            else self.coarser.bottom_is_direct
+        )
+
+    def describe(self) -> str:
+        """What the cycle is, in words."""
+        bottom = "a direct solver" if self.bottom_is_direct else "BoomerAMG"
+        if self.grids <= 2:
+            return f"P1 auxiliary space with {bottom} (there is no coarser mesh)"
+        return f"geometric multigrid on {self.grids - 1} meshes with {bottom} on the coarsest"
+
+    def free(self) -> None:  # "destroy" is what PETSc calls a context with
+        """Free what belongs to this space alone, not the matrix it was made with."""
+        for thing in (self.masked, self._transfer, self._r, self._bottom):
+            if thing is not None:
+                thing.destroy()
+        if self.coarser is not None:
+            self._b.destroy()
+            self._x.destroy()
+
+    def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        if self._bottom is None:
+            pc = self._bottom = PETSc.PC().create(self.matrix.getComm())
+            if not self.bottom_is_direct:
+                pc.setType(PETSc.PC.Type.HYPRE)
+            elif self.matrix.getComm().getSize() == 1:
+                pc.setType(PETSc.PC.Type.CHOLESKY)
+            else:
+                pc.setType(PETSc.PC.Type.REDUNDANT)
+        if self._changed:
+            self._bottom.setOperators(self.masked)
+            self._bottom.setUp()
+            self._changed = False
+        self._bottom.apply(b, x)
+
+
+def cr_grid(
+    A: PETSc.Mat,
+    cr: Layout,
+    dirichlet: npt.NDArray[np.int32],
+    coarser: tuple[Grid, Layout, npt.NDArray[np.int32]] | None = None,
+) -> tuple[Grid, Grid, Layout]:
+    """The chain that starts with CR on a mesh.
+
+    Args:
+        A: Matrix of a_h, with the identity in the rows and columns of Γ0's dofs.
+        cr: The dofs of CR.
+        dirichlet: Owned dofs on Γ0.
+        coarser: P1 on the coarser mesh, its dofs, and the parent of each local cell.
+
+    Returns:
+        CR, the P1 space that comes next, and the dofs of that.
+    """
+    p1 = Layout.of_vertices(cr.mesh)
+    into_cr = inclusion(p1, cr)
+    K = A.ptap(into_cr)
+    # On Γ0 the product holds rubbish, in rows and columns that become the identity's
+    vertices = _touched(into_cr, dirichlet)
+    K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
+    if coarser is None:
+        conforming = Grid(K, vertices)
+    else:
+        grid, dofs, parent_cell = coarser
+        conforming = Grid(K, vertices, prolongation(dofs, p1, parent_cell), grid)
+    return Grid(A, dirichlet, into_cr, conforming), conforming, p1
+
+
+def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
+    fine, coarse = transfer.createVecLeft(), transfer.createVecRight()
+    fine.array[dofs] = 1.0
+    transfer.multTranspose(fine, coarse)
+    touched = np.flatnonzero(coarse.array_r).astype(np.int32)
+    fine.destroy()
+    coarse.destroy()
+    return touched

@@ -1,0 +1,234 @@
+"""From coarse to fine: prolongation between nested meshes, and P1 as a subspace of CR.
+
+On nested meshes every fine cell lies in one coarse cell, its parent, and nothing else has to be
+known: the value at a fine dof is the average, over the fine cells that touch it, of the parents'
+affine functions there. That holds for any pattern of refinement and any dimension; for P1, which is
+continuous, the average is that of equal numbers. Parents live on their children's rank, so each
+rank adds its own cells' share.
+
+P1 is contained in CR: a conforming function's mean over a facet is the mean of its d vertex values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from petsc4py import PETSc
+
+from . import compat
+from .space import ghosted_vector
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the dofs of CR or P1 are.
+
+    Attributes:
+        mesh: The mesh.
+        cells: Local dofs of the local cells, shape (cells, d + 1); dof i of a cell belongs to its
+            vertex i (P1) or to the facet opposite (CR).
+        index_map: Their distribution over the ranks.
+        cr: Whether it is CR.
+    """
+
+    mesh: Mesh
+    cells: IntArray
+    index_map: Any
+    cr: bool
+
+    @classmethod
+    def of_space(cls, V: fem.FunctionSpace) -> Layout:
+        """The dofs of a CR or P1 space."""
+        cr = V.element.basix_element.family is basix.ElementFamily.CR
+        return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr)
+
+    @classmethod
+    def of_vertices(cls, mesh: Mesh) -> Layout:
+        """P1 without building a space: the nodes of a straight-sided mesh are its vertices."""
+        if compat.coordinate_map(mesh).degree == 1:
+            return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False)
+        return cls.of_space(fem.functionspace(mesh, ("Lagrange", 1)))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of owned dofs, and of all on all ranks, as PETSc takes them."""
+        return self.index_map.size_local, self.index_map.size_global
+
+    def numbers(self, dofs: IntArray) -> IntArray:
+        """Global numbers of local dofs."""
+        if self.mesh.comm.size == 1:
+            return dofs
+        numbers = self.index_map.local_to_global(dofs.ravel())
+        return numbers.astype(PETSc.IntType).reshape(dofs.shape)
+
+
+def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
+    """The matrix that writes a P1 function in CR: d entries 1/d in each row."""
+    d = cr.cells.shape[1] - 1
+    owned = cr.size[0]
+    columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
+    for i in range(d + 1):
+        others = [j for j in range(d + 1) if j != i]
+        for k, j in enumerate(others):
+            columns[cr.cells[:, i], k] = p1.cells[:, j]
+    lengths, values = np.full(owned, d, dtype=np.int32), np.full(owned * d, 1.0 / d)
+    return _matrix(cr, p1, lengths, columns[:owned], values)
+
+
+def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.Mat:
+    """The matrix of the prolongation between two nested meshes, from CR to CR or from P1 to P1.
+
+    Args:
+        coarse: The coarse dofs.
+        fine: The fine dofs.
+        parent_cell: For each local fine cell the local coarse cell that holds it.
+    """
+    weights = parent_weights(coarse, fine, parent_cell)
+    corners = fine.cells.shape[1]
+    if not fine.cr:  # one cell tells all
+        slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
+        slot[fine.cells.ravel()] = np.arange(fine.cells.size, dtype=np.int32)
+        slot = slot[: fine.size[0]]
+        values = weights.reshape(-1, corners)[slot % (len(weights) * corners)]
+        columns = coarse.cells[parent_cell[slot // corners]]
+        kept = np.abs(values) > 1e-10
+        return _matrix(fine, coarse, kept.sum(axis=1, dtype=np.int32), columns[kept], values[kept])
+    repeats = len(parent_cell) // len(weights)
+    values = np.tile(weights, (repeats, 1, 1)) / touching_cells(fine)[fine.cells][:, :, None]
+    kept = np.abs(values) > 1e-10
+    columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)
+    start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
+    np.cumsum(kept.sum(axis=2), out=start[1:])
+    # no facet touches more than two cells
+    most = 2 * corners
+    matrix = PETSc.Mat().createAIJ((fine.size, coarse.size), nnz=(most, most), comm=fine.mesh.comm)
+    rows = fine.numbers(fine.cells).ravel().astype(PETSc.IntType, copy=False)
+    columns = columns[kept].astype(PETSc.IntType, copy=False)
+    matrix.setValuesIJV(start, columns, values[kept], PETSc.InsertMode.ADD_VALUES, rows)
+    matrix.assemble()
+    return matrix
+
+
+def prolongate(u: fem.Function, V: fem.FunctionSpace, parent_cell: IntArray) -> FloatArray:
+    """Apply the prolongation once, without its matrix.
+
+    Args:
+        u: A CR or P1 function on the coarse mesh, ghosts up to date.
+        V: The same kind of space on the fine mesh.
+        parent_cell: For each local fine cell the local coarse cell that holds it.
+
+    Returns:
+        Values of all local dofs, ghosts included.
+    """
+    coarse, fine = Layout.of_space(u.function_space), Layout.of_space(V)
+    weights = parent_weights(coarse, fine, parent_cell)
+    corners = fine.cells.shape[1]
+    local = u.x.array[coarse.cells]
+    if len(weights) == len(parent_cell):
+        values = np.einsum("cij,cj->ci", weights, local[parent_cell])
+    else:  # the same pattern in each parent
+        values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+    size = fine.index_map.size_local + fine.index_map.num_ghosts
+    total = np.bincount(fine.cells.ravel(), values.ravel(), minlength=size)
+    return shared_sum(V, total.astype(np.float64, copy=False)) / touching_cells(fine)
+
+
+def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
+    """The parent's shape functions at the dofs of each fine cell.
+
+    Returns:
+        Shape (cells, d + 1, d + 1): dof of the fine cell, dof of its parent. Shorter where the
+        pattern repeats: with m rows, those of fine cell c are in row c % m.
+    """
+    barycentric = _barycentric(coarse, fine, parent_cell)
+    corners = barycentric.shape[-1]
+    d = corners - 1
+    if fine.cr:  # facet midpoints
+        barycentric = (barycentric.sum(axis=1, keepdims=True) - barycentric) / d
+    return 1.0 - d * barycentric if coarse.cr else barycentric
+
+
+def touching_cells(layout: Layout) -> FloatArray:
+    """The number of cells that touch each local dof, over all ranks."""
+    size = layout.index_map.size_local + layout.index_map.num_ghosts
+    count = np.bincount(layout.cells.ravel(), minlength=size).astype(np.float64)
+    if layout.mesh.comm.size == 1:
+        return count
+    vector = PETSc.Vec().createGhostWithArray(
+        layout.index_map.ghosts.astype(PETSc.IntType), count, layout.size, comm=layout.mesh.comm
+    )
+    _add_ghosts(vector)
+    return count
+
+
+def _barycentric(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
+    """The parent's barycentric coordinates of the fine cells' vertices, as in `parent_weights`."""
+    d = fine.mesh.topology.dim
+    children = 2**d
+    regular = len(parent_cell) > 0 and np.array_equal(
+        parent_cell, np.arange(len(parent_cell)) // children
+    )
+    x, x_coarse = (mesh.geometry.x[:, : mesh.geometry.dim] for mesh in (fine.mesh, coarse.mesh))
+    nodes = compat.cell_nodes(fine.mesh)[: len(parent_cell)]
+    parents = compat.cell_nodes(coarse.mesh)
+    if regular:  # does the pattern of the first cell repeat? one vertex of each child tells
+        first = x_coarse[parents[:1].repeat(children, axis=0)]
+        pattern = barycentric_coordinates(first, x[nodes[:children]])
+        inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
+        deviation = [
+            np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
+            for theirs, own in zip(x_coarse.T.copy(), x.T.copy(), strict=True)
+        ]
+        if max(deviation) <= 1e-10 * np.abs(x_coarse).max():
+            return pattern
+    return barycentric_coordinates(x_coarse[parents[parent_cell]], x[nodes])
+
+
+def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:
+    """Barycentric coordinates of points in simplices.
+
+    Args:
+        simplices: Vertices, shape (n, d + 1, 3).
+        points: Shape (n, m, 3).
+
+    Returns:
+        Shape (n, m, d + 1).
+    """
+    edges = simplices[:, 1:] - simplices[:, :1]
+    inverse = np.linalg.pinv(edges)
+    rest = np.einsum("nmx,nxd->nmd", points - simplices[:, :1], inverse)
+    return np.concatenate([1.0 - rest.sum(axis=2, keepdims=True), rest], axis=2)
+
+
+def _matrix(
+    rows: Layout, columns: Layout, lengths: IntArray, dofs: IntArray, values: FloatArray
+) -> PETSc.Mat:
+    """A matrix from the owned rows' entries, one row after the other; columns as local dofs."""
+    start = np.zeros(len(lengths) + 1, dtype=PETSc.IntType)
+    np.cumsum(lengths, out=start[1:])
+    csr = start, columns.numbers(dofs.ravel()).astype(PETSc.IntType, copy=False), values
+    matrix = PETSc.Mat().createAIJ((rows.size, columns.size), csr=csr, comm=rows.mesh.comm)
+    matrix.assemble()
+    return matrix
+
+
+def shared_sum(V: fem.FunctionSpace, array: FloatArray) -> FloatArray:
+    """Sum up, in place, what the ranks have for each shared dof."""
+    if V.mesh.comm.size > 1:
+        _add_ghosts(ghosted_vector(V, array))
+    return array
+
+
+def _add_ghosts(vector: PETSc.Vec) -> None:
+    vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+    vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+    vector.destroy()
