@@ -1,0 +1,31 @@
+# Each command makes what it needs: see container/run.
+run = ./container/run
+
+# A rank that fails can leave the others waiting; no run goes without an end.
+limit = timeout --kill-after=20 1500
+
+.PHONY: demo test lint types clean purge
+
+demo:
+	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
+
+test:
+	$(run) $(limit) python3 -m pytest
+	$(run) $(limit) mpirun -n 2 python3 -m pytest
+
+lint:
+	$(run) container/tool ruff check
+	$(run) container/tool ruff format --check
+	@if command -v shellcheck >/dev/null; then \
+	    grep -lr '^#!.*sh$$' container .ci | xargs -d '\n' shellcheck; \
+	else echo 'no shellcheck here: the shell scripts are not looked at'; fi
+
+types:
+	$(run) container/tool mypy
+
+clean:
+	git clean -fdX
+
+# The environments too, those of other checkouts with them.
+purge: clean
+	rm -rf --one-file-system "$${XDG_CACHE_HOME:-$$HOME/.cache}/signorini_cr"
