@@ -278,5 +278,5 @@ def _ordered(rows: dict[str, npt.NDArray]) -> tuple[dict[str, npt.NDArray], Floa
     share = np.where(inside, middle_gap / np.where(inside, middle_gap - vertex_gap, 1.0), 1.0)
     between = ends[later, 0]
     points = midpoints[free] + share[:, None] * (between - midpoints[free])
-    along = np.lexsort([steps[free], part[free]])
+    along = np.lexsort([steps[earlier], part[earlier]])
     return {name: column[order] for name, column in table.items()}, points[along]
