@@ -17,6 +17,7 @@ from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from .compat import cell_nodes
 from .domain import CONTACT, Domain
 from .space import closure_dofs, facet_entities, facet_measures, vertex_values
 
@@ -215,7 +216,7 @@ def _along_boundary(
 def _clockwise(mesh: Mesh, facets: npt.NDArray[np.int32], vertices: FloatArray) -> npt.NDArray:
     """Whether Ω lies to the right when a facet is walked from its first vertex to its second."""
     cells, local = facet_entities(mesh, facets).T
-    apex = mesh.geometry.x[mesh.geometry.dofmap[cells, local]]
+    apex = mesh.geometry.x[cell_nodes(mesh)[cells, local]]
     along, inward = vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]
     return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
 

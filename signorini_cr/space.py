@@ -16,6 +16,7 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
+from .compat import cell_nodes
 from .errors import InputError
 
 Int32Array = npt.NDArray[np.int32]
@@ -99,7 +100,7 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
     tdim = mesh.topology.dim
     cells, local = facet_entities(mesh, facets).T
     corners = np.array(basix.topology(mesh.basix_cell())[-2])
-    x = mesh.geometry.x[np.take_along_axis(mesh.geometry.dofmap[cells], corners[local], axis=1)]
+    x = mesh.geometry.x[np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)]
     edges = x[:, 1:] - x[:, :1]
     gram = np.einsum("nid,njd->nij", edges, edges)
     return x, np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, tdim))
