@@ -271,7 +271,7 @@ def _check_labels(labels: Sequence[str], edges: int) -> None:
             f"{len(labels)} boundary labels for {edges} edges: one for each edge is needed"
         )
     for i, label in enumerate(labels):
-        if label not in PARTS:
+        if label not in tuple(PARTS):
             raise InputError(f"edge {i} is labelled {label!r}: allowed are {_list(PARTS)}")
 
 

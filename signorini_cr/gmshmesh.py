@@ -17,6 +17,8 @@ import numpy.typing as npt
 from signorini_cr.errors import InputError
 
 _MOST_TRIANGLES = 2e7
+_MOST_FACETS = 1e5  # on the boundary
+_UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
 _OPTIONS = {
     "General.Terminal": 0,
@@ -25,9 +27,12 @@ _OPTIONS = {
     "Mesh.Algorithm": 6,  # Frontal-Delaunay: the best angles
     "Mesh.ElementOrder": 1,
     "Mesh.RandomSeed": 1,
-    "Mesh.MeshSizeFromPoints": 0,
+    "Mesh.MeshSizeFromPoints": 1,
     "Mesh.MeshSizeFromCurvature": 0,
     "Mesh.MeshSizeExtendFromBoundary": 1,
+    "Mesh.MeshSizeFactor": 1,
+    "Mesh.MeshSizeMin": 0,
+    "Mesh.MeshSizeMax": 1e22,
     "Mesh.RecombineAll": 0,
 }
 
@@ -81,37 +86,42 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate a polygon with holes; its vertices become mesh vertices.
 
+    Edges are cut into equal facets. Only an edge beside one with much shorter facets is graded
+    towards it, since the angles would suffer otherwise.
+
     Args:
         loops: Vertices of the polygon and of each hole, shapes (n, 2).
         labels: Label of every edge, one loop after the other.
         size: Facet length wanted; shorter edges get one facet.
     """
-    ends = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
-    lengths = np.linalg.norm(ends - np.concatenate(loops), axis=1)
-    counts = np.maximum(1, np.ceil(lengths / size - 1e-9))
-    if counts.sum() > _MOST_TRIANGLES:
-        raise _too_fine(size)
+    lengths = [np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1) for loop in loops]
+    counts = [np.maximum(1, np.ceil(length / size - 1e-9)) for length in lengths]
+    triangles = _area(loops[0]) / (0.43 * size**2)  # equilateral: √3/4
+    if sum(map(np.sum, counts)) > _MOST_FACETS or triangles > _MOST_TRIANGLES:
+        raise InputError(
+            f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
+        )
     with _session() as gmsh:
         geo = gmsh.model.geo
         curves: list[int] = []
         rings = []
-        for loop in loops:
-            points = [geo.addPoint(x, y, 0.0) for x, y in loop]
+        for loop, length, count in zip(loops, lengths, counts):
+            facet = length / count
+            near = np.minimum(facet, np.roll(facet, 1))  # at each vertex
+            even = np.minimum(near, np.roll(near, -1)) > _UNEVEN * facet
+            points = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(loop, near)]
             lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1])]
+            for i in np.flatnonzero(even):
+                geo.mesh.setTransfiniteCurve(lines[i], int(count[i]) + 1)
             rings.append(geo.addCurveLoop(lines))
             curves += lines
         geo.addPlaneSurface(rings)
-        for curve, count in zip(curves, counts):
-            geo.mesh.setTransfiniteCurve(curve, int(count) + 1)
         geo.synchronize()
-        before = gmsh.option.getNumber("Mesh.MeshSizeMax")
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         try:
             gmsh.model.mesh.generate(2)
         except Exception as error:
             raise InputError(f"gmsh could not triangulate the polygon: {error}") from error
-        finally:
-            gmsh.option.setNumber("Mesh.MeshSizeMax", before)
         facets = [_elements(gmsh, 1, _LINE, curve) for curve in curves]
         return _compact(
             gmsh,
@@ -297,5 +307,6 @@ def _compact(
     )
 
 
-def _too_fine(size: float) -> InputError:
-    return InputError(f"size is {size}: that asks for more than {_MOST_TRIANGLES:.0e} triangles")
+def _area(loop: npt.NDArray[np.float64]) -> float:
+    x, y = (loop - loop[0]).T
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2

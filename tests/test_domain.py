@@ -1,0 +1,441 @@
+"""Polygons, gmsh files and users' own meshes: right lengths and areas, clear complaints."""
+
+import itertools
+from pathlib import Path
+
+import dolfinx.mesh
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
+from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
+
+COMM = MPI.COMM_WORLD
+MESHES = Path(__file__).parent.parent / "meshes"
+RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
+LABELS = ["contact", "dirichlet", "neumann", "dirichlet"]
+SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
+
+
+def integral(form: ufl.Form, comm: MPI.Comm = COMM) -> float:
+    return comm.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+def lengths(domain: Domain) -> list[float]:
+    ds = ufl.Measure("ds", domain.mesh, subdomain_data=domain.tags)
+    return [integral(1.0 * ds(part), domain.mesh.comm) for part in (CONTACT, DIRICHLET, NEUMANN)]
+
+
+def area(domain: Domain) -> float:
+    return integral(1.0 * ufl.dx(domain.mesh), domain.mesh.comm)
+
+
+def counts(domain: Domain) -> list[int]:
+    comm = domain.mesh.comm
+    return [comm.allreduce(len(domain.facets(part))) for part in (CONTACT, DIRICHLET, NEUMANN)]
+
+
+def fails_alike(function, *args) -> str:
+    """The message of the InputError that every rank must raise."""
+    with pytest.raises(InputError) as caught:
+        function(*args)
+    messages = set(COMM.allgather(str(caught.value)))
+    assert len(messages) == 1
+    return messages.pop()
+
+
+# errors
+
+
+def test_on_root_gives_all_ranks_the_result():
+    assert on_root(COMM, lambda a, b: a + b, 1, 2) == 3
+
+
+def test_on_root_raises_everywhere():
+    def fail() -> None:
+        raise InputError("no such thing")
+
+    assert fails_alike(on_root, COMM, fail) == "no such thing"
+    with pytest.raises((ZeroDivisionError, RuntimeError), match="division"):
+        on_root(COMM, lambda: 1 // 0)
+
+
+def test_raise_together_shows_the_lowest_rank():
+    raise_together(COMM, None)
+    last = COMM.size - 1
+    complaint = f"rank {COMM.rank}" if COMM.rank == last else None
+    assert fails_alike(raise_together, COMM, complaint) == f"rank {last}"
+
+
+def test_not_converged_names_the_level():
+    error = NotConverged("too many steps", level=3)
+    assert (error.level, error.reason, str(error)) == (
+        3,
+        "too many steps",
+        "level 3: too many steps",
+    )
+
+
+# polygons
+
+
+@pytest.mark.parametrize("size", [0.1, 0.5, 10.0])
+@pytest.mark.parametrize("turn", [1, -1])
+def test_polygon_has_its_lengths_and_area(size: float, turn: int):
+    # turned round, edge i runs between the same vertices if the labels are turned and shifted
+    labels = LABELS if turn == 1 else [*LABELS[::-1][1:], LABELS[-1]]
+    domain = Polygon(np.array(RECTANGLE)[::turn], labels).mesh(size)
+    assert lengths(domain) == pytest.approx([2, 2, 2])
+    assert area(domain) == pytest.approx(2)
+    facets = int(np.ceil(2 / size - 1e-9))
+    assert counts(domain) == [facets, 2 * max(1, int(np.ceil(1 / size - 1e-9))), facets]
+
+
+def test_every_exterior_facet_has_one_part():
+    domain = Polygon(RECTANGLE, LABELS).mesh(0.3)
+    exterior = dolfinx.mesh.exterior_facet_indices(domain.mesh.topology)
+    assert np.array_equal(np.sort(exterior), domain.tags.indices)
+    together = np.concatenate([domain.facets(part) for part in PARTS.values()])
+    assert np.array_equal(np.sort(together), domain.tags.indices)
+    assert domain.mesh.topology.index_map(2).num_ghosts == 0
+
+
+def test_holes_are_cut_out():
+    hole = Polygon(SQUARE, ["neumann", "contact", "neumann", "neumann"])
+    domain = Polygon(RECTANGLE, LABELS, (hole,)).mesh(0.2)
+    assert area(domain) == pytest.approx(2 - 0.25)
+    assert lengths(domain) == pytest.approx([2.5, 2, 3.5])
+
+
+def test_vertices_are_mesh_vertices():
+    vertices = [[-1, 0], [0.3, 0], [1, 0], [1, 1], [-1, 1]]
+    domain = Polygon(vertices, ["contact", "neumann", "dirichlet", "dirichlet", "dirichlet"]).mesh(
+        0.4
+    )
+    x = domain.mesh.geometry.x[:, :2]
+    near = [np.abs(x - v).max(axis=1).min(initial=9.0) for v in vertices]
+    assert np.min(COMM.allgather(near), axis=0) == pytest.approx(0, abs=1e-14)
+    assert lengths(domain) == pytest.approx([1.3, 4, 0.7])
+
+
+def test_short_edges_get_a_facet_and_angles_stay_away_from_zero():
+    vertices = [[-1, 0], [0, 0], [0.01, 0], [1, 0], [1, 1], [-1, 1]]
+    labels = ["contact", "neumann", "contact", "dirichlet", "dirichlet", "dirichlet"]
+    domain = Polygon(vertices, labels).mesh(0.25)
+    assert counts(domain)[2] == 1
+    assert smallest_angle(domain) > 20
+
+
+def smallest_angle(domain: Domain) -> float:
+    """In degrees, over all ranks."""
+    mesh = domain.mesh
+    cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
+    nodes = dolfinx.mesh.entities_to_geometry(mesh, 2, cells).reshape(-1, 3)
+    x = mesh.geometry.x[nodes]
+    sides = np.roll(x, -1, axis=1) - x
+    sides = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+    cosine = -(sides * np.roll(sides, 1, axis=1)).sum(axis=2)
+    smallest = np.degrees(np.arccos(cosine)).min() if len(cells) else 180.0
+    return mesh.comm.allreduce(smallest, op=MPI.MIN)
+
+
+def test_triangles_are_well_shaped():
+    assert smallest_angle(Polygon(RECTANGLE, LABELS).mesh(0.1)) > 35
+
+
+def test_the_same_polygon_gives_the_same_mesh():
+    polygon = Polygon(RECTANGLE, LABELS)
+    a, b = (polygon.mesh(0.2, MPI.COMM_SELF).mesh.geometry.x for _ in range(2))
+    assert np.array_equal(a, b)
+    assert len(set(COMM.allgather(a.tobytes()))) == 1
+
+
+@pytest.mark.parametrize(
+    ("vertices", "labels", "message"),
+    [
+        ([[0, 0], [1, 0]], ["contact", "dirichlet"], "2 vertices: a polygon has at least 3"),
+        ([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet"], "2 boundary labels for 3 edges"),
+        ([[0, 0], [1, 0], [0, np.nan]], LABELS[:3], "vertex 2 is (0, nan)"),
+        ([[0, 0], [1, 0], [0, np.inf]], LABELS[:3], "vertex 2 is (0, inf)"),
+        ([[0, 0], [1, 0], [0, "a"]], LABELS[:3], "[x, y] pairs"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], LABELS[:3], "[x, y] pairs"),
+        ([[0, 0], [1, 0], [0]], LABELS[:3], "[x, y] pairs"),
+        ([[0, 0], [1, 0], [0, 1]], ["contact", "glue", "neumann"], "edge 1 is labelled 'glue'"),
+        ([[0, 0], [1, 0], [0, 1]], ["contact", ["a"], "neumann"], "edge 1 is labelled ['a']"),
+        ([[0, 0], [1, 0], [1, 0], [0, 1]], LABELS, "vertex 1 at (1, 0) is the same point as"),
+        ([[0, 0], [1, 0], [0, 1], [0, 0]], LABELS, "vertex 0 at (0, 0) is the same point as"),
+        ([[0, 0], [1, 1], [1, 0], [0, 1]], LABELS, "edge 0 crosses edge 2"),
+        ([[0, 0], [2, 0], [2, 1], [1, 0], [0, 1]], [*LABELS, "neumann"], "lies on edge 0"),
+        ([[0, 0], [1, 0], [2, 0]], LABELS[:3], "lies on edge"),
+        ([[0, 0], [1, 0], [0.5, 0], [0.5, 1]], LABELS, "lies on edge"),
+    ],
+)
+def test_bad_polygons(vertices, labels, message):
+    assert message in fails_alike(Polygon, vertices, labels)
+
+
+def test_unknown_labels_name_the_allowed_ones():
+    message = fails_alike(Polygon, RECTANGLE, [*LABELS[:3], "free"])
+    assert all(name in message for name in PARTS)
+
+
+@pytest.mark.parametrize(
+    ("holes", "message"),
+    [
+        ([np.array(SQUARE) + 5], "hole 0 lies outside"),
+        ([np.array(SQUARE) + [0, 0.5]], "crosses"),
+        ([np.array(SQUARE) + [0, 0.25]], "lies on edge"),
+        ([SQUARE, np.array(SQUARE) + 0.1], "crosses"),
+        ([SQUARE, 0.5 + 0.5 * (np.array(SQUARE) - 0.5)], "hole 1 lies inside hole 0"),
+        ([0.5 + 0.5 * (np.array(SQUARE) - 0.5), SQUARE], "hole 0 lies inside hole 1"),
+        ([SQUARE, SQUARE], "is the same point as"),
+        ([[[-2, -1], [2, -1], [2, 2], [-2, 2]]], "hole 0 lies outside"),
+    ],
+)
+def test_bad_holes(holes, message):
+    holes = [Polygon(hole, ["neumann"] * 4) for hole in holes]
+    assert message in fails_alike(Polygon, RECTANGLE, LABELS, holes)
+
+
+def test_close_but_apart_is_fine():
+    Polygon([[0, 0], [2, 0], [2, 1], [1, 1e-6], [0, 1]], [*LABELS, "neumann"])
+    Polygon(np.array(RECTANGLE) * 1e-7 + 1, LABELS)
+
+
+@pytest.mark.parametrize("missing", ["contact", "dirichlet"])
+def test_parts_that_must_be_there(missing: str):
+    labels = [label if label != missing else "neumann" for label in LABELS]
+    assert f"no edge is labelled '{missing}'" in fails_alike(Polygon(RECTANGLE, labels).mesh, 0.5)
+
+
+@pytest.mark.parametrize("size", [0, -1, np.nan, np.inf, 1e-12, 1e-4])
+def test_bad_sizes(size: float):
+    assert f"size is {size}" in fails_alike(Polygon(RECTANGLE, LABELS).mesh, size)
+
+
+def test_a_gmsh_session_of_the_users_own_goes_on():
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(argv=[], interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.7)
+        gmsh.model.add("mine")
+        gmsh.model.geo.addPoint(0, 0, 0)
+        gmsh.model.geo.synchronize()
+        assert area(Polygon(RECTANGLE, LABELS).mesh(0.5)) == pytest.approx(2)
+        assert gmsh.isInitialized()
+        assert gmsh.model.getCurrent() == "mine"
+        assert len(gmsh.model.getEntities(0)) == 1
+        assert gmsh.option.getNumber("Mesh.MeshSizeMax") == 0.7
+    finally:
+        gmsh.finalize()
+
+
+# gmsh files
+
+
+def write_gmsh(path: Path, curves: dict[str, list[int]], **options) -> None:
+    """The unit square from gmsh: edges are 0 (below), 1 (right), 2 (above), 3 (left)."""
+    import gmsh
+
+    gmsh.initialize(argv=[], readConfigFiles=False, interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        geo = gmsh.model.geo
+        corners = [(0, 0), (1, 0), (1, 1), (0, 1)]
+        points = [geo.addPoint(x, y, options.get("slope", 0) * x, 0.5) for x, y in corners]
+        lines = [geo.addLine(a, b) for a, b in itertools.pairwise([*points, points[0]])]
+        inner = []
+        if options.get("wall"):
+            middle = [geo.addPoint(x, 0.5, 0, 0.5) for x in (0.25, 0.75)]
+            inner = [geo.addLine(*middle)]
+        surface = geo.addPlaneSurface([geo.addCurveLoop(lines)])
+        geo.synchronize()
+        if inner:
+            gmsh.model.mesh.embed(1, inner, 2, surface)
+        for name, members in curves.items():
+            group = [(lines + inner)[i] for i in members]
+            gmsh.model.addPhysicalGroup(1, group, name=name)
+        if options.get("surface", True):
+            gmsh.model.addPhysicalGroup(2, [surface], name="inside")
+        if options.get("quadrilaterals"):
+            gmsh.model.mesh.setRecombine(2, surface)
+        if options.get("solid"):
+            geo.extrude([(2, surface)], 0, 0, 1)
+            geo.synchronize()
+            gmsh.model.addPhysicalGroup(3, [1])
+            gmsh.model.mesh.generate(3)
+        else:
+            gmsh.model.mesh.generate(2)
+        gmsh.model.mesh.setOrder(options.get("order", 1))
+        gmsh.option.setNumber("Mesh.MshFileVersion", options.get("version", 4.1))
+        gmsh.option.setNumber("Mesh.Binary", options.get("binary", 0))
+        gmsh.write(str(path))
+    finally:
+        gmsh.finalize()
+
+
+CURVES = {"Contact": [0], "DIRICHLET": [1, 3]}
+
+
+@pytest.mark.parametrize("version", [2.2, 4.1])
+@pytest.mark.parametrize("binary", [0, 1])
+def test_gmsh_formats(shared_tmp_path: Path, version: float, binary: int):
+    path = shared_tmp_path / "square.msh"
+    on_root(COMM, lambda: write_gmsh(path, CURVES, version=version, binary=binary))
+    domain = read_gmsh(path)
+    assert lengths(domain) == pytest.approx([1, 2, 1])  # above: in no group, so Neumann
+    assert area(domain) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("name", ["signorini.msh", "signorini-2.2.msh"])
+def test_ready_meshes(name: str):
+    domain = read_gmsh(MESHES / name)
+    contact, dirichlet, neumann = lengths(domain)
+    facets = counts(domain)[1]
+    assert (contact, neumann) == pytest.approx((2, 0))
+    # a polygon in the half circle, its sides equally long
+    assert dirichlet == pytest.approx(2 * facets * np.sin(np.pi / 2 / facets))
+    assert area(domain) == pytest.approx(facets / 2 * np.sin(np.pi / facets))
+
+
+@pytest.mark.parametrize(
+    ("curves", "options", "message"),
+    [
+        ({"floor": [0], "dirichlet": [1]}, {}, "no physical curve is named 'contact'"),
+        ({"floor": [0], "dirichlet": [1]}, {}, "are: floor, dirichlet"),
+        ({"contact": [0]}, {}, "no physical curve is named 'dirichlet'"),
+        ({}, {}, "are: none"),
+        (CURVES, {"surface": False}, "no triangles"),
+        (CURVES, {"quadrilaterals": True}, "Quadrilateral"),
+        (CURVES, {"order": 2}, "'Triangle 6'"),
+        (CURVES, {"solid": True}, "three dimensions"),
+        (CURVES, {"slope": 1}, "does not lie in the x-y plane"),
+        ({"contact": [0, 1], "dirichlet": [1, 2]}, {}, "belongs to contact and to dirichlet"),
+        ({**CURVES, "neumann": [4]}, {"wall": True}, "labelled neumann but lies inside"),
+    ],
+)
+def test_bad_gmsh_files(shared_tmp_path: Path, curves, options, message):
+    path = shared_tmp_path / "bad.msh"
+    on_root(COMM, lambda: write_gmsh(path, curves, **options))
+    found = fails_alike(read_gmsh, path)
+    assert message in found
+    assert str(path) in found
+
+
+@pytest.mark.parametrize("keep", [0, 8, 200, 0.6])
+@pytest.mark.parametrize("version", [2.2, 4.1])
+@pytest.mark.parametrize("binary", [0, 1])
+def test_cut_off_gmsh_files(shared_tmp_path: Path, keep: float, version: float, binary: int):
+    path = shared_tmp_path / "cut.msh"
+
+    def write() -> None:
+        write_gmsh(path, CURVES, version=version, binary=binary)
+        whole = path.read_bytes()
+        path.write_bytes(whole[: keep if isinstance(keep, int) else int(keep * len(whole))])
+
+    on_root(COMM, write)
+    assert str(path) in fails_alike(read_gmsh, path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\xc3\x28\xff\x00" * 99, b"$MeshFormat\n1 0 8"])
+def test_files_that_are_no_meshes(shared_tmp_path: Path, content: bytes):
+    path = shared_tmp_path / "no.msh"
+    on_root(COMM, lambda: path.write_bytes(content) and None)
+    assert str(path) in fails_alike(read_gmsh, path)
+
+
+def test_missing_files_and_folders(shared_tmp_path: Path):
+    assert "No such file" in fails_alike(read_gmsh, shared_tmp_path / "nowhere.msh")
+    assert "directory" in fails_alike(read_gmsh, shared_tmp_path)
+
+
+def test_pieces_without_dirichlet_facets(shared_tmp_path: Path):
+    path = shared_tmp_path / "pieces.msh"
+    text = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+1 1 "contact"
+1 2 "dirichlet"
+$EndPhysicalNames
+$Nodes
+6
+1 0 0 0
+2 1 0 0
+3 0 1 0
+4 2 0 0
+5 3 0 0
+6 2 1 0
+$EndNodes
+$Elements
+4
+1 1 2 1 1 1 2
+2 1 2 2 2 2 3
+3 2 2 3 3 1 2 3
+4 2 2 3 3 4 5 6
+$EndElements
+"""
+    on_root(COMM, lambda: path.write_text(text) and None)
+    assert "the one around (2.33333, 0.333333) has no Dirichlet" in fails_alike(read_gmsh, path)
+
+
+# users' own meshes
+
+
+def tagged_rectangle(mode, n: int = 4, values=(7, 5, 9)) -> tuple:
+    """(-1, 1) × (0, 1), tagged on y = 0, at the sides and above."""
+    mesh = dolfinx.mesh.create_rectangle(COMM, [[-1, 0], [1, 1]], [2 * n, n], ghost_mode=mode)
+    mesh.topology.create_connectivity(1, 2)
+    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    x = dolfinx.mesh.compute_midpoints(mesh, 1, facets)
+    below, above = np.isclose(x[:, 1], 0), np.isclose(x[:, 1], 1)
+    labels = np.where(below, values[0], np.where(above, values[2], values[1])).astype(np.int32)
+    return mesh, dolfinx.mesh.meshtags(mesh, 1, facets, labels)
+
+
+@pytest.mark.parametrize("mode", list(dolfinx.mesh.GhostMode))
+@pytest.mark.parametrize("neumann", [None, 9, [9, 10]])
+def test_own_tags(mode, neumann):
+    mesh, tags = tagged_rectangle(mode)
+    domain = Domain.from_tags(mesh, tags, contact=7, dirichlet=[5], neumann=neumann)
+    assert domain.mesh is mesh
+    assert lengths(domain) == pytest.approx([2, 2, 2])
+    assert counts(domain) == [8, 8, 8]
+
+
+def test_own_tags_by_several_values():
+    mesh, tags = tagged_rectangle(dolfinx.mesh.GhostMode.none)
+    domain = Domain.from_tags(mesh, tags, contact=[7, 8], dirichlet=(5, 9))
+    assert lengths(domain) == pytest.approx([2, 4, 0])
+
+
+def test_own_tags_that_do_not_fit():
+    mesh, tags = tagged_rectangle(dolfinx.mesh.GhostMode.shared_facet)
+
+    def take(**parts) -> Domain:
+        return Domain.from_tags(mesh, tags, **parts)
+
+    message = fails_alike(lambda: take(contact=1, dirichlet=5))
+    assert "no exterior facet is tagged contact (value 1)" in message
+    assert "5, 7, 9" in message
+    assert "tagged dirichlet (value 2)" in fails_alike(lambda: take(contact=7))
+    both = fails_alike(lambda: take(contact=[7, 5], dirichlet=5))
+    assert "the facet value 5 stands for contact and for dirichlet" in both
+    cells = dolfinx.mesh.meshtags(mesh, 2, np.array([], dtype=np.int32), 1)
+    assert "dimension 2" in fails_alike(lambda: Domain.from_tags(mesh, cells))
+    inside = dolfinx.mesh.locate_entities(mesh, 1, lambda x: np.isclose(x[1], 0.5))
+    wall = dolfinx.mesh.meshtags(mesh, 1, inside, np.full(len(inside), 1, dtype=np.int32))
+    assert "lie inside" in fails_alike(lambda: Domain.from_tags(mesh, wall))
+
+
+def test_own_quadrilaterals():
+    mesh = dolfinx.mesh.create_unit_square(
+        COMM, 2, 2, cell_type=dolfinx.mesh.CellType.quadrilateral
+    )
+    tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
+    assert "quadrilateral" in fails_alike(lambda: Domain.from_tags(mesh, tags))
