@@ -187,7 +187,8 @@ def start_petsc(options: list[str]) -> None:
     import petsc4py
 
     if "petsc4py.PETSc" not in sys.modules:
-        petsc4py.init([sys.argv[0] or "signorini-cr", *options])
+        # PETSc would take a closed pipe, or being told to stop, for a crash
+        petsc4py.init([sys.argv[0] or "signorini-cr", "-no_signal_handler", *options])
     elif options:
         from petsc4py import PETSc
 

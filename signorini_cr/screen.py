@@ -62,7 +62,7 @@ class Screen:
         if self.root:
             self.clear()
             self.flush()
-            print(wrapped(f"signorini-cr: {message}"), file=sys.stderr, flush=True)
+            print(wrapped(message, "signorini-cr: "), file=sys.stderr, flush=True)
 
     def flush(self) -> None:
         """Bring out what was printed, and take away the progress line."""
@@ -79,11 +79,16 @@ class Screen:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def wrapped(text: str) -> str:
-    """Fold to the width of a terminal; lines that begin with blanks are left as they are."""
-    return "\n".join(
-        line
-        if line.startswith(" ")
-        else textwrap.fill(line, WIDTH, break_long_words=False, break_on_hyphens=False)
-        for line in text.rstrip().split("\n")
-    )
+def wrapped(text: str, before: str = "") -> str:
+    """Fold to the width of a terminal; lines that begin with blanks are left as they are.
+
+    Args:
+        text: One paragraph a line.
+        before: What the first line begins with.
+    """
+    fold = textwrap.TextWrapper(WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = []
+    for line in text.rstrip().split("\n"):
+        fold.initial_indent = before if not lines else ""
+        lines.append(line if line.startswith(" ") else fold.fill(line))
+    return "\n".join(lines)

@@ -1,0 +1,548 @@
+"""The command: what it prints, writes and returns, and one clear message for each mistake."""
+
+import contextlib
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+from signorini_cr import cli, commandline, levels
+from signorini_cr.errors import NotConverged
+
+COMM = MPI.COMM_WORLD
+LINE = 'boundary = ["contact", "dirichlet", "dirichlet", "dirichlet"]'
+CASE = f"""title = "S1"
+[domain]
+vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
+{LINE}
+size = 0.5
+[define]
+r = "sqrt(x**2 + y**2)"
+[data]
+f = "1 + r"
+obstacle = 0
+[refine]
+mode = "uniform"
+levels = 2
+tolerance = 0
+"""
+NEUMANN = '["neumann", "neumann", "neumann"]'
+HOLE = f"holes = [{{ vertices = [[3, 3], [4, 3], [4, 4]], boundary = {NEUMANN} }}]"
+FLAT_HOLE = f"holes = [{{ vertices = [[0, 0.4], [0.1, 0.4]], boundary = {NEUMANN} }}]"
+
+
+def with_(old: str, new: str) -> str:
+    assert old in CASE
+    return CASE.replace(old, new)
+
+
+def without(section: str) -> str:
+    parts = CASE.split("\n[")
+    assert any(part.startswith(section) for part in parts)
+    return "\n[".join(part for part in parts if not part.startswith(section))
+
+
+def mesh_case(name: str) -> str:
+    return f'domain.mesh = "{name}"\n[data]\nf = 1\n'
+
+
+# name: (text of the file, what the message must hold)
+BAD: dict[str, tuple[str, list[str]]] = {
+    "unknown section": (with_("[refine]", "[refin]"), ["refin:", "did you mean refine?"]),
+    "unknown key": (
+        with_("levels", "level"),
+        ["refine.level:", "did you mean levels? Allowed are mode, levels, tolerance, max_dofs"],
+    ),
+    "key in the wrong section": (
+        with_("[refine]", "[refine]\nobstacle = 1"),
+        ["refine.obstacle:", "it belongs under [data]"],
+    ),
+    "section missing": (without("domain"), ["the section [domain] is missing"]),
+    "no data": (without("data"), ["the section [data] is missing"]),
+    "section of the wrong kind": ("domain = 3\n[data]\n", ["domain:", "section", "found 3"]),
+    "key missing": (with_("size = 0.5\n", ""), ["domain.size: this key is missing"]),
+    "empty exact": (CASE + "[exact]\n", ["exact.u: this key is missing"]),
+    "levels a string": (with_("levels = 2", 'levels = "2"'), ["refine.levels:", 'string "2"']),
+    "levels true": (with_("levels = 2", "levels = true"), ["refine.levels:", "found true"]),
+    "levels 2.0": (with_("levels = 2", "levels = 2.0"), ["refine.levels:", "whole", "found 2.0"]),
+    "levels 0": (with_("levels = 2", "levels = 0"), ["refine.levels: 1 or more", "found 0"]),
+    "levels too many": (with_("levels = 2", "levels = 99"), ["levels is 99", "at most"]),
+    "tolerance negative": (
+        with_("tolerance = 0", "tolerance = -1e-3"),
+        ["refine.tolerance: 0 or more is needed, found -0.001"],
+    ),
+    "tolerance nan": (with_("tolerance = 0", "tolerance = nan"), ["tolerance:", "found nan"]),
+    "mode": (
+        with_('"uniform"', '"unifrom"'),
+        ["refine.mode:", '"unifrom"', "did you mean uniform? Allowed are uniform, adaptive"],
+    ),
+    "max_dofs": (with_("levels = 2", "max_dofs = 0"), ["refine.max_dofs: 1 or more"]),
+    "title a number": (with_('"S1"', "1"), ["title: a string is needed, found 1"]),
+    "size zero": (with_("size = 0.5", "size = 0"), ["domain.size: a number above 0", "found 0"]),
+    "size negative": (with_("size = 0.5", "size = -0.5"), ["domain.size:", "found -0.5"]),
+    "size infinite": (with_("size = 0.5", "size = inf"), ["domain.size:", "found inf"]),
+    "size far too small": (with_("size = 0.5", "size = 1e-12"), ["domain:", "size is 1e-12"]),
+    "vertices no list": (
+        with_("vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]", "vertices = 4"),
+        ["domain.vertices: a list is needed, found 4"],
+    ),
+    "vertex of one number": (
+        with_("[1, 0]", "[1]"),
+        ["domain.vertices[1]: a point [x, y] is needed", "found a list of 1"],
+    ),
+    "vertex of strings": (with_("[1, 0]", '[1, "0"]'), ["domain.vertices[1][1]:", 'string "0"']),
+    "vertex not finite": (with_("[1, 0]", "[1, inf]"), ["domain.vertices[1][1]:", "inf"]),
+    "crossing": (
+        with_("[1, 1], [-1, 1]", "[-1, 1], [1, 1]"),
+        ["domain.vertices:", "edge 1 crosses edge 3"],
+    ),
+    "vertex twice": (with_("[1, 1],", "[1, 0],"), ["domain.vertices:", "vertex 1", "vertex 2"]),
+    "two vertices": (
+        with_("[1, 0], [1, 1], [-1, 1]]", "[1, 0]]"),
+        ["domain.vertices: at least 3", "found 2"],
+    ),
+    "too few labels": (
+        with_(LINE, 'boundary = ["contact", "dirichlet"]'),
+        ["domain.boundary:", "4 edges, found 2 labels"],
+    ),
+    "unknown label": (
+        with_('"contact"', '"contct"'),
+        [
+            "domain.boundary[0]:",
+            '"contct" is unknown; did you mean contact? Allowed are contact, dirichlet, neumann',
+        ],
+    ),
+    "no dirichlet": (
+        with_(', "dirichlet"' * 3, ', "neumann"' * 3),
+        ["domain.boundary:", "'dirichlet'"],
+    ),
+    "no contact": (with_('"contact"', '"neumann"'), ["domain.boundary:", "'contact'"]),
+    "hole outside": (with_("size", HOLE + "\nsize"), ["domain.holes:", "hole 0", "outside"]),
+    "hole of two": (
+        with_("size", FLAT_HOLE + "\nsize"),
+        ["domain.holes[0].vertices: at least 3", "found 2"],
+    ),
+    "hole with a bad label": (
+        with_("size", HOLE.replace('"neumann"]', '"slip"]') + "\nsize"),
+        ["domain.holes[0].boundary[2]:", '"slip"', "contact, dirichlet, neumann"],
+    ),
+    "hole with an unknown key": (
+        with_("size", HOLE.replace("vertices", "vertexes") + "\nsize"),
+        ["domain.holes[0].vertexes:", "did you mean vertices?"],
+    ),
+    "mesh and polygon": (
+        with_("size", 'mesh = "a.msh"\nsize'),
+        ["domain: both mesh and vertices are given"],
+    ),
+    "neither": ("[domain]\nsize = 1\n[data]\n", ["domain: neither vertices nor mesh"]),
+    "unknown name": (
+        with_("1 + r", "1 + rr"),
+        ["data.f:", "no name 'rr'; did you mean r?", "1 + rr\n        ^^\n"],
+    ),
+    "unknown function": (with_("1 + r", "sine(r)"), ["data.f:", "did you mean sin?"]),
+    "forbidden construct": (
+        with_("1 + r", "__import__('os').system('true')"),
+        ["data.f:", "only a function can be called"],
+    ),
+    "attribute": (with_("1 + r", "x.real"), ["data.f: a dot is not part of the language"]),
+    "condition for a number": (with_("1 + r", "r < 1"), ["data.f:", "condition"]),
+    "expression of the wrong type": (with_('"1 + r"', "[1]"), ["data.f:", "found a list of 1"]),
+    "expression true": (with_('"1 + r"', "true"), ["data.f:", "found true"]),
+    "definition used before": (
+        with_("[define]", '[define]\nq = "2*r"'),
+        ["define.q:", "'r' is defined only further down"],
+    ),
+    "definition of a taken name": (with_("[define]", "[define]\nx = 1"), ["define.x:", "already"]),
+    "definition of no name": (with_("[define]", '[define]\n"a-b" = 1'), ["define.a-b:"]),
+    "f not finite": (with_("1 + r", "1/r"), ["data.f: the value at (0, 0) is inf"]),
+    "obstacle not finite": (
+        with_("obstacle = 0", 'obstacle = "log(x)"'),
+        ["data.obstacle: the value at (-1, 0) is nan", "on the contact part"],
+    ),
+    "dirichlet not finite": (
+        with_("obstacle = 0", 'dirichlet = "1/(1 - y)"'),
+        ["data.dirichlet: the value at (-1, 1) is inf", "on the dirichlet part"],
+    ),
+    "exact not finite": (CASE + '[exact]\nu = "sqrt(x)"\n', ["exact.u: the value at (-1, 0)"]),
+    "coefficient": (
+        with_("obstacle = 0", 'coefficient = "x"'),
+        ["data.coefficient: the value at (-1, 0) is -1", "above 0"],
+    ),
+    "obstacle above u_D": (
+        with_("obstacle = 0", 'obstacle = "x"\ndirichlet = "x/2"'),
+        ["data.obstacle: at (1, 0)", "obstacle is 1", "value is only 0.5"],
+    ),
+    "obstacle above 0": (
+        with_("obstacle = 0", "obstacle = 1e-3"),
+        ["data.obstacle: at (-1, 0)", "0.001", "only 0"],
+    ),
+    "syntax": (with_("size = 0.5", "size = "), ["TOML syntax in line 5, column 8", "^"]),
+    "syntax at the end": (CASE + "[other", ["TOML syntax at the end of the file (line 15)"]),
+    "section twice": (CASE + "[data]\n", ["TOML syntax in line 15", "Cannot declare [data] twice"]),
+    "key twice": (with_("size = 0.5", "size = 0.5\nsize = 1"), ["TOML syntax in line 6"]),
+    "not text": ("\udcff", ["UTF-8"]),
+    "mesh missing": (mesh_case("none.msh"), ["domain.mesh:", "none.msh", "No such file"]),
+    "mesh a folder": (mesh_case("."), ["domain.mesh:", "cannot be read"]),
+    "mesh no mesh": (mesh_case("junk.msh"), ["domain.mesh:", "not a gmsh mesh file"]),
+    "mesh cut off": (mesh_case("cut.msh"), ["domain.mesh:", "cut.msh"]),
+    "mesh without names": (
+        mesh_case("nameless.msh"),
+        ["domain.mesh:", "named 'contact'", "floor, dirichlet"],
+    ),
+    "mesh with quadrilaterals": (mesh_case("quads.msh"), ["domain.mesh:", "Quadrilateral"]),
+    "mesh in 3D": (mesh_case("solid.msh"), ["domain.mesh:", "three dimensions"]),
+    "mesh facet in two groups": (
+        mesh_case("twice.msh"),
+        ["domain.mesh:", "(0, 0) to (1, 0)", "contact and to dirichlet"],
+    ),
+}
+_NODES = ["0 0 0", "1 0 0", "1 1 0", "0 1 0", "0 0 1"]
+_LINES = ["1 2 1 1 1 2", "1 2 2 2 2 3 4"]
+_TRIANGLES = ["2 2 3 3 1 2 3", "2 2 3 3 1 3 4"]
+
+
+def msh(elements: list[str], contact: str = "contact") -> str:
+    """A gmsh file of a unit square."""
+
+    def block(name: str, rows: list[str], numbered: bool = True) -> str:
+        rows = [f"{i + 1} {row}" if numbered else row for i, row in enumerate(rows)]
+        return "\n".join([f"${name}", str(len(rows)), *rows, f"$End{name}", ""])
+
+    names = [f'1 1 "{contact}"', '1 2 "dirichlet"', '2 3 "body"', '3 4 "solid"']
+    return (
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
+        + block("PhysicalNames", names, numbered=False)
+        + block("Nodes", _NODES)
+        + block("Elements", elements)
+    )
+
+
+LINES = ["1 2 1 1 1 2", "1 2 2 2 3 4"]
+MESHES = {
+    "junk.msh": "nothing",
+    "cut.msh": msh(LINES + _TRIANGLES)[:-60],
+    "nameless.msh": msh(LINES + _TRIANGLES, "floor"),
+    "quads.msh": msh([*LINES, "3 2 3 3 1 2 3 4"]),
+    "solid.msh": msh([*LINES, *_TRIANGLES, "4 2 4 4 1 2 3 5"]),
+    "twice.msh": msh([*LINES, "1 2 2 3 1 2", *_TRIANGLES]),
+}
+
+
+def run(*argv: str | Path) -> tuple[int, str, str]:
+    """The command in this process, on all ranks: status, stdout and stderr of this rank."""
+    with (
+        contextlib.redirect_stdout(io.StringIO()) as out,
+        contextlib.redirect_stderr(io.StringIO()) as err,
+    ):
+        status = cli.main([str(word) for word in argv])
+    return status, out.getvalue(), err.getvalue()
+
+
+def refused(*argv: str | Path) -> str:
+    """The one message of a run that is turned down with nothing written, on every rank."""
+    before = sorted(Path().rglob("*"))
+    COMM.Barrier()
+    status, out, err = run(*argv)
+    assert COMM.allgather(status) == [cli.BAD_INPUT] * COMM.size
+    assert COMM.allgather(out) == [""] * COMM.size
+    said = COMM.allgather(err)
+    assert said[1:] == [""] * (COMM.size - 1)
+    assert said[0].startswith("signorini-cr: ") and "Traceback" not in said[0]
+    assert max(map(len, said[0].split("\n"))) <= 80
+    COMM.Barrier()
+    assert sorted(Path().rglob("*")) == before
+    return said[0]
+
+
+@pytest.fixture
+def write(shared_tmp_path: Path, monkeypatch) -> Callable[..., str]:
+    """Write a file into the folder of the test, which is the current one."""
+    monkeypatch.chdir(shared_tmp_path)
+
+    def write(text: str, name: str = "case.toml") -> str:
+        if COMM.rank == 0:
+            Path(name).write_text(text, encoding="utf-8", errors="surrogateescape")
+        COMM.Barrier()
+        return name
+
+    return write
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input(name: str, write) -> None:
+    text, words = BAD[name]
+    for mesh, content in MESHES.items():
+        if mesh in text:
+            write(content, mesh)
+    path = write(text)
+    message = refused("solve", path, "--out", "out")
+    assert message.startswith("signorini-cr: case.toml: ")
+    flat = " ".join(message.split())
+    for word in words:
+        assert word in message or word in flat
+    assert refused("check", path, "--out", "out") == message
+
+
+@pytest.mark.parametrize(
+    "argv, words",
+    [
+        ([], ["a command comes first", "solve and check"]),
+        (["solv"], ["no command 'solv'", "did you mean solve?"]),
+        (["solve"], ["FILE.toml"]),
+        (["solve", "FILE", "two"], ["'two' is one argument too many"]),
+        (["solve", "FILE", "--outt", "DIR"], ["no option --outt", "did you mean --out?"]),
+        (["solve", "FILE", "--level", "3"], ["no option --level", "did you mean --levels?"]),
+        (["solve", "FILE", "--levels", "0"], ["--levels", "1 or more", "found 0"]),
+        (["solve", "FILE", "--levels", "-2"], ["--levels", "1 or more", "found -2"]),
+        (["solve", "FILE", "--levels", "two"], ["--levels", "whole number", "found two"]),
+        (["solve", "FILE", "--levels"], ["--levels"]),
+        (["solve", "FILE", "--out="], ["--out", "folder"]),
+        (["solve", "FILE", "--element", "p2"], ["--element", "cr", "p1"]),
+        (["check", "FILE", "--levels", "2"], ["no option --levels"]),
+        (["solve", "none.toml"], ["none.toml: there is no such file"]),
+        (["solve", "."], ["folder; a problem file (TOML) is needed"]),
+        (["solve", "FILE", "--out", "FILE/out"], ["--out: cannot write", "not a folder"]),
+        (["solve", "FILE", "--out", "/proc/none"], ["--out: cannot write"]),
+    ],
+    ids=lambda argv: " ".join(argv)[:30],
+)
+def test_bad_command_lines(argv: list[str], words: list[str], write) -> None:
+    path = write(CASE)
+    if "/proc/none" in argv and os.access("/proc", os.W_OK):
+        argv[-1] = "/proc/version/out"
+    argv = [word.replace("FILE", path) for word in argv]
+    message = " ".join(refused(*argv).split())
+    for word in words:
+        assert word in message
+
+
+def test_a_folder_without_permission(write) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may write anywhere")
+    path, folder = write(CASE), Path("kept")
+    if COMM.rank == 0:
+        folder.mkdir(mode=0o500)
+    message = refused("solve", path, "--out", folder)
+    assert "not writable" in message
+
+
+def test_solve(write) -> None:
+    path, out = write(CASE), Path("deep/out")
+    status, text, err = run("solve", path, "--out", out, "--levels", "3")
+    assert (status, err) == (0, "")
+    if COMM.rank > 0:
+        assert text == ""
+        return
+    lines = text.split("\n")
+    assert lines[0].split()[:4] == ["level", "cells", "dofs", "h"]
+    assert [line.split()[0] for line in lines[1:4]] == ["0", "1", "2"]
+    assert max(map(len, lines)) <= 80
+    assert "contact on" in text and "written to" in text
+    report = json.loads((out / "report.json").read_text())
+    assert (report["title"], report["element"], report["ranks"]) == ("S1", "CR", COMM.size)
+    assert [level["level"] for level in report["levels"]] == [0, 1, 2]
+    assert report["levels"][0]["seconds"]["mesh"] > 0
+    assert {"levels.csv", "levels.md", "contact.csv"} <= {file.name for file in out.iterdir()}
+
+
+def test_quiet_and_p1(write) -> None:
+    path, out = write(CASE), Path("out")
+    assert run("solve", path, "--out", out, "--element", "P1", "--quiet") == (0, "", "")
+    if COMM.rank == 0:
+        assert json.loads((out / "report.json").read_text())["element"] == "P1"
+
+
+def test_verbose_prints_the_steps(write) -> None:
+    status, text, _ = run("solve", write(CASE), "--out", "out", "-v")
+    assert status == 0
+    steps = [line.split() for line in text.split("\n") if line.startswith("  level 1")]
+    if COMM.rank == 0:
+        assert [step[:4] for step in steps[:2]] == [
+            ["level", "1", "step", "0"],
+            ["level", "1", "step", "1"],
+        ]
+        assert {"residual", "active", "cg"} <= set(steps[0])
+
+
+def test_progress_is_for_terminals(write, monkeypatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    path, terminal = write(CASE), Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert cli.main(["solve", str(path), "--out", "out"]) == 0
+    if COMM.rank == 0:
+        assert "level 1  step" in terminal.getvalue()
+        assert terminal.getvalue().endswith("\r") and "\n" not in terminal.getvalue()
+        assert max(map(len, terminal.getvalue().split("\r"))) < 80
+    else:
+        assert terminal.getvalue() == ""
+
+
+def test_check(write) -> None:
+    path, out = write(CASE), Path("out")
+    status, text, err = run("check", path, "--out", out)
+    assert (status, err) == (0, "")
+    if COMM.rank == 0:
+        assert "case.toml: in order" in text
+        assert "contact: 4 facets, length 2\n" in text
+        assert "dirichlet: 8 facets, length 4\n" in text
+        assert "neumann: 0 facets" in text
+        assert [file.name for file in out.iterdir()] == ["mesh.png"] or "not drawn" in text
+
+
+@pytest.mark.parametrize("finished", [0, 2])
+def test_levels_finished_before_a_failure_are_kept(finished: int, write, monkeypatch) -> None:
+    solve_levels = levels.solve_levels
+
+    def failing(problem, domain, number, *rest, **options):
+        yield from (
+            s for s in solve_levels(problem, domain, finished, *rest, **options) if finished
+        )
+        raise NotConverged("DIVERGED_MAX_IT after 50 steps", finished)
+
+    monkeypatch.setattr(levels, "solve_levels", failing if finished else _at_once)
+    path, out = write(CASE), Path("out")
+    status, text, err = run("solve", path, "--out", out, "--levels", "4")
+    assert status == cli.NOT_CONVERGED
+    COMM.Barrier()
+    if COMM.rank > 0:
+        assert (text, err) == ("", "")
+        return
+    message = " ".join(err.split())
+    assert f"case.toml: stopped on level {finished}: DIVERGED_MAX_IT after 50 steps" in message
+    assert "Traceback" not in err
+    if finished:
+        assert "levels 0 to 1, finished before, are kept in" in message
+        assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
+    else:
+        assert "nothing was written" in message and not out.exists()
+
+
+def _at_once(*_, **__):
+    raise NotConverged("DIVERGED_MAX_IT after 50 steps", 0)
+
+
+@pytest.mark.serial
+def test_the_unexpected_is_told_as_such(write, monkeypatch) -> None:
+    monkeypatch.setattr(levels, "solve_levels", lambda *_: 1 / 0)
+    status, _, err = run("solve", write(CASE), "--out", "out")
+    assert status == cli.FAULT
+    assert "ZeroDivisionError" in err and "signorini-cr: unexpected error" in err
+
+
+@pytest.mark.serial
+def test_ctrl_c(write, monkeypatch) -> None:
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(levels, "solve_levels", interrupt)
+    status, _, err = run("solve", write(CASE), "--out", "out")
+    assert (status, err) == (cli.INTERRUPTED, "signorini-cr: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    "argv, own, petsc",
+    [
+        (["solve", "a.toml", "-log_view"], ["solve", "a.toml"], ["-log_view"]),
+        (["-log_view", "solve", "a.toml"], ["solve", "a.toml"], ["-log_view"]),
+        (["solve", "-log_view", "a.toml"], ["solve", "a.toml"], ["-log_view"]),
+        (["solve", "-k", "-ksp_x", "-1e-3", "a"], ["solve", "-k", "a"], ["-ksp_x", "-1e-3"]),
+        (["-a_b", "-v", "-c_d", "x", "-q"], ["-v", "-q"], ["-a_b", "-c_d", "x"]),
+        (["solve", "--levels", "2", "-view", "3"], ["solve", "--levels", "2"], ["-view", "3"]),
+        (["solve", "--", "-odd.toml"], ["solve", "--", "-odd.toml"], []),
+    ],
+)
+def test_single_dashes_are_left_to_petsc(argv, own, petsc) -> None:
+    assert commandline._split(argv) == (own, petsc)
+
+
+def test_petsc_takes_them(write) -> None:
+    from petsc4py import PETSc
+
+    out = Path("out")
+    status, _, _ = run("solve", write(CASE), "--out", out, "-q", "-signorini_cr_probe", "1e-10")
+    assert status == 0
+    options = PETSc.Options()
+    assert options.getReal("signorini_cr_probe") == 1e-10
+    options.delValue("signorini_cr_probe")
+
+
+def process(*argv: str | Path, ranks: int = 1, **options) -> subprocess.CompletedProcess[str]:
+    """The command as users start it."""
+    launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    command = [*launch, sys.executable, "-m", "signorini_cr", *map(str, argv)]
+    # Not the variables of an MPI that runs these tests
+    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "PMI" not in k}
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=clean, **options
+    )
+
+
+@pytest.mark.serial
+def test_help_answers_without_the_heavy_libraries() -> None:
+    program = (
+        "import sys\nfrom signorini_cr import cli\nassert cli.main(['solve', '--help']) == 0\n"
+        "heavy = {'numpy', 'mpi4py', 'petsc4py', 'dolfinx', 'ufl', 'gmsh', 'matplotlib'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
+    )
+    began = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert time.perf_counter() - began < 2.0
+    for word in ("--out DIR", "--levels N", "cr|p1", "--quiet", "PETSc", "FILE-out"):
+        assert word in done.stdout
+    assert max(map(len, done.stdout.split("\n"))) <= 80
+    assert process("--version").stdout.startswith("signorini-cr 0.")
+
+
+@pytest.mark.serial
+def test_on_two_ranks_mistakes_are_told_once(tmp_path: Path) -> None:
+    for argv in (["solve", "x.toml", "--level", "3"], ["solve", tmp_path / "none.toml"]):
+        done = process(*argv, ranks=2)
+        assert done.returncode == 2
+        assert done.stderr.count("signorini-cr: ") == 1 and "Traceback" not in done.stderr
+
+
+@pytest.mark.serial
+def test_on_two_ranks_the_figures_are_the_same(tmp_path: Path) -> None:
+    (tmp_path / "case.toml").write_text(CASE)
+    energies = []
+    for ranks in (1, 2):
+        out = tmp_path / str(ranks)
+        done = process("solve", tmp_path / "case.toml", "--out", out, ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        energies.append(
+            [r["energy"] for r in json.loads((out / "report.json").read_text())["levels"]]
+        )
+    assert energies[0] == pytest.approx(energies[1], rel=1e-9)
+
+
+@pytest.mark.serial
+def test_without_out_the_results_lie_in_the_current_folder(tmp_path: Path) -> None:
+    (tmp_path / "case.toml").write_text(CASE)
+    (tmp_path / "work").mkdir()
+    done = process("solve", "../case.toml", "--quiet", cwd=tmp_path / "work")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert (tmp_path / "work" / "case-out" / "report.json").exists()
+
+
+@pytest.mark.serial
+def test_a_closed_pipe_is_no_reason_to_stop(tmp_path: Path) -> None:
+    (tmp_path / "case.toml").write_text(CASE)
+    command = f"{sys.executable} -m signorini_cr solve case.toml --out out; echo $? >status"
+    done = subprocess.run(
+        ["sh", "-c", f"({command}) | true"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert "Error" not in done.stderr and "Exception" not in done.stderr
+    assert (tmp_path / "status").read_text().strip() == "0"
+    assert (tmp_path / "out" / "report.json").exists()
