@@ -1,0 +1,258 @@
+"""A mesh as arrays: what the certificate needs to know of cells, facets and vertices.
+
+Arrays over cells have the local number first: shape (d + 1, cells), owned cells only. Facet i is
+opposite vertex i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem, la
+
+from . import compat
+from .domain import DIRICHLET, PARTS, Domain
+from .space import facet_entities
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+BLOCK = 1 << 13
+"""Cells that are worked on at a time: as many as the processor's cache holds."""
+
+BESSEL = 3.8317059702
+"""First positive zero of J₁, rounded down."""
+
+
+def blocks(cells: int) -> Iterator[slice]:
+    """Consecutive ranges of cells."""
+    return (slice(a, min(a + BLOCK, cells)) for a in range(0, cells, BLOCK))
+
+
+def pick(values: FloatArray, where: slice | IntArray) -> FloatArray:
+    """Values on some cells of an array over all of them, or the one value that holds on all."""
+    return values if values.ndim == 0 else values[where]
+
+
+def poincare(tdim: int) -> float:
+    """C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
+
+    1/π for any convex cell (Payne and Weinberger); 1/j₁₁ for triangles (Laugesen and Siudeja).
+    """
+    return 1 / BESSEL if tdim == 2 else 1 / np.pi
+
+
+@dataclass(frozen=True)
+class Side:
+    """Boundary facets of one part, seen from their cells.
+
+    Attributes:
+        cells: The cell of each facet, shape (n,).
+        local: Number of the facet in its cell, shape (n,).
+        dofs: The facet's degree of freedom, shape (n,).
+        ends: The facet's vertices, in the order of the cell's closure, shape (d, n).
+    """
+
+    cells: IntArray
+    local: IntArray
+    dofs: IntArray
+    ends: IntArray
+
+    @property
+    def entities(self) -> npt.NDArray[np.int32]:
+        """Pairs (cell, local facet), as Expressions want them."""
+        return np.column_stack([self.cells, self.local]).astype(np.int32)
+
+
+class Cells:
+    """What the certificate needs to know of a mesh.
+
+    Attributes:
+        number: Owned cells.
+        facets: Facet dofs of each cell, shape (d + 1, cells).
+        vertices: Vertices of each cell, shape (d + 1, cells).
+        others: The vertices of facet i but vertex i, shape (d + 1, d).
+        pairs: The pairs i < j of local vertices, in the order of the next two arrays' rows.
+        lengths: |X_i − X_j|², shape (pairs, cells).
+        stiffness: |T| ∇λ_i·∇λ_j, shape (pairs, cells).
+        volume: |T|, shape (cells,).
+        sides: The boundary facets by part.
+    """
+
+    def __init__(self, domain: Domain, V: fem.FunctionSpace):
+        """Read a domain's mesh; V is its Crouzeix-Raviart space."""
+        mesh = domain.mesh
+        self.domain, self.V, self.comm = domain, V, mesh.comm
+        d = self.tdim = mesh.topology.dim
+        n = self.number = mesh.topology.index_map(d).size_local
+        self.facets = V.dofmap.list[:n].T.astype(np.intp)
+        corners = mesh.topology.connectivity(d, 0).array.reshape(-1, d + 1)
+        self.vertices = corners[:n].T.astype(np.intp)
+        self.others = np.array([[j for j in range(d + 1) if j != i] for i in range(d + 1)])
+        self.pairs = list(combinations(range(d + 1), 2))
+        self.lengths = np.empty((len(self.pairs), n))
+        self.stiffness = np.empty((len(self.pairs), n))
+        self.volume = np.empty(n)
+        x = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
+        nodes = compat.cell_nodes(mesh)[:n].T.astype(np.intp)
+        for part in blocks(n):
+            corner = [[row.take(i) for row in x] for i in nodes[:, part]]
+            edges = [[p - q for p, q in zip(c, corner[0], strict=True)] for c in corner[1:]]
+            for k, (i, j) in enumerate(self.pairs):
+                self.lengths[k, part] = sum(
+                    (p - q) ** 2 for p, q in zip(corner[i], corner[j], strict=True)
+                )
+            self.volume[part], self.stiffness[:, part] = _shape(edges, self.lengths[:, part])
+
+    @cached_property
+    def diameter2(self) -> FloatArray:
+        """h_T², shape (cells,)."""
+        return self.lengths.max(axis=0)
+
+    @cached_property
+    def sides(self) -> dict[int, Side]:
+        """Boundary facets of owned cells."""
+        mesh, d = self.domain.mesh, self.tdim
+        index_map = mesh.topology.index_map(d - 1)
+        mark = la.vector(index_map, dtype=np.float64)
+        for part in PARTS.values():
+            mark.array[self.domain.facets(part)] = part
+        mark.scatter_forward()
+        sides = {}
+        for part in PARTS.values():
+            found = np.flatnonzero(mark.array == part).astype(np.int32)
+            cells, local = facet_entities(mesh, found).T.astype(np.intp)
+            own = cells < self.number
+            cells, local = cells[own], local[own]
+            sides[part] = Side(
+                cells,
+                local,
+                self.facets[local, cells],
+                self.vertices[self.others[local].T, cells[None, :]],
+            )
+        return sides
+
+    @cached_property
+    def exterior(self) -> npt.NDArray[np.bool_]:
+        """Which facet dofs lie on the boundary, ghosts included."""
+        mark = la.vector(self.V.dofmap.index_map, dtype=np.float64)
+        for side in self.sides.values():
+            mark.array[side.dofs] = 1.0
+        self.share(mark.array)
+        return mark.array > 0
+
+    @cached_property
+    def layers(self) -> list[tuple[IntArray, IntArray]]:
+        """Cells by the number of facets between them and Γ0, nearest first.
+
+        Each layer has its cells and, for each, the local facet that leads back towards Γ0.
+        """
+        d = self.tdim
+        owners = np.full((2, len(self.exterior)), -1)
+        flat, cell = self.facets.ravel(), np.tile(np.arange(self.number), d + 1)
+        owners[0, flat] = cell
+        other = owners[0, flat] != cell
+        owners[1, flat[other]] = cell[other]
+        way_out = np.full(self.number, -1, dtype=np.intp)
+        front = np.zeros(len(self.exterior))
+        front[self.sides[DIRICHLET].dofs] = 1.0
+        self.share(front)
+        seen = front > 0
+        found, layers = np.flatnonzero(seen), []
+        while self.comm.allreduce(len(found)) > 0:
+            near = owners[:, found].ravel()
+            layer = np.unique(near[near >= 0])
+            layer = layer[way_out[layer] < 0]
+            facets = self.facets[:, layer]
+            way_out[layer] = np.argmax(seen[facets], axis=0)
+            layers.append((layer, way_out[layer]))
+            new = np.unique(facets[~seen[facets]])
+            if self.comm.size > 1:
+                front[:] = 0.0
+                front[new] = 1.0
+                new = np.flatnonzero((self.share(front) > 0) & ~seen)
+            seen[new] = True
+            found = new
+        return layers
+
+    def over_facets(self, values: FloatArray) -> FloatArray:
+        """Add up local values, shape (d + 1, cells), for each facet; ghosts included."""
+        index_map = self.V.dofmap.index_map
+        size = index_map.size_local + index_map.num_ghosts
+        total = np.bincount(self.facets.ravel(), values.ravel(), minlength=size)
+        return self.share(total.astype(np.float64, copy=False))
+
+    def share(self, values: FloatArray, dim: int | None = None) -> FloatArray:
+        """Sum the ranks' shares of facet dofs, or of vertices (``dim`` = 0), in place."""
+        if self.comm.size > 1:
+            topology = self.domain.mesh.topology
+            index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
+            vector = la.vector(index_map, dtype=np.float64)
+            vector.array[:] = values
+            vector.scatter_reverse(la.InsertMode.add)
+            vector.scatter_forward()
+            values[:] = vector.array
+        return values
+
+    def owned_facets(self) -> int:
+        """Number of facet dofs this rank owns."""
+        return self.V.dofmap.index_map.size_local
+
+    def total(self, *values: float | np.floating | FloatArray) -> FloatArray:
+        """Sum over all ranks."""
+        return self.comm.allreduce(np.array(values, dtype=np.float64))
+
+    def apply(self, c: FloatArray, part: slice) -> FloatArray:
+        """|T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
+        out = np.zeros_like(c)
+        for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
+            flow = (c[j] - c[i]) * s[part]
+            out[i] += flow
+            out[j] -= flow
+        return out
+
+    def trace(self, part: slice) -> FloatArray:
+        """|T| Σ |∇λ_i|²."""
+        return -2.0 * self.stiffness[:, part].sum(axis=0)
+
+
+def corner_points(cells: Cells, side: Side) -> tuple[FloatArray, FloatArray]:
+    """Coordinates of the opposite vertex, shape (n, gdim), and of the ends, shape (d, n, gdim)."""
+    mesh = cells.domain.mesh
+    nodes = compat.cell_nodes(mesh)[side.cells]
+    x = mesh.geometry.x[:, : mesh.geometry.dim]
+    apex = x[np.take_along_axis(nodes, side.local[:, None], axis=1)[:, 0]]
+    return apex, x[np.take_along_axis(nodes, cells.others[side.local], axis=1).T]
+
+
+def measures(cells: Cells, side: Side) -> FloatArray:
+    """|F|, shape (n,)."""
+    _, ends = corner_points(cells, side)
+    edges = ends[1:] - ends[:1]
+    gram = np.einsum("ind,jnd->nij", edges, edges)
+    return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, cells.tdim))
+
+
+def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Volumes and |T| ∇λ_i·∇λ_j of cells given by the edges from their first vertex."""
+    if len(edges) == 2:
+        (a, b), (c, d) = edges
+        volume = 0.5 * np.abs(a * d - b * c)
+        scale = 0.125 / volume
+        half = lengths.sum(axis=0)
+        return volume, (2.0 * lengths - half) * scale
+    jacobian = np.stack([np.stack(e, axis=-1) for e in edges], axis=-2)
+    size = len(edges)
+    volume = np.abs(np.linalg.det(jacobian)) / np.prod(np.arange(1, size + 1))
+    inverse = np.linalg.inv(jacobian)
+    gradients = np.concatenate([-inverse.sum(axis=-1, keepdims=True), inverse], axis=-1)
+    rows = [
+        volume * (gradients[..., i] * gradients[..., j]).sum(axis=-1)
+        for i, j in combinations(range(size + 1), 2)
+    ]
+    return volume, np.stack(rows)

@@ -1,0 +1,256 @@
+"""How wrong a solution can be: guaranteed bounds of its error and of the energy.
+
+For v ∈ K and y ∈ H(div) with −div y = f, y·n = g on Γg and y·n ≥ 0 on Γ1 the gap J(v) − D(y) bounds
+what neither of them knows about u. Both come from u_h at linear cost, see `flux` and `companion`.
+`docs/certificate.md` has the mathematics; the letters are the same there.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from . import compat
+from .cells import Cells, blocks, measures, poincare
+from .companion import Companion, companion, on_facet
+from .domain import NEUMANN
+from .flux import Flux, equilibrate, unbalanced
+from .gap import Sums, integrate
+from .moments import Coefficient, Load, Rule, Trace, Volume
+
+if TYPE_CHECKING:
+    from .levels import Solution
+    from .problem import Forms
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is certain about a solution; None where nothing is, `reason` then says why.
+
+    Attributes:
+        bound_h1: ‖u − u_h‖_h, the broken norm (1.6), is at most this.
+        bound_energy_norm: The same for ‖κ^{1/2} ∇_h(u − u_h)‖.
+        bound_companion: The same for ‖κ^{1/2} ∇(u − v)‖, v the conforming companion.
+        energy: J(u) lies between these two.
+        parts: Where the bound comes from: the norms of y − κ∇u_h (flux) and of ∇(v − u_h)
+            (companion), the contact term's square root (contact), the data oscillation of f
+            (load), of g (neumann), of u_D and α (boundary), and what the solver left (solver).
+        indicators: Square of each cell's share, shape (cells,), owned cells.
+        reason: Why figures are missing.
+        seconds: Wall time.
+    """
+
+    bound_h1: float | None = None
+    bound_energy_norm: float | None = None
+    bound_companion: float | None = None
+    energy: tuple[float, float] | None = None
+    parts: dict[str, float] = field(default_factory=dict)
+    indicators: FloatArray | None = None
+    reason: str | None = None
+    seconds: float = 0.0
+    _made: tuple[Cells, Flux, Companion, FloatArray] | None = None
+
+    @cached_property
+    def flux(self) -> fem.Function | None:
+        """The flux y as a function in the Raviart-Thomas space of lowest order."""
+        if self._made is None:
+            return None
+        cells, flux, _, kappa_w = self._made
+        mesh, d = cells.domain.mesh, cells.tdim
+        fluxes = flux.excess.copy()
+        for part in blocks(cells.number):
+            fluxes[:, part] -= d * cells.apply(kappa_w[:, part], part)
+        # y = slope x + shift on each cell
+        corners = mesh.geometry.x[compat.cell_nodes(mesh)[: cells.number], : mesh.geometry.dim]
+        constants = fem.functionspace(mesh, ("DG", 0))
+        vectors = fem.functionspace(mesh, ("DG", 0, (mesh.geometry.dim,)))
+        slope, shift = fem.Function(constants), fem.Function(vectors)
+        slope.x.array[: cells.number] = fluxes.sum(axis=0) / (d * cells.volume)
+        shift.x.array[: cells.number * mesh.geometry.dim] = (
+            -np.einsum("in,nik->nk", fluxes, corners) / (d * cells.volume)[:, None]
+        ).ravel()
+        for function in (slope, shift):
+            function.x.scatter_forward()
+        y = fem.Function(fem.functionspace(mesh, ("RT", 1)))
+        points = y.function_space.element.interpolation_points
+        points = points() if callable(points) else points
+        y.interpolate(fem.Expression(slope * ufl.SpatialCoordinate(mesh) + shift, points))
+        return y
+
+    @cached_property
+    def companion(self) -> fem.Function | None:
+        """The companion v without its lifting: quadratic on cells for d = 2, affine else."""
+        if self._made is None:
+            return None
+        cells, _, made, _ = self._made
+        degree = 2 if cells.tdim == 2 else 1
+        v = fem.Function(fem.functionspace(cells.domain.mesh, ("Lagrange", degree)))
+        dofs = v.function_space.dofmap.list[: cells.number]
+        values = made.vertices[cells.vertices]
+        v.x.array[dofs[:, : cells.tdim + 1]] = values.T
+        if degree == 2:
+            middle = (values.sum(axis=0) - values) / 2 + made.bumps[cells.facets]
+            v.x.array[dofs[:, 3:]] = middle.T
+        v.x.scatter_forward()
+        return v
+
+
+class _Data:
+    """The data of a problem, compiled for the certificate."""
+
+    def __init__(self, forms: Forms):
+        degree = forms.problem.quadrature_degree
+        rule = Rule(forms)
+        self.f = Volume(forms.f, forms, rule)
+        self.kappa = Volume(forms.kappa, forms, rule) if not ufl.shape(forms.kappa) else None
+        self.u_D = Trace(forms.dirichlet, forms, degree)
+        self.alpha = Trace(forms.obstacle, forms, degree)
+        self.g = Trace(forms.g, forms, degree, slopes=False)
+
+
+_DATA: WeakKeyDictionary[Forms, _Data] = WeakKeyDictionary()
+
+NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
+TENSOR = "the coefficient is not a scalar"
+ADRIFT = "part of the domain has no way to Γ0, or a figure is not finite"
+
+
+def certify(solution: Solution, sweeps: int = 1) -> Certificate:
+    """Bound the error of a solution; collective.
+
+    Args:
+        solution: From `solve` or `solve_levels`; it need not be converged.
+        sweeps: How often the companion's bumps are improved.
+    """
+    began = time.perf_counter()
+    level, u = solution.level, solution.u
+    if solution.element != "CR":
+        return Certificate(reason=NO_FLUX)
+    data = _DATA.get(level.forms)
+    if data is None:
+        data = _DATA[level.forms] = _Data(level.forms)
+    if data.kappa is None:
+        return Certificate(reason=TENSOR)
+    cells = Cells(level.domain, level.V)
+    kappa = Coefficient(data.kappa, cells)
+    if kappa.reason is not None:
+        return Certificate(reason=kappa.reason)
+    w = u.x.array[cells.facets]
+    w = w.sum(axis=0) - cells.tdim * w
+    load = Load.of(data.f, cells)
+    edge = _Neumann(cells, kappa, data.g)
+    flux = equilibrate(cells, kappa.mean, w, load, edge.shares)
+    v = companion(cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, sweeps)
+    sums = integrate(cells, kappa, w, load, flux, v)
+    lift, lift_energy = _lifted(cells, kappa, load, v, sums)
+    edge_energy = edge.load(v)
+    total = dict(zip(_TOTALS, cells.total(*(getattr(sums, name) for name in _TOTALS)), strict=True))
+    contact, edge_square, edge_energy, lift, lift_energy = cells.total(
+        np.sum(v.contact), edge.square, edge_energy, lift, lift_energy
+    )
+    lift, edge_norm = np.sqrt(lift), np.sqrt(edge_square)
+    left = unbalanced(level, cells, flux.left, kappa.low)
+    loose = edge_norm + left
+    same = total["flux"] + total["companion"] + total["load"]
+    same += 2 * (total["load_flux"] + total["slack"])
+    mixed = 2 * (total["cross"] + total["load_companion"])
+    far = np.sqrt(max(same - mixed, 0.0)) + lift + loose
+    near = np.sqrt(max(same + mixed, 0.0)) + lift
+    bound = near / 2 + loose / 2 + np.sqrt(far**2 / 4 + contact)
+    energy = total["energy"] - edge_energy
+    reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
+    if reason is not None:
+        return Certificate(reason=reason, seconds=time.perf_counter() - began)
+    return Certificate(
+        bound_h1=float(bound / np.sqrt(kappa.smallest)),
+        bound_energy_norm=float(bound),
+        bound_companion=float((far + np.sqrt(far**2 + 4 * contact)) / 2 + lift),
+        energy=(
+            float(energy - lift_energy - far**2 / 2 - contact),
+            float(energy + lift_energy),
+        ),
+        parts={
+            "flux": float(np.sqrt(total["flux"])),
+            "companion": float(np.sqrt(total["companion"])),
+            "contact": float(np.sqrt(contact)),
+            "load": float(np.sqrt(total["load"])),
+            "neumann": float(edge_norm),
+            "boundary": float(lift),
+            "solver": float(left),
+        },
+        indicators=sums.indicators,
+        seconds=time.perf_counter() - began,
+        _made=(cells, flux, v, kappa.mean * w),
+    )
+
+
+_TOTALS = (
+    "flux",
+    "companion",
+    "cross",
+    "load",
+    "load_flux",
+    "load_companion",
+    "slack",
+    "energy",
+)
+
+
+class _Neumann:
+    """g on Γg.
+
+    Attributes:
+        shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
+        square: Σ_T (Σ_F c_F ‖g − g_F‖_F)²/κ with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, this rank's share.
+    """
+
+    def __init__(self, cells: Cells, kappa: Coefficient, g: Trace):
+        self._cells, self._g = cells, g
+        side = self._side = cells.sides[NEUMANN]
+        _, _, self._values = g.at(cells, side)
+        self._measure = measures(cells, side)
+        self.shares = self._measure * (g.hats.T * g.weights @ self._values)
+        mean = g.weights @ self._values
+        variance = g.weights @ (self._values - mean) ** 2
+        at, d = side.cells, cells.tdim
+        h = np.sqrt(cells.diameter2[at])
+        # |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F
+        c = poincare(d) * h
+        trace = self._measure / cells.volume[at] * c * (c + 2.0 * h / d)
+        sizes = np.bincount(at, np.sqrt(trace * self._measure * variance), minlength=1)
+        low = kappa.low[: len(sizes)] if kappa.low.ndim else kappa.low
+        self.square = float(np.sum(sizes**2 / low)) if cells.number else 0.0
+
+    def load(self, v: Companion) -> float:
+        """∫_Γg g v, this rank's share."""
+        values = on_facet(self._cells, self._side, self._g, v.vertices, v.bumps)
+        return float(self._measure @ (self._g.weights @ (self._values * values)))
+
+
+def _lifted(
+    cells: Cells, kappa: Coefficient, load: Load, v: Companion, sums: Sums
+) -> tuple[float, float]:
+    """‖κ^{1/2} ∇ℓ‖² and how far J(v + ℓ) may be from J(v), bounds of this rank's shares."""
+    at, slope, size = v.lift
+    if not len(at):
+        return 0.0, 0.0
+    which, place = np.unique(at, return_inverse=True)
+    high = kappa.high[which] if kappa.high.ndim else kappa.high
+    steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
+    f = np.abs(load.mean[which])
+    if load.variance is not None:
+        f = np.hypot(f, np.sqrt(load.variance[which]))
+    assert sums.steepness is not None
+    before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
+    change = before * steep + 0.5 * steep**2 + np.sqrt(cells.volume[which]) * f * area
+    return float(np.sum(steep**2)), float(np.sum(change))

@@ -1,0 +1,221 @@
+"""Integrals over the cells that the certificate is made of.
+
+All of them are quadratic forms in a handful of numbers per cell, in which the mesh appears through
+|T| ∇λ_i·∇λ_j and |X_i − X_j|² alone. With κ_T the mean of κ on T, and
+
+    p = κ^{-1/2} (y − κ∇u_h),   b = κ^{1/2} ∇(v − u_h),   σ: −div σ = f − f_T in T, σ·n = 0 on ∂T,
+
+‖σ‖_T ≤ C h_T ‖f − f_T‖_T by Poincaré's inequality, and ∫_T σ·∇φ = ∫_T (f − f_T) φ for any φ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .cells import Cells, blocks, pick, poincare
+from .companion import Companion, bump_squares
+from .flux import Flux, field_squares
+from .moments import Coefficient, Load
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass
+class Sums:
+    """Totals over this rank's cells.
+
+    Attributes:
+        flux: ‖p‖².
+        companion: ‖b‖².
+        cross: ∫ p·b.
+        load: Bound of ‖κ^{-1/2}σ‖².
+        load_flux: ∫ κ^{-1/2}σ·p.
+        load_companion: ∫ κ^{-1/2}σ·b.
+        slack: How far load_flux may be from the truth.
+        energy: ½∫ κ|∇v|² − ∫ f v.
+        indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).
+        steepness: ∫_T κ|∇v|², shape (cells,).
+    """
+
+    flux: float = 0.0
+    companion: float = 0.0
+    cross: float = 0.0
+    load: float = 0.0
+    load_flux: float = 0.0
+    load_companion: float = 0.0
+    slack: float = 0.0
+    energy: float = 0.0
+    indicators: FloatArray | None = None
+    steepness: FloatArray | None = None
+
+
+def integrate(
+    cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux: Flux, v: Companion
+) -> Sums:
+    """Sum up the parts of the gap.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        load: Moments of f.
+        flux: y.
+        v: v.
+    """
+    d = cells.tdim
+    sums = Sums(indicators=np.empty(cells.number), steepness=np.empty(cells.number))
+    assert sums.indicators is not None and sums.steepness is not None
+    for part in blocks(cells.number):
+        P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
+        height = v.bumps[cells.facets[:, part]] if d == 2 else None
+        forms = _exact if kappa.values is None else _by_quadrature
+        pp, bb, pb, vv = forms(cells, kappa, part, P, c, W, height)
+        volume, s = cells.volume[part], P.sum(axis=0)
+        total = c.sum(axis=0) + W.sum(axis=0)
+        fv = load.mean[part] * total / (d + 1)
+        if height is not None:
+            fv += load.mean[part] * height.sum(axis=0) / 3
+        indicators = pp + bb
+        if load.hats is not None and load.bumps is not None and load.variance is not None:
+            hats, bumps = load.hats[:, part], load.bumps[:, part]
+            moment = _dot(hats, c)
+            fv += _dot(hats, W)
+            if height is not None:
+                moment += _dot(bumps, height)
+            fv += moment
+            square = poincare(d) ** 2 * cells.diameter2[part] * volume * load.variance[part]
+            osc = square / pick(kappa.low, part)
+            indicators += osc
+            mean, low, high = (pick(k, part) for k in (kappa.mean, kappa.low, kappa.high))
+            sums.load += float(np.sum(osc))
+            sums.load_companion += float(np.sum(volume * moment))
+            if d == 2:
+                against = _against_potential(cells, P, s, hats, bumps, part)
+                sums.load_flux += float(np.sum(against / mean))
+            else:
+                sums.slack += float(np.sum(np.sqrt(osc * pp)))
+            if kappa.values is not None:
+                # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
+                spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
+                steep = np.sqrt(np.maximum(_dot(W, cells.apply(W, part)), 0.0))
+                y = np.sqrt(field_squares(cells, P, part)) + mean * steep
+                sums.slack += float(np.sum(np.sqrt(square) * spread * y))
+        sums.flux += float(np.sum(pp))
+        sums.companion += float(np.sum(bb))
+        sums.cross += float(np.sum(pb))
+        sums.energy += float(np.sum(0.5 * vv - volume * fv))
+        sums.indicators[part], sums.steepness[part] = indicators, vv
+    return sums
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.einsum("ij,ij->j", a, b)
+
+
+def _exact(
+    cells: Cells,
+    kappa: Coefficient,
+    part: slice,
+    P: FloatArray,
+    c: FloatArray,
+    W: FloatArray,
+    height: FloatArray | None,
+) -> tuple[FloatArray, ...]:
+    """∫_T of |p|², |b|², p·b and κ|∇v|² for κ constant on T, shapes (cells in the part,).
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        part: Which cells.
+        P: Fluxes of y − κ_T∇u_h out of the cells.
+        c: v − u_h at the vertices.
+        W: u_h at the vertices.
+        height: Heights of v's bumps.
+    """
+    d, k = cells.tdim, pick(kappa.mean, part)
+    s, c_sum = P.sum(axis=0), c.sum(axis=0)
+    z = c + W
+    Sc, Sz = cells.apply(c, part), cells.apply(z, part)
+    bb, vv = _dot(c, Sc), _dot(z, Sz)
+    # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
+    pb = (s * c_sum - _dot(P, c)) / d - s * c_sum / (d + 1)
+    if height is not None:
+        squares = bump_squares(cells, height, part)
+        bb += squares - 8 / 3 * _dot(height, Sc)
+        vv += squares - 8 / 3 * _dot(height, Sz)
+        pb += 2 / 3 * _dot(P, height) - s * height.sum(axis=0) / 3
+    return field_squares(cells, P, part) / k, k * bb, pb, k * vv
+
+
+def _by_quadrature(
+    cells: Cells,
+    kappa: Coefficient,
+    part: slice,
+    P: FloatArray,
+    c: FloatArray,
+    W: FloatArray,
+    height: FloatArray | None,
+) -> tuple[FloatArray, ...]:
+    """The same for any κ.
+
+    At a point with barycentric coordinates λ_k, y − κ_T∇u_h = Σ Q_k X_k / (d |T|) with
+    Q_k = λ_k ΣP − P_k, and ∇(v − u_h) = Σ γ_k ∇λ_k with γ_k = c_k + 4 Σ_l height_l λ_m, where
+    k, l, m are the three vertices. As Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
+    """
+    d, mean, volume = cells.tdim, pick(kappa.mean, part), cells.volume[part]
+    assert kappa.values is not None
+    s = P.sum(axis=0)
+    gg = _dot(W, cells.apply(W, part))
+    pp, bb, pb, vv = np.zeros((4, len(volume)))
+    for k, weight, hat in zip(
+        kappa.values[:, part], kappa.rule.weights, kappa.rule.hats.T, strict=True
+    ):
+        Q = hat[:, None] * s - P
+        gamma = c.copy()
+        if height is not None:
+            for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
+                gamma[i] += 4.0 * hat[m] * height[j]
+                gamma[j] += 4.0 * hat[m] * height[i]
+        qq = np.zeros_like(s)
+        for (i, j), length in zip(cells.pairs, cells.lengths[:, part], strict=True):
+            qq -= Q[i] * Q[j] * length
+        qq /= d**2 * volume
+        S_gamma = cells.apply(gamma, part)
+        bend, along = _dot(gamma, S_gamma), _dot(W, S_gamma)
+        off = k - mean
+        pp += weight / k * (qq - 2.0 * off * _dot(Q, W) / d + off**2 * gg)
+        bb += weight * k * bend
+        pb += weight * (_dot(Q, gamma) / d - off * along)
+        vv += weight * k * (gg + 2.0 * along + bend)
+    return pp, bb, pb, vv
+
+
+def _against_potential(
+    cells: Cells,
+    P: FloatArray,
+    s: FloatArray,
+    hats: FloatArray,
+    bumps: FloatArray,
+    part: slice,
+) -> FloatArray:
+    """∫_T (f − f_T) φ for the φ with ∇φ = y − κ_T∇u_h and d = 2, shape (cells in the part,).
+
+    d |T| φ = s |x − x_T|²/2 − (x − x_T)·Σ a_i X_i up to a constant, a_i = P_i − s/(d + 1). With
+    x = Σ λ_i X_i, |x − x_T|² = Σ λ_i |X_i − x_T|² − Σ_{i<j} λ_i λ_j |X_i − X_j|².
+    """
+    d = cells.tdim
+    a = P - s / (d + 1)
+    lengths = cells.lengths[:, part]
+    arm, reach = np.zeros_like(a), np.zeros_like(a)  # Σ_j |X_i − X_j|² times a_j, and times 1
+    square = np.zeros_like(s)
+    for (i, j), length in zip(cells.pairs, lengths, strict=True):
+        reach[i] += length
+        reach[j] += length
+        arm[i] += a[j] * length
+        arm[j] += a[i] * length
+        square -= bumps[3 - i - j] * length / 4
+    square += _dot(hats, reach) / (d + 1)
+    return (s * square + _dot(hats, arm)) / (2 * d)

@@ -1,0 +1,375 @@
+"""The certificate: bounds that hold on any data, whatever the solver left, on any ranks."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import DiagonalType, create_rectangle, locate_entities_boundary, meshtags
+from mpi4py import MPI
+
+from signorini_cr import Domain, Polygon, Problem, exact, solve, solve_levels
+from signorini_cr.cells import Cells
+from signorini_cr.certificate import certify
+from signorini_cr.flux import unbalanced
+from signorini_cr.ranges import range_of
+
+WORLD = MPI.COMM_WORLD
+GOAL = 1.45
+"""What the effectivity must stay below on uniform meshes."""
+
+
+def integral(expression, mesh, measure=ufl.dx, degree=8):
+    form = fem.form(expression * measure(domain=mesh, metadata={"quadrature_degree": degree}))
+    return mesh.comm.allreduce(fem.assemble_scalar(form))
+
+
+def energy_of(problem, domain):
+    """J(u) from the exact solution, on a mesh."""
+    x = ufl.SpatialCoordinate(domain.mesh)
+    u = problem.exact(x)
+    f = problem.f(x) if callable(problem.f) else problem.f
+    if problem.f is None:
+        f = -ufl.div(ufl.grad(u))
+    return integral(0.5 * ufl.inner(ufl.grad(u), ufl.grad(u)) - f * u, domain.mesh)
+
+
+# ---- the bound holds and is sharp
+
+
+@pytest.mark.parametrize("name", ["S1", "A", "B", "C", "I", "S1_NEUMANN", "S1_RAISED"])
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_bound_is_above_the_error_and_near_it(name, jitter):
+    example = getattr(exact, name)
+    for solution in solve_levels(example.problem, example.structured(8, jitter=jitter), 3):
+        certificate = certify(solution)
+        effectivity = certificate.bound_h1 / solution.errors[0]
+        assert 1.0 <= effectivity <= GOAL, (name, solution.cells)
+        if example.energy is not None:
+            low, high = certificate.energy
+            assert low <= example.energy <= high
+
+
+def test_bound_without_exact_solution():
+    """On E the error is known up to a much smaller one: that of a mesh two refinements on."""
+    solutions = list(solve_levels(exact.E.problem, exact.E.structured(8), 4))
+    best = certify(solutions[-1])
+    companion = best.companion
+    for solution in solutions[:2]:
+        bound = certify(solution).bound_h1
+        low, high = certify(solution).energy
+        assert low <= best.energy[0] <= best.energy[1] <= high
+        # ‖u − u_h‖ ≥ ‖v − u_h‖ − ‖u − v‖ with v from the fine mesh
+        fine = fem.Function(companion.function_space)
+        difference = _distance(solution.u, companion, fine)
+        assert bound >= difference - best.bound_companion
+        assert bound <= GOAL * (difference + best.bound_companion)
+
+
+def _distance(u, companion, fine):
+    """‖∇_h(u_h − v)‖ with v on a refinement, by sampling u_h's constant gradients there."""
+    coarse, mesh = u.function_space.mesh, companion.function_space.mesh
+    if mesh.comm.size > 1:
+        pytest.skip("needs both meshes on one rank")
+    gradient = fem.Function(fem.functionspace(coarse, ("DG", 0, (2,))))
+    points = gradient.function_space.element.interpolation_points
+    points = points() if callable(points) else points
+    gradient.interpolate(fem.Expression(ufl.grad(u), points))
+    from dolfinx import geometry
+
+    tree = geometry.bb_tree(coarse, 2)
+    middle = mesh.geometry.x[mesh.geometry.dofmap].mean(axis=1)
+    found = geometry.compute_colliding_cells(
+        coarse, geometry.compute_collisions_points(tree, middle), middle
+    )
+    cells = found.array[found.offsets[:-1]]
+    there = fem.Function(fem.functionspace(mesh, ("DG", 0, (2,))))
+    there.x.array[:] = gradient.x.array.reshape(-1, 2)[cells].ravel()
+    difference = ufl.grad(companion) - there
+    return np.sqrt(integral(ufl.inner(difference, difference), mesh))
+
+
+def test_singular_solution_is_bounded():
+    """D is not in H²: nothing in the bound asks for that."""
+    for solution in solve_levels(exact.D.problem, exact.D.structured(8), 3):
+        assert certify(solution).bound_h1 >= solution.errors[0]
+
+
+@pytest.mark.parametrize("name", ["S1", "B"])
+def test_energy_bracket_shrinks_like_h_squared(name):
+    example = getattr(exact, name)
+    widths = []
+    for solution in solve_levels(example.problem, example.structured(8), 4):
+        low, high = certify(solution).energy
+        assert low <= example.energy <= high
+        widths.append(high - low)
+    rates = np.log2(np.array(widths[:-1]) / widths[1:])
+    assert np.all(rates > 1.9), rates
+
+
+# ---- random polygons, random data
+
+
+def random_example(seed):
+    """A polygon above a contact edge on y = 0, a solution with contact, and data from it."""
+    rng = np.random.default_rng(seed)
+    angles = np.sort(rng.uniform(0.15, np.pi - 0.15, rng.integers(2, 6)))
+    radii = rng.uniform(0.6, 1.6, len(angles))
+    top = [[r * np.cos(t), r * np.sin(t)] for r, t in zip(radii, angles, strict=True)]
+    labels = ["contact", *rng.choice(["dirichlet", "neumann"], len(top) + 1)]
+    labels[rng.integers(1, len(labels))] = "dirichlet"
+    polygon = Polygon([[-1, 0], [1, 0], *top], labels)
+    switch, power = rng.uniform(-0.5, 0.5), rng.uniform(2.2, 4)
+    phase, size, wave = rng.uniform(0, 6, 3)
+    bend = rng.uniform(-1, 1)
+
+    def alpha(x):
+        return bend * ufl.sin((1 + wave) * x[0] + phase)
+
+    def u(x):
+        gap = ufl.max_value(x[0] - switch, 0.0) ** power
+        pressure = ufl.max_value(switch - x[0], 0.0) ** power
+        factor = 1.5 + ufl.cos(size * x[0]) + x[1] ** 2 * ufl.sin(phase + x[0])
+        return (gap - x[1] * pressure) * (factor + 3 * x[1] ** 2) + alpha(x)
+
+    return polygon, Problem(exact=u, obstacle=alpha)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_polygons_and_data(seed):
+    polygon, problem = random_example(seed)
+    for solution in solve_levels(problem, polygon.mesh(0.35), 3):
+        certificate = certify(solution)
+        assert certificate.reason is None
+        assert certificate.bound_h1 >= solution.errors[0]
+        assert certificate.bound_h1 <= 3 * solution.errors[0]
+
+
+@pytest.mark.parametrize(
+    "kappa",
+    [
+        lambda x: 1 + 0.8 * ufl.sin(3 * x[0]) * ufl.cos(2 * x[1]),
+        lambda x: ufl.exp(x[0] - x[1] / 2),
+        lambda x: 7.0,
+        lambda x: 1 / (1 + x[0] ** 2),
+    ],
+)
+def test_coefficient(kappa):
+    problem = Problem(exact=exact.A.problem.exact, coefficient=kappa)
+    for solution in solve_levels(problem, exact.A.structured(8, jitter=0.2), 3):
+        certificate = certify(solution)
+        mesh = solution.domain.mesh
+        x = ufl.SpatialCoordinate(mesh)
+        difference = ufl.grad(problem.exact(x) - solution.u)
+        weighted = np.sqrt(integral(kappa(x) * ufl.inner(difference, difference), mesh))
+        assert weighted <= certificate.bound_energy_norm <= 1.6 * weighted
+        assert solution.errors[0] <= certificate.bound_h1
+
+
+def test_jumping_coefficient():
+    """κ = 10 on the left, 1 on the right: no exact solution, but a mesh with it on cell sides."""
+    problem = Problem(f=1.0, coefficient=lambda x: ufl.conditional(ufl.gt(x[0], 0.0), 1.0, 10.0))
+    brackets, bounds = [], []
+    for solution in solve_levels(problem, exact.S1.structured(8), 3):
+        certificate = certify(solution)
+        brackets.append(certificate.energy)
+        bounds.append(certificate.bound_h1)
+    assert brackets[0][0] <= brackets[1][0] <= brackets[2][0]
+    assert brackets[2][1] <= brackets[1][1] <= brackets[0][1]
+    assert bounds[2] < 0.6 * bounds[1] < 0.36 * bounds[0]
+
+
+def test_quadrature_agrees_with_closed_forms():
+    """A coefficient that varies by next to nothing takes the other way to the same figures."""
+    one, other = (
+        certify(solve(Problem(exact=exact.A.problem.exact, coefficient=k), exact.A.structured(8)))
+        for k in (2.0, lambda x: 2.0 + 1e-9 * x[0])
+    )
+    assert np.isclose(one.bound_h1, other.bound_h1, rtol=1e-6)
+    assert np.allclose(one.energy, other.energy, rtol=1e-6)
+
+
+# ---- the two fields
+
+
+def test_flux_and_companion_are_what_they_claim():
+    example = exact.S1_NEUMANN
+    solution = solve(example.problem, example.structured(12, jitter=0.2))
+    certificate = certify(solution)
+    mesh, u = solution.domain.mesh, solution.u
+    y, v = certificate.flux, certificate.companion
+    x, n = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
+    for difference, name in ((y - ufl.grad(u), "flux"), (ufl.grad(v - u), "companion")):
+        norm = np.sqrt(integral(ufl.inner(difference, difference), mesh))
+        assert np.isclose(norm, certificate.parts[name], rtol=1e-9)
+    # −div y is the mean of f, cell by cell
+    f = example.problem.f(x)
+    test = ufl.TestFunction(fem.functionspace(mesh, ("DG", 0)))
+    degree = {"quadrature_degree": example.problem.quadrature_degree}
+    left = fem.assemble_vector(fem.form((f + ufl.div(y)) * test * ufl.dx(metadata=degree)))
+    assert np.abs(left.array).max() < 1e-9
+    # y·n ≥ 0 on Γ1, v = u_D = 0 on Γ0, v ≥ 0 on Γ1
+    ds = ufl.Measure("ds", mesh, subdomain_data=solution.domain.tags)
+    wrong = ufl.max_value(-ufl.dot(y, n), 0.0) + ufl.max_value(-v, 0.0)
+    assert integral(wrong, mesh, ds(1)) < 1e-12
+    assert integral(v**2, mesh, ds(2)) < 1e-24
+
+
+@pytest.mark.parametrize("name", ["S1", "A"])
+def test_the_identity(name):
+    """Gap(v, y) = what v and y lack of u, with the exact u at hand.
+
+    gap(v, y) = ½‖∇v − y‖² + ∫_Γ1 (y·n)(v − α) equals
+    ½‖∇(v − u)‖² + ∫_Γ1 λ(v − α) + ½‖y − ∇u‖² + ∫_Γ1 (y·n)(u − α) if −div y = f; here div y is off
+    by f's oscillation, which adds ∫ (f + div y)(v − u).
+    """
+    example = getattr(exact, name)
+    solution = solve(example.problem, example.structured(16))
+    certificate = certify(solution)
+    mesh = solution.domain.mesh
+    y, v = certificate.flux, certificate.companion
+    x, n = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
+    u, lam = example.problem.exact(x), example.pressure(x)
+    lam = ufl.max_value(lam, 0.0)
+    f = -ufl.div(ufl.grad(u)) if example.problem.f is None else example.problem.f(x)
+    ds = ufl.Measure("ds", mesh, subdomain_data=solution.domain.tags)
+    square = lambda w: ufl.inner(w, w)  # noqa: E731
+    high = 12
+    gap = integral(0.5 * square(ufl.grad(v) - y), mesh, degree=high)
+    gap += integral(ufl.dot(y, n) * v, mesh, ds(1), high)
+    lacks = integral(0.5 * (square(ufl.grad(v - u)) + square(y - ufl.grad(u))), mesh, degree=high)
+    lacks += integral(lam * v + ufl.dot(y, n) * u, mesh, ds(1), high)
+    lacks += integral((f + ufl.div(y)) * (v - u), mesh, degree=high)
+    # v is u_D on Γ0 up to its part beyond quadratics
+    lacks += integral(ufl.dot(ufl.grad(u) - y, n) * (v - u), mesh, ds(2), high)
+    assert np.isclose(gap, lacks, rtol=2e-5), gap / lacks
+
+
+# ---- what the solver left
+
+
+@pytest.mark.parametrize("noise", [1e-8, 1e-4, 1e-2, 1e-1, 1.0])
+def test_unfinished_solve_is_still_bounded(noise):
+    """Any function in the place of u_h: the residual goes into the bound."""
+    for name in ("S1", "B", "S1_NEUMANN"):
+        example = getattr(exact, name)
+        *_, solution = solve_levels(example.problem, example.structured(6), 3)
+        before = certify(solution)
+        rng = np.random.default_rng(WORLD.rank)
+        u, system = solution.u, solution.level.system
+        change = noise * rng.standard_normal(len(u.x.array)) * np.abs(u.x.array).max()
+        change[system.dirichlet] = 0.0
+        u.x.array[:] += change
+        u.x.scatter_forward()
+        solution.__dict__.pop("errors", None)
+        after = certify(solution)
+        assert after.bound_h1 >= solution.errors[0]
+        assert after.parts["solver"] > before.parts["solver"]
+        if example.energy is not None:
+            assert after.energy[0] <= example.energy <= after.energy[1]
+
+
+def test_smooth_residual_is_bounded_without_a_hierarchy():
+    """One mesh, no coarser one: the residual is carried to Γ0 cell by cell."""
+    solution = solve(exact.S1.problem, exact.S1.structured(24))
+    solution.u.x.array[:] *= 0.9
+    solution.__dict__.pop("errors", None)
+    certificate = certify(solution)
+    assert solution.errors[0] <= certificate.bound_h1 <= 6 * solution.errors[0]
+
+
+def test_residual_functional_is_bounded():
+    """|Σ left_T e_T| ≤ W ‖∇e‖ for continuous e with e = 0 on Γ0, with and without levels."""
+    example = exact.S1_NEUMANN
+    *_, solution = solve_levels(example.problem, example.structured(4), 3)
+    level, mesh = solution.level, solution.domain.mesh
+    cells = Cells(level.domain, level.V)
+    V = fem.functionspace(mesh, ("Lagrange", 1))
+    fixed = fem.locate_dofs_topological(V, 1, level.domain.tags.find(2))
+    rng = np.random.default_rng(3)
+    alone = SimpleNamespace(domain=level.domain, V=level.V, coarser=None, parent_cell=None)
+    x = mesh.geometry.x[mesh.geometry.dofmap[: cells.number]].mean(axis=1)
+    for left in (cells.volume * np.sin(3 * x[:, 0]), rng.standard_normal(cells.number)):
+        bounds = [unbalanced(which, cells, left, np.array(1.0)) for which in (level, alone)]
+        for shape in (lambda x: 1 - x[0] ** 2 + x[1], lambda x: np.sin(9 * x[0] + 5 * x[1])):
+            e = fem.Function(V)
+            e.interpolate(shape)
+            e.x.array[fixed] = 0.0
+            means = e.x.array[V.dofmap.list[: cells.number]].mean(axis=1)
+            work = abs(WORLD.allreduce(left @ means))
+            norm = np.sqrt(integral(ufl.inner(ufl.grad(e), ufl.grad(e)), mesh))
+            assert all(work <= bound * norm for bound in bounds)
+
+
+# ---- ranks, refusals
+
+
+def test_same_figures_on_any_number_of_ranks():
+    polygon, problem = random_example(1)
+    here, alone = (
+        certify(solve(problem, polygon.mesh(0.2, comm))) for comm in (WORLD, MPI.COMM_SELF)
+    )
+    assert np.isclose(here.bound_h1, alone.bound_h1, rtol=1e-6)
+    assert np.allclose(here.energy, alone.energy, rtol=1e-6)
+    total = WORLD.allreduce(here.indicators.sum())
+    assert np.isclose(total, alone.indicators.sum(), rtol=1e-6)
+
+
+def test_meshes_with_ghost_cells():
+    """A user's own mesh, shared with ghost cells, and with diagonals that cross."""
+    mesh = create_rectangle(
+        WORLD, [(-1.0, 0.0), (1.0, 1.0)], [24, 12], diagonal=DiagonalType.crossed
+    )
+    found = [
+        locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 0.0)),
+        locate_entities_boundary(mesh, 1, lambda x: ~np.isclose(x[1], 0.0)),
+    ]
+    mesh.topology.create_connectivity(1, 0)
+    other = [f for f in found[1] if f not in set(found[0])]
+    middle = np.array(other, dtype=np.int32)
+    facets = np.concatenate([found[0], middle])
+    values = np.repeat([1, 2], [len(found[0]), len(middle)]).astype(np.int32)
+    order = np.argsort(facets)
+    domain = Domain.from_tags(mesh, meshtags(mesh, 1, facets[order], values[order]))
+    solution = solve(exact.S1.problem, domain)
+    certificate = certify(solution)
+    assert 1.0 <= certificate.bound_h1 / solution.errors[0] <= GOAL
+
+
+def test_refusals():
+    domain = exact.S1.structured(8)
+    cases = {
+        "only a Crouzeix-Raviart": (Problem(f=1.0), "P1"),
+        "not a scalar": (Problem(f=1.0, coefficient=lambda x: ufl.Identity(2)), "CR"),
+        "below α": (Problem(f=1.0, obstacle=1.0), "CR"),
+        "computable": (Problem(f=1.0, coefficient=lambda x: 1 + ufl.bessel_J(0, x[0]) ** 2), "CR"),
+    }
+    for words, (problem, element) in cases.items():
+        certificate = certify(solve(problem, domain, element))
+        assert certificate.bound_h1 is None and certificate.energy is None
+        assert words in certificate.reason
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        lambda x: ufl.sin(7 * x[0] * x[1]) - ufl.cos(9 * x[0]),
+        lambda x: abs(x[0]) ** 3 / (2 + x[1]) - x[0] ** 2,
+        lambda x: ufl.max_value(x[0], x[1]) + ufl.min_value(x[0] ** 3, ufl.exp(-x[1])),
+        lambda x: ufl.conditional(
+            ufl.And(ufl.gt(x[0], 0.1), ufl.le(x[1], 0.4)), x[0], ufl.sqrt(x[1])
+        ),
+        lambda x: (1 + x[1]) ** -2 + (2 + x[0]) ** 0.5,
+    ],
+)
+def test_ranges_hold_everywhere(expression):
+    domain = exact.S1.structured(6)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    x = ufl.SpatialCoordinate(domain.mesh)
+    low, high = range_of(expression(x), cells)
+    points = np.random.default_rng(0).dirichlet([0.3, 0.3, 0.3], 60)[:, 1:]
+    which = np.arange(cells.number, dtype=np.int32)
+    values = fem.Expression(expression(x), points).eval(domain.mesh, which).reshape(len(which), -1)
+    assert np.all(low[:, None] - 1e-12 <= values) and np.all(values <= high[:, None] + 1e-12)
+    assert np.all(high - low < 3.0)
