@@ -234,7 +234,7 @@ class FacetData:
             )
         values = compat.evaluate_on_facets(
             self._expression, domain.mesh, facet_entities(domain.mesh, facets)
-        ).reshape(len(facets), -1)
+        ).reshape(len(facets), self._size + len(self._weights))
         return values[:, self._size :] @ self._weights, values[:, : self._size]
 
 
