@@ -238,6 +238,7 @@ class _Reader:
 
     def call(self, tree: ast.Call, depth: int) -> Node:
         if not isinstance(tree.func, ast.Name):
+            self.node(tree.func, depth)
             self.reject(tree.func, "only a function can be called; a product is written with *")
         name = tree.func.id
         if name not in FUNCTIONS:
@@ -283,7 +284,7 @@ class _Reader:
             message += f"; did you mean {close[0]}?"
         else:
             message += ";"
-        label = "Functions are" if kind == "function" else "Known are"
+        label = "Functions are" if kind == "function" else "Names are"
         self.reject(tree, f"{message} {label if close else label.lower()} {_listed(known)}")
 
 

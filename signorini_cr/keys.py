@@ -77,7 +77,8 @@ def insist_known(
         else:
             hint = (f"did you mean {near[0]}? Allowed" if near else "allowed") + " are "
             hint += ", ".join(allowed)
-        raise InputError(f"{full}: there is no such key; {hint}")
+        kind = "key" if section else "section"
+        raise InputError(f"{full}: there is no such {kind}; {hint}")
 
 
 def get(
@@ -86,13 +87,23 @@ def get(
     key: str,
     read: Callable[[str, Any], Any],
     default: Any = None,
+    needed: str = "",
 ) -> Any:
-    """The value of a key, read and checked; a missing key without a default is an error."""
+    """The value of a key, read and checked.
+
+    Args:
+        table: The keys found.
+        section: Where, for the message.
+        key: The key wanted.
+        read: Called with the full key and the value.
+        default: What a missing key stands for; without one, it is an error.
+        needed: What belongs there, for the message.
+    """
     full = f"{section}.{key}" if section else key
     if key in table:
         return read(full, table[key])
     if default is None:
-        raise InputError(f"{full}: this key is missing")
+        raise InputError(f"{full}: this key is missing; {needed} is needed")
     return default
 
 
@@ -176,9 +187,9 @@ def shown(value: Any) -> str:
     return f"{value}"
 
 
-def named(key: str, function: Callable[..., Any], *args: Any) -> Any:
-    """``function(*args)`` with the key put before what it complains about."""
+def named(key: str, function: Callable[..., Any], *args: Any, rule: str = "") -> Any:
+    """Call ``function(*args)``; what it complains about gets the key before and the rule after."""
     try:
         return function(*args)
     except InputError as error:
-        raise InputError(f"{key}: {error}") from None
+        raise InputError(f"{key}: {error}" + (rule and f"; {rule}")) from None

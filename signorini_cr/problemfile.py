@@ -131,7 +131,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         if "data" not in table and "exact" not in table:
             raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
         if "exact" in table and not table["exact"]:
-            raise InputError("exact.u: this key is missing")
+            raise InputError("exact.u: this key is missing; an expression in x and y is needed")
         domain, size = _domain(sections["domain"], path.parent)
         expressions = _expressions(sections)
         refine = sections["refine"]
@@ -189,14 +189,18 @@ def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, flo
         insist_known(hole, key, ("vertices", "boundary"))
         holes.append(_polygon(hole, key))
     if holes:
-        polygon = named("domain.holes", Polygon, polygon.vertices, polygon.boundary, tuple(holes))
+        apart = "holes must lie inside the polygon and apart from each other"
+        outline = (polygon.vertices, polygon.boundary)
+        polygon = named("domain.holes", Polygon, *outline, tuple(holes), rule=apart)
     named("domain.boundary", polygon.check_parts)
-    return polygon, get(table, "domain", "size", positive)
+    return polygon, get(
+        table, "domain", "size", positive, needed="a number above 0, the length of a facet,"
+    )
 
 
 def _polygon(table: Mapping[str, Any], section: str) -> Polygon:
     key = f"{section}.vertices"
-    vertices = get(table, section, "vertices", array)
+    vertices = get(table, section, "vertices", array, needed="a list of points [x, y]")
     for i, vertex in enumerate(vertices):
         if not isinstance(vertex, list) or len(vertex) != 2:
             raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
@@ -204,7 +208,7 @@ def _polygon(table: Mapping[str, Any], section: str) -> Polygon:
             number(f"{key}[{i}][{j}]", coordinate)
     if len(vertices) < 3:
         raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
-    boundary = get(table, section, "boundary", array)
+    boundary = get(table, section, "boundary", array, needed="a list of labels, one for each edge,")
     for i, label in enumerate(boundary):
         one_of(tuple(PARTS))(f"{section}.boundary[{i}]", label)
     if len(boundary) != len(vertices):
@@ -212,15 +216,16 @@ def _polygon(table: Mapping[str, Any], section: str) -> Polygon:
             f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
             f" found {len(boundary)} labels"
         )
-    return named(key, Polygon, np.array(vertices, dtype=np.float64), tuple(boundary))
+    simple = "the polygon must be simple, its edges must meet at their common vertices only"
+    return named(key, Polygon, np.array(vertices, dtype=np.float64), tuple(boundary), rule=simple)
 
 
 def _few_enough(levels: int, cells: int, dim: int) -> None:
     most = 1 + int(math.log2(max(MOST_CELLS / cells, 1.0)) / dim)
     if levels > most:
         raise InputError(
-            f"levels is {levels}, but from {cells} cells on the coarsest mesh, at most {most} are"
-            f" allowed: then there are {cells * 2 ** (dim * (most - 1)):.0e} cells"
+            f"refine.levels (or --levels): {levels} meshes would end with far too many cells; from"
+            f" the {cells} of the coarsest mesh on, at most {most} are allowed"
         )
 
 

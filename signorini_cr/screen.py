@@ -87,7 +87,7 @@ def wrapped(text: str, before: str = "") -> str:
         before: What the first line begins with.
     """
     fold = textwrap.TextWrapper(WIDTH, break_long_words=False, break_on_hyphens=False)
-    lines = []
+    lines: list[str] = []
     for line in text.rstrip().split("\n"):
         fold.initial_indent = before if not lines else ""
         lines.append(line if line.startswith(" ") else fold.fill(line))
