@@ -1,0 +1,248 @@
+"""Nested meshes in the solver: prolongation, multigrid in the active set, starts from below."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from signorini_cr import Polygon, Problem, exact, solve, solve_levels
+from signorini_cr.domain import CONTACT
+from signorini_cr.hierarchy import refine, refine_marked
+from signorini_cr.levels import Level
+from signorini_cr.multigrid import Grid
+from signorini_cr.nested import Coarse, nested_start
+from signorini_cr.problem import Forms
+from signorini_cr.solver import ContactRows, solve_vi
+from signorini_cr.space import function_space, ghosted_vector
+from signorini_cr.transfer import Layout, inclusion, prolongate, prolongation
+
+# Obtuse corners, a hole, and contact in three pieces that meet in a corner and at the hole
+CROOKED = Polygon(
+    [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],
+    ["contact", "contact", "dirichlet", "neumann", "dirichlet"],
+    holes=[Polygon([[1, 0.5], [1.7, 0.4], [1.3, 0.9]], ["contact", "neumann", "dirichlet"])],
+)
+HARD = [exact.S1, exact.A, exact.root(3.5), exact.root(5.5)]
+
+
+def refined(domain, pattern):
+    """Refine everywhere, or every third cell, or near a point."""
+    if pattern == "all":
+        return refine(domain)
+    cells = domain.mesh.topology.index_map(2).size_local
+    return refine_marked(domain, np.arange(0, cells, 3, dtype=np.int32))
+
+
+def vector(V, array):
+    return ghosted_vector(V, array.copy())
+
+
+def difference(a, b):
+    """Largest difference over all ranks."""
+    return MPI.COMM_WORLD.allreduce(float(np.abs(a - b).max(initial=0.0)), op=MPI.MAX)
+
+
+def affine(x):
+    return 2.0 * x[0] - 3.0 * x[1] + 1.0
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("pattern", ["all", "marked"])
+def test_affine_functions_are_prolonged_exactly(element, pattern):
+    coarse = CROOKED.mesh(0.4)
+    fine, parent_cell = refined(coarse, pattern)
+    u, v = (fem.Function(function_space(d.mesh, element)) for d in (coarse, fine))
+    for function in (u, v):
+        function.interpolate(affine)
+    result = prolongate(u, v.function_space, parent_cell)
+    assert difference(result, v.x.array) < 1e-12
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("pattern", ["all", "marked"])
+def test_prolongation_is_its_matrix(element, pattern):
+    coarse = CROOKED.mesh(0.4)
+    fine, parent_cell = refined(coarse, pattern)
+    V, W = (function_space(d.mesh, element) for d in (coarse, fine))
+    matrix = prolongation(Layout.of_space(V), Layout.of_space(W), parent_cell)
+    u = fem.Function(V)
+    u.x.array[:] = np.random.default_rng(MPI.COMM_WORLD.rank).standard_normal(len(u.x.array))
+    u.x.scatter_forward()
+    product = matrix.createVecLeft()
+    matrix.mult(vector(V, u.x.array), product)
+    owned = W.dofmap.index_map.size_local
+    assert difference(product.array_r, prolongate(u, W, parent_cell)[:owned]) < 1e-12
+
+
+def test_p1_in_cr_has_the_p1_stiffness_matrix():
+    """Also with a coefficient that varies and a term of order zero."""
+    mesh = CROOKED.mesh(0.3).mesh
+    V, W = function_space(mesh, "CR"), fem.functionspace(mesh, ("Lagrange", 1))
+
+    def matrix(space):
+        u, v, x = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.SpatialCoordinate(mesh)
+        form = (2 + x[0] ** 2) * ufl.inner(ufl.grad(u), ufl.grad(v)) + u * v
+        A = assemble_matrix(fem.form(form * ufl.dx))
+        A.assemble()
+        return A
+
+    product = matrix(V).ptap(inclusion(Layout.of_space(W), Layout.of_space(V)))
+    product.axpy(-1.0, matrix(W))
+    assert product.norm() < 1e-12
+
+
+def test_vertices_of_the_mesh_serve_as_p1():
+    mesh = CROOKED.mesh(0.3).mesh
+    V = function_space(mesh, "CR")
+    nodes = Layout.of_vertices(mesh)
+    u = fem.Function(V)
+    u.interpolate(affine)
+    matrix = inclusion(nodes, Layout.of_space(V))
+    at_nodes, means = matrix.createVecRight(), matrix.createVecLeft()
+    at_nodes.array = affine(mesh.geometry.x[: nodes.size[0]].T)
+    matrix.mult(at_nodes, means)
+    assert difference(means.array_r, u.x.array[: means.local_size]) < 1e-12
+
+
+def last(problem, domain, levels, **more):
+    *_, solution = solve_levels(problem, domain, levels, **more)
+    return solution
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.31])
+@pytest.mark.parametrize("example", HARD, ids=lambda e: e.name)
+def test_few_steps_on_every_level(example, shift):
+    """Also where contact ends inside a facet; a cold start needs up to 12 Newton steps here."""
+    domain = example.structured(4, shift=shift)
+    for solution in solve_levels(example.problem, domain, 6):
+        if solution.level.number > 1:
+            assert solution.iterations.newton <= 3
+            assert solution.iterations.linear <= 17
+
+
+def test_the_same_solution_as_a_direct_solver():
+    """The active set as well, and the residual the report promises."""
+    solution = last(exact.A.problem, exact.A.structured(4), 5)
+    system, V = solution.level.system, solution.u.function_space
+    u, r = system.start(), fem.Function(V)
+    b, lower, x, residual = (
+        ghosted_vector(V, a) for a in (system.b.x.array, system.lower, u.x.array, r.x.array)
+    )
+    rows = ContactRows(system.A, lower)
+    database = PETSc.Options("signorini_")
+    options = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+    for name, value in options.items():
+        database.setValue(name, value)
+    try:
+        cold = solve_vi(
+            Grid(system.A, system.dirichlet), rows, b, lower, x, residual,
+            load=system.load, tolerance=1e-12,
+        )  # fmt: skip
+    finally:
+        for name in options:
+            database.delValue(name)
+    assert cold.newton > 8
+    x.ghostUpdate()
+    residual.ghostUpdate()
+    assert difference(u.x.array, solution.u.x.array) < 1e-7
+
+    def active(u, residual):
+        return (u.x.array[rows.dofs] <= rows.lower) & (residual.x.array[rows.dofs] > 0)
+
+    assert np.array_equal(active(u, r), active(solution.u, solution.residual))
+    free = solution.residual.x.array[: V.dofmap.index_map.size_local].copy()
+    free[rows.dofs[active(u, r)]] = 0.0
+    norm = np.sqrt(MPI.COMM_WORLD.allreduce(float(free @ free)))
+    assert norm <= 1e-8 * system.load
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_contact_in_several_pieces_and_corners(element):
+    """With a coefficient that jumps, a linear obstacle, Neumann data."""
+    problem = Problem(
+        f=lambda x: 3 * ufl.sin(5 * x[0]),
+        g=lambda x: x[1],
+        obstacle=lambda x: 0.05 * x[0],
+        dirichlet=lambda x: 0.5 + x[1],
+        coefficient=lambda x: ufl.conditional(x[0] < 1.3, 1.0, 50.0),
+    )
+    nested = last(problem, CROOKED.mesh(0.4), 5, element=element)
+    cold = last(problem, CROOKED.mesh(0.4), 5, element=element, nested=False)
+    assert nested.energy == pytest.approx(cold.energy, rel=1e-9)
+    assert nested.contact.number_active == cold.contact.number_active
+    if element == "CR":
+        assert nested.iterations.newton <= 3
+    assert nested.iterations.linear <= 40
+
+
+@pytest.mark.parametrize("example", [exact.S1, exact.A], ids=lambda e: e.name)
+def test_the_first_active_set_is_the_prediction(example):
+    """Children of active facets, each with its share of the force; no other contact facet."""
+    coarse = last(example.problem, example.mesh(0.2), 2)
+    fine, parent_cell = refine(coarse.domain)
+    level = Level(Forms(example.problem, fine.mesh), fine, 2, coarse.level, parent_cell)
+    system, V = level.system, level.V
+    start, residual = system.start(), fem.Function(V)
+    rows = ContactRows(system.A, ghosted_vector(V, system.lower))
+    below = Coarse(coarse.domain, coarse.u, coarse.residual, coarse.level.system.lower)
+    nested_start(below, fine, parent_cell, start, rows, system.b.x.array, system.dirichlet)
+    start.x.scatter_forward()
+    system.residual(start, residual)
+    on_bound = start.x.array[rows.dofs] <= rows.lower
+    force = residual.x.array[rows.dofs]
+    assert np.all(start.x.array[rows.dofs] >= rows.lower)
+    comm = MPI.COMM_WORLD
+    assert comm.allreduce(int(on_bound.sum())) == 2 * coarse.contact.number_active > 0
+    assert np.all(force[on_bound] > 0)
+    total = comm.allreduce(float(force[on_bound].sum()))
+    assert total == pytest.approx(coarse.contact.force, rel=1e-3)
+    assert len(fine.facets(CONTACT)) == len(rows.dofs)
+
+
+def test_the_figures_do_not_depend_on_the_ranks():
+    """Against the same run on one process, by every rank for itself."""
+    example, comm = exact.A, MPI.COMM_WORLD
+    alone = last(example.problem, example.structured(3, MPI.COMM_SELF), 5)
+    together = last(example.problem, example.structured(3), 5)
+    assert together.dofs == alone.dofs
+    assert together.energy == pytest.approx(alone.energy, rel=1e-10)
+    assert together.contact.number_active == alone.contact.number_active
+    assert together.contact.force == pytest.approx(alone.contact.force, rel=1e-7)
+    assert abs(together.iterations.linear - alone.iterations.linear) <= 4
+    assert comm.allreduce(together.iterations.linear, op=MPI.MAX) == together.iterations.linear
+
+
+def test_a_mesh_without_a_hierarchy():
+    """Fine enough for BoomerAMG to take the P1 part over."""
+    one = solve(exact.S1.problem, exact.S1.mesh(0.02))
+    assert "BoomerAMG" in one.iterations.preconditioner
+    assert one.iterations.linear <= 25
+    assert one.errors[0] < 0.05
+    few = solve(exact.S1.problem, exact.S1.mesh(0.1))
+    assert "direct" in few.iterations.preconditioner
+
+
+def test_the_cycle_is_symmetric_and_keeps_fixed_dofs_out():
+    solution = last(exact.S1.problem, exact.S1.mesh(0.25), 3)
+    level = Level(solution.level.forms, solution.domain, 2, solution.level.coarser)
+    level.parent_cell = solution.level.parent_cell
+    grid, _, _ = level.grids
+    V = level.V
+    rows = ContactRows(level.system.A, ghosted_vector(V, level.system.lower))
+    for fixed in (rows.dofs[::2], rows.dofs[:0], rows.dofs):
+        grid.fix(fixed)
+        vectors = [grid.matrix.createVecRight() for _ in range(4)]
+        for i, v in enumerate(vectors[:2]):
+            random = np.random.default_rng(10 * MPI.COMM_WORLD.rank + i)
+            v.array = random.standard_normal(v.local_size)
+            v.array[fixed] = 0.0
+            v.array[level.system.dirichlet[level.system.dirichlet < v.local_size]] = 0.0
+        b, c, x, y = vectors
+        grid.cycle(b, x)
+        grid.cycle(c, y)
+        assert c.dot(x) == pytest.approx(b.dot(y), rel=1e-10)
+        assert b.dot(x) > 0
+        assert np.all(x.array_r[fixed] == 0.0)
