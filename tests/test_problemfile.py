@@ -120,6 +120,12 @@ def test_what_is_left_out_follows_from_the_exact_solution(read) -> None:
     assert np.allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.1)
 
 
+def test_a_constant_may_be_the_exact_solution(read) -> None:
+    case = read(SQUARE + "[exact]\nu = 2\n")
+    solution = solve(case.problem, case.mesh())
+    assert max(solution.errors) < 1e-6
+
+
 def test_a_mesh_file_lies_beside_the_problem_file(read, shared_tmp_path: Path) -> None:
     if MPI.COMM_WORLD.rank == 0:
         (shared_tmp_path / "two.msh").write_text(MESH)
