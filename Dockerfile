@@ -14,7 +14,7 @@ ENV OMP_NUM_THREADS=1 \
     OMPI_MCA_btl=self,sm \
     PRTE_MCA_rmaps_default_mapping_policy=:oversubscribe \
     PYTHONPATH=/opt/signorini_cr \
-    PATH=/opt/signorini_cr/container/bin:/usr/local/bin:/usr/bin:/bin \
+    PATH=/opt/signorini_cr/container/bin:$PATH \
     HOME=/home/user
 
 COPY . /opt/signorini_cr
