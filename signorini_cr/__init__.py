@@ -13,6 +13,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .adaptive import solve_adaptive
+    from .certificate import Certificate
     from .domain import Domain, Polygon, read_gmsh
     from .errors import InputError, NotConverged
     from .levels import Solution, solve, solve_levels
@@ -30,6 +32,8 @@ _ROOMS = {
     "Solution": "levels",
     "solve": "levels",
     "solve_levels": "levels",
+    "solve_adaptive": "adaptive",
+    "Certificate": "certificate",
     "Problem": "problem",
 }
 __all__ = [  # noqa: RUF022, in the order in which one meets them
@@ -39,7 +43,9 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Problem",
     "solve",
     "solve_levels",
+    "solve_adaptive",
     "Solution",
+    "Certificate",
     "InputError",
     "NotConverged",
     "__version__",

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
+SHARES = ("flux", "companion", "contact", "load", "neumann", "boundary", "solver")
+"""Where a bound comes from: the keys of `Certificate.parts`."""
+
 
 @dataclass(frozen=True)
 class Certificate:

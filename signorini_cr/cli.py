@@ -187,7 +187,6 @@ def _solutions(
     case: ProblemFile, domain: Domain, element: str, screen: Screen
 ) -> Iterator[Solution]:
     from . import levels
-    from .errors import InputError
 
     def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
         facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
@@ -196,7 +195,17 @@ def _solutions(
     screen.progress("level 0")
     if case.mode == "uniform":
         return levels.solve_levels(case.problem, domain, case.levels, element, monitor)
-    raise InputError("refine.mode: adaptive refinement is not available yet; uniform is")
+    from .adaptive import solve_adaptive
+
+    return solve_adaptive(
+        case.problem,
+        domain,
+        tolerance=case.tolerance,
+        levels=case.levels,
+        max_dofs=case.max_dofs,
+        element=element,
+        monitor=monitor,
+    )
 
 
 def _facts(record: dict[str, Any]) -> str:

@@ -15,6 +15,7 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from .certificate import Certificate, certify
 from .contact import Contact, contact_facts
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import InputError, raise_together
@@ -210,6 +211,11 @@ class Solution:
         )
         return float(h1), float(l2)
 
+    @cached_property
+    def certificate(self) -> Certificate:
+        """What is certain about the error; made when first asked for, collectively."""
+        return certify(self)
+
     def _integrate(self, form: fem.Form) -> float:
         return float(self.domain.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
@@ -262,16 +268,46 @@ def solve_levels(
     """
     if levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
+
+    def step(solution: Solution) -> tuple[Domain, npt.NDArray[np.int32]] | None:
+        return refine(solution.domain) if solution.level.number + 1 < levels else None
+
+    yield from solve_sequence(problem, domain, step, element, monitor, nested)
+
+
+def solve_sequence(
+    problem: Problem,
+    domain: Domain,
+    step: Callable[[Solution], tuple[Domain, npt.NDArray[np.int32]] | None],
+    element: str = "CR",
+    monitor: LevelMonitor | None = None,
+    nested: bool = True,
+) -> Iterator[Solution]:
+    """Solve on a mesh and on those that ``step`` makes of it, one from the other.
+
+    Args:
+        problem: As for `solve_levels`.
+        domain: The coarsest mesh and its boundary parts.
+        step: Makes the next domain, and the parent of each of its cells, from a solution; None
+            ends the sequence. `hierarchy.refine` and `hierarchy.refine_marked` return such pairs.
+        element: "CR" or "P1".
+        monitor: Called after each step of the solver.
+        nested: Start from the solution on the mesh below; otherwise from zero, to compare.
+
+    Yields:
+        The solutions, coarsest first.
+    """
     level = Level(Forms(problem, domain.mesh, element), domain)
     solution = _solve(level, None, monitor)
-    yield solution
-    for number in range(1, levels):
+    while True:
+        yield solution
         began = time.perf_counter()
-        fine, parent_cell = refine(level.domain)
-        level = Level(level.forms, fine, number, level, parent_cell)
+        refined = step(solution)
+        if refined is None:
+            return
+        level = Level(level.forms, refined[0], level.number + 1, level, refined[1])
         seconds = {"mesh": time.perf_counter() - began}
         solution = _solve(level, solution if nested else None, monitor, seconds)
-        yield solution
 
 
 def _solve(

@@ -22,6 +22,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from . import __version__, plots
+from .certificate import SHARES
 from .errors import on_root
 from .files import Writer, write_files, write_text
 from .tables import contact_csv, levels_csv, markdown_table
@@ -30,7 +31,6 @@ from .tables import table_row as table_row
 from .vtu import write_vtu
 
 if TYPE_CHECKING:
-    from .certificate import Certificate
     from .levels import Solution
 
 FILES = (
@@ -53,14 +53,12 @@ Record = dict[str, Any]
 def level_record(
     solution: Solution,
     previous: Mapping[str, Any] | None = None,
-    certificate: Certificate | None = None,
 ) -> Record:
     """The numbers of one level, as they stand in report.json.
 
     Args:
         solution: What was found on this mesh.
         previous: The record of the level before, for the rates.
-        certificate: The certified bound of the broken error, where there is one.
 
     Returns:
         Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
@@ -69,9 +67,10 @@ def level_record(
     contact, kkt = solution.contact, solution.contact.kkt
     h1, l2 = solution.errors or (None, None)
     gdim = solution.domain.mesh.geometry.dim
-    bound = None if certificate is None else certificate.bound_h1
+    certificate = solution.certificate
+    bound = certificate.bound_h1
     seconds = {phase: solution.seconds.get(phase, 0.0) for phase in PHASES}
-    seconds["estimate"] += 0.0 if certificate is None else certificate.seconds
+    seconds["estimate"] += certificate.seconds
     return plain(
         {
             "level": solution.level.number,
@@ -100,6 +99,11 @@ def level_record(
             "rate_l2": _rate("error_l2", l2, solution.h, previous),
             "bound_h1": bound,
             "effectivity": bound / h1 if bound is not None and h1 else None,
+            "bound_reason": certificate.reason,
+            "bound_parts": {name: certificate.parts.get(name) for name in SHARES},
+            "energy_bounds": dict(
+                zip(("lower", "upper"), certificate.energy or (None, None), strict=True)
+            ),
             "seconds": seconds,
         }
     )

@@ -45,6 +45,8 @@ KEYS = {
 SECTIONS = ("domain", "define", "data", "exact", "refine")
 MODES = ("uniform", "adaptive")
 MAX_DOFS = 1_000_000
+ENOUGH = 1000
+"""Levels of an adaptive run that names no limit: others end it."""
 MOST_CELLS = 1e9
 """More than anyone means for the last mesh of a uniform sequence."""
 
@@ -135,6 +137,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         domain, size = _domain(sections["domain"], path.parent)
         expressions = _expressions(sections)
         refine = sections["refine"]
+        mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
         return ProblemFile(
             path=path,
             title=title,
@@ -142,8 +145,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
             size=size,
             problem=_problem(expressions),
             expressions=expressions,
-            mode=get(refine, "refine", "mode", one_of(MODES), "uniform"),
-            levels=get(refine, "refine", "levels", whole, 1),
+            mode=mode,
+            levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
             tolerance=get(refine, "refine", "tolerance", not_negative, 0.0),
             max_dofs=get(refine, "refine", "max_dofs", whole, MAX_DOFS),
         )

@@ -4,7 +4,6 @@ import csv
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Problem, output, solve, solve_levels
+from signorini_cr.certificate import SHARES, Certificate
 from signorini_cr.files import check_writable, write_files
 from signorini_cr.space import function_space
 from signorini_cr.vtu import write_vtu
@@ -29,6 +29,7 @@ WORLD = MPI.COMM_WORLD
 LEVEL = {
     "level", "cells", "dofs", "h", "newton_iterations", "linear_iterations", "energy", "kkt",
     "contact", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1", "effectivity", "seconds",
+    "bound_reason", "bound_parts", "energy_bounds",
 }  # fmt: skip
 CONTACT_HEADER = ["part", "arc_length", "x", "y", "length", "obstacle", "u", "pressure", "active"]
 
@@ -97,7 +98,9 @@ def test_the_report_says_what_the_solution_says(finished, folder):
     assert point == pytest.approx([0, 0], abs=0.15)
     assert record["rate_h1"] == pytest.approx(1, abs=0.1)
     assert record["rate_l2"] == pytest.approx(2, abs=0.1)
-    assert record["bound_h1"] is None
+    assert record["error_h1"] <= record["bound_h1"] <= 1.45 * record["error_h1"]
+    assert record["energy_bounds"]["lower"] <= record["energy_bounds"]["upper"]
+    assert record["bound_reason"] is None
 
 
 def test_rates_need_two_errors_on_two_meshes(finished):
@@ -114,13 +117,19 @@ def test_rates_need_two_errors_on_two_meshes(finished):
 def test_the_bound_and_its_time_are_reported(finished):
     solution, report = finished
     plain = report["levels"][-1]
-    certificate = SimpleNamespace(bound_h1=3 * plain["error_h1"], seconds=100.0)
-    record = output.level_record(solution, None, certificate)
+    try:
+        solution.certificate = Certificate(bound_h1=3 * plain["error_h1"], seconds=100.0)
+        record = output.level_record(solution)
+        solution.certificate = Certificate(reason="no", seconds=1.0)
+        unknown = output.level_record(solution)
+    finally:
+        del solution.certificate
     assert record["bound_h1"] == pytest.approx(3 * plain["error_h1"])
     assert record["effectivity"] == pytest.approx(3)
     assert 100 <= record["seconds"]["estimate"] < 200
-    unknown = output.level_record(solution, None, SimpleNamespace(bound_h1=None, seconds=1.0))
     assert unknown["bound_h1"] is unknown["effectivity"] is None
+    assert unknown["energy_bounds"] == {"lower": None, "upper": None}
+    assert unknown["bound_reason"] == "no"
 
 
 def test_without_an_exact_solution_errors_are_null():
@@ -195,7 +204,9 @@ def test_levels_csv_holds_the_whole_record(finished, folder):
         "kkt_min_gap", "kkt_min_pressure", "kkt_complementarity", "kkt_residual",
         "contact_facets", "contact_active", "contact_length", "contact_force",
         "contact_transitions", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1",
-        "effectivity", "seconds_mesh", "seconds_assemble", "seconds_solve", "seconds_estimate",
+        "effectivity", "bound_reason", *(f"bound_parts_{name}" for name in SHARES),
+        "energy_bounds_lower", "energy_bounds_upper", "seconds_mesh", "seconds_assemble",
+        "seconds_solve", "seconds_estimate",
     ]  # fmt: skip
     for row, record in zip(rows, finished[1]["levels"], strict=True):
         assert float(row["contact_force"]) == record["contact"]["force"]

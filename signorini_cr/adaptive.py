@@ -1,0 +1,104 @@
+"""Meshes that adapt to the solution: solve, certify, mark, refine.
+
+The cells' shares of the certified bound say where the error sits. Dörfler's marking takes the
+fewest cells that hold a given part of it; their sides are halved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from .domain import Domain
+from .errors import InputError
+from .hierarchy import refine_marked
+from .levels import LevelMonitor, Solution, solve_sequence
+from .problem import Problem
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def solve_adaptive(
+    problem: Problem,
+    domain: Domain,
+    *,
+    tolerance: float = 0.0,
+    levels: int | None = None,
+    max_dofs: int = 1_000_000,
+    fraction: float = 0.5,
+    element: str = "CR",
+    monitor: LevelMonitor | None = None,
+) -> Iterator[Solution]:
+    """Solve on meshes that are refined where the error is; each starts from the one below.
+
+    Args:
+        problem: The data; they must not hold a Function, which lives on one mesh only.
+        domain: The coarsest mesh and its boundary parts.
+        tolerance: The end: a certified bound of the broken error (1.6) not above it.
+        levels: The end: so many meshes, the coarsest included; None for any number.
+        max_dofs: The end: the next mesh would have more degrees of freedom.
+        fraction: Part of the bound's square that the marked cells hold, in (0, 1].
+        element: "CR"; with another one there is no bound.
+        monitor: Called after each step of the solver.
+
+    Yields:
+        The solutions, coarsest first; `Solution.certificate` has the bounds.
+
+    Raises:
+        InputError: There is no bound to go by; the message says why.
+        NotConverged: The solver stopped short on one of the meshes.
+    """
+    if not 0.0 < fraction <= 1.0:
+        raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
+    if levels is not None and levels < 1:
+        raise InputError(f"levels is {levels}; it must be 1 or more")
+
+    def step(solution: Solution) -> tuple[Domain, npt.NDArray[np.int32]] | None:
+        certificate = solution.certificate
+        if certificate.bound_h1 is None or certificate.indicators is None:
+            raise InputError(
+                f"adaptive refinement goes by the certified bound, and there is none: "
+                f"{certificate.reason}"
+            )
+        last = levels is not None and solution.level.number + 1 >= levels
+        if last or certificate.bound_h1 <= tolerance or solution.dofs >= max_dofs:
+            return None
+        comm = solution.domain.mesh.comm
+        marked = mark(certificate.indicators, fraction, comm)
+        fine, parent_cell = refine_marked(solution.domain, marked)
+        tdim = fine.mesh.topology.dim
+        if fine.mesh.topology.index_map(tdim - 1).size_global > max_dofs:
+            return None
+        return fine, parent_cell
+
+    for solution in solve_sequence(problem, domain, step, element, monitor):
+        _ = solution.certificate  # made here, so that it doesn't count as time for the mesh
+        yield solution
+
+
+def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> npt.NDArray[np.bool_]:
+    """Dörfler's marking: the largest indicators that make up a fraction of their sum; collective.
+
+    The ranks agree on the value that separates them by bisection; cells that share this value to
+    rounding are all marked.
+
+    Args:
+        indicators: Not negative, this rank's cells, shape (cells,).
+        fraction: In (0, 1].
+        comm: The ranks that take part.
+
+    Returns:
+        Whether to refine the cell, shape (cells,).
+    """
+    ordered = np.sort(indicators)
+    above = np.concatenate([np.cumsum(ordered[::-1])[::-1], [0.0]])
+    total, top = comm.allreduce(above[0]), comm.allreduce(ordered.max(initial=0.0), op=MPI.MAX)
+    low, high = 0.0, float(top)
+    while high - low > 1e-12 * top:
+        middle = 0.5 * (low + high)
+        held = comm.allreduce(above[np.searchsorted(ordered, middle)])
+        low, high = (middle, high) if held >= fraction * total else (low, middle)
+    return indicators >= low if top > 0 else np.zeros(len(indicators), dtype=bool)

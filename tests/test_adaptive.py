@@ -1,0 +1,111 @@
+"""Adaptive refinement: marks, stopping rules, and the rate that a corner takes from uniform meshes."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from signorini_cr import InputError, Polygon, Problem, exact, solve_adaptive, solve_levels
+from signorini_cr.adaptive import mark
+from signorini_cr.domain import PARTS
+from signorini_cr.space import facet_measures
+
+WORLD = MPI.COMM_WORLD
+
+
+def run(example, size=4, **limits):
+    return list(solve_adaptive(example.problem, example.structured(size), **limits))
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.5, 0.9, 1.0])
+def test_marks_are_the_fewest_that_hold_the_fraction(fraction):
+    everything = np.random.default_rng(0).exponential(size=1000) ** 3
+    mine = everything[WORLD.rank :: WORLD.size]
+    marked = mark(mine, fraction, WORLD)
+    held = WORLD.allreduce(mine[marked].sum())
+    number = WORLD.allreduce(int(marked.sum()))
+    assert held >= (fraction - 1e-9) * everything.sum()
+    largest = np.sort(everything)[::-1]
+    assert largest[: number - 1].sum() < fraction * everything.sum() or fraction == 1.0
+
+
+def test_marks_of_nothing():
+    assert not mark(np.zeros(7), 0.5, WORLD).any()
+    assert mark(np.zeros(0), 0.5, WORLD).shape == (0,)
+
+
+def test_a_rank_without_cells_may_take_part():
+    mine = np.arange(1.0, 5.0) if WORLD.rank == 0 else np.zeros(0)
+    assert WORLD.allreduce(int(mark(mine, 0.4, WORLD).sum())) == 1
+
+
+def test_adaptive_meshes_restore_the_rate_at_a_corner():
+    """On L uniform meshes give h^{2/3}, which is dofs^{-1/3}; adaptive ones must give dofs^{-1/2}."""
+    solutions = run(exact.L, max_dofs=40_000)
+    dofs = np.array([s.dofs for s in solutions])
+    bounds = np.array([s.certificate.bound_h1 for s in solutions])
+    late = dofs > 1000
+    slope = np.polyfit(np.log(dofs[late]), np.log(bounds[late]), 1)[0]
+    assert slope == pytest.approx(-0.5, abs=0.05)
+    *_, uniform = solve_levels(exact.L.problem, exact.L.structured(4), 5)
+    cheapest = dofs[bounds <= uniform.certificate.bound_h1].min()
+    assert cheapest < 0.25 * uniform.dofs
+
+
+@pytest.mark.parametrize("name", ["S1", "B", "D", "I"])
+def test_bounds_hold_on_adaptive_meshes(name):
+    example = getattr(exact, name)
+    for solution in run(example, max_dofs=4000):
+        assert solution.errors[0] <= solution.certificate.bound_h1
+        if example.energy is not None:
+            low, high = solution.certificate.energy
+            assert low <= example.energy <= high
+
+
+def test_singular_solution_gets_its_rate_back():
+    """D has r^{1/2}: uniform meshes give dofs^{-1/4}."""
+    solutions = run(exact.D, max_dofs=10_000)
+    dofs, errors = np.array([(s.dofs, s.errors[0]) for s in solutions if s.dofs > 500]).T
+    assert np.polyfit(np.log(dofs), np.log(errors), 1)[0] == pytest.approx(-0.5, abs=0.06)
+
+
+def test_boundary_parts_keep_their_lengths():
+    first, *_, last = run(exact.S1, max_dofs=3000)
+
+    def lengths(solution):
+        domain = solution.domain
+        return [
+            WORLD.allreduce(float(facet_measures(domain.mesh, domain.facets(part))[1].sum()))
+            for part in PARTS.values()
+        ]
+
+    assert np.allclose(lengths(first), lengths(last))
+    assert last.cells > 10 * first.cells
+
+
+def test_stopping_rules():
+    tolerance = 0.2
+    by_tolerance = run(exact.S1, tolerance=tolerance)
+    assert [s.certificate.bound_h1 <= tolerance for s in by_tolerance[-2:]] == [False, True]
+    assert len(run(exact.S1, levels=3)) == 3
+    by_dofs = run(exact.S1, max_dofs=1000)
+    assert 300 < by_dofs[-1].dofs <= 1000
+
+
+def test_same_meshes_on_any_number_of_ranks():
+    polygon = Polygon([[-1, 0], [1, 0], [0.5, 1], [-1, 0.7]], ["contact", *["dirichlet"] * 3])
+    problem = Problem(f=1.0, obstacle=-0.01)
+    dofs = [
+        [s.dofs for s in solve_adaptive(problem, polygon.mesh(0.3, comm), levels=4)]
+        for comm in (WORLD, MPI.COMM_SELF)
+    ]
+    assert np.allclose(*dofs, rtol=0.01)
+
+
+def test_refusals():
+    domain = exact.S1.structured(4)
+    with pytest.raises(InputError, match="only a Crouzeix-Raviart"):
+        list(solve_adaptive(exact.S1.problem, domain, element="P1"))
+    with pytest.raises(InputError, match="fraction is 0"):
+        list(solve_adaptive(exact.S1.problem, domain, fraction=0.0))
+    with pytest.raises(InputError, match="levels is 0"):
+        list(solve_adaptive(exact.S1.problem, domain, levels=0))
