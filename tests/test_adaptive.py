@@ -1,4 +1,4 @@
-"""Adaptive refinement: marks, stopping rules, and the rate that a corner takes from uniform meshes."""
+"""Adaptive refinement: marks, stopping rules, and the rate a corner takes from uniform meshes."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_a_rank_without_cells_may_take_part():
 
 
 def test_adaptive_meshes_restore_the_rate_at_a_corner():
-    """On L uniform meshes give h^{2/3}, which is dofs^{-1/3}; adaptive ones must give dofs^{-1/2}."""
+    """On L uniform meshes give dofs^{-1/3}; adaptive ones must give dofs^{-1/2}."""
     solutions = run(exact.L, max_dofs=40_000)
     dofs = np.array([s.dofs for s in solutions])
     bounds = np.array([s.certificate.bound_h1 for s in solutions])
