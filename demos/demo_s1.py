@@ -29,6 +29,7 @@ from mpi4py import MPI
 
 from signorini_cr import exact, plots, solve_levels
 from signorini_cr.output import level_record, table_header, table_row
+from signorini_cr.tables import markdown_table
 
 comm = MPI.COMM_WORLD
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
@@ -62,7 +63,15 @@ plots.plot_solution(solution, folder / "s1-solution.png", "S1")
 plots.plot_contact(solution, folder / "s1-contact.png", "S1")
 if comm.rank == 0:
     plots.plot_convergence(records, folder / "s1-convergence.png", "S1")
-    print(f"pictures: {folder}/s1-solution.png, s1-contact.png, s1-convergence.png")
+    captions = {
+        "s1-solution.png": "u_h of S1 on the finest mesh, in contact for x < 0.",
+        "s1-contact.png": "S1: u_h and the pressure along Γ1.",
+        "s1-convergence.png": "S1: the errors fall like h and like h².",
+    }
+    pages = [f"![{caption}]({file})\n\n*{caption}*\n" for file, caption in captions.items()]
+    text = "\n".join(["## S1 on unstructured meshes\n", markdown_table(records), *pages])
+    (folder / "demo_s1.md").write_text(text, encoding="utf-8")
+    print(f"pictures: {', '.join(str(folder / file) for file in captions)}")
 
 # %% [markdown]
 # ## Check

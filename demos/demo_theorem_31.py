@@ -67,7 +67,7 @@ def draw(left, right):
     curves = {label.get(name, name): (h, column(rows, "h1")) for name, rows in results.items()}
     loglog(left, curves, {1.0: "$h$"}, title="errors in the broken norm", y=r"$\|u-u_h\|_h$")
     top = max(values[0] for values in scaled.values()) * 1.6 * h**0.75
-    left.loglog(h, top, color="black", linewidth=1.2)
+    left.plot(h, top, color="black", linewidth=1.2)
     left.annotate("$h^{3/4}$", (h[-3], top[-3]), xytext=(0, 8), ha="right",
                   textcoords="offset points", fontsize=13)  # fmt: skip
     curves = {label.get(name, name): (h, values) for name, values in scaled.items()}

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from dolfinx.mesh import Mesh, entities_to_geometry
 from mpi4py import MPI
 
 from signorini_cr import canvas, exact, norms, solve, solve_levels
@@ -121,7 +122,16 @@ def run(
         before = solution
     del before, solution
     gc.collect()
+    _dofs.append(rows[-1].dofs)
     return tuple(rows)
+
+
+def most_dofs() -> int:
+    """The largest number of degrees of freedom that `run` has solved for."""
+    return max(_dofs, default=0)
+
+
+_dofs: list[int] = []
 
 
 def column(rows: Sequence[Row], name: str) -> np.ndarray:
@@ -132,6 +142,16 @@ def column(rows: Sequence[Row], name: str) -> np.ndarray:
 def orders(rows: Sequence[Row], name: str) -> np.ndarray:
     """The rates of one attribute in h, not a number on the first level."""
     return np.append(np.nan, norms.rates(column(rows, "h"), column(rows, name)))
+
+
+def edges(mesh: Mesh) -> np.ndarray:
+    """Ends of all edges on rank 0, shape (n, 2, 2); none on the others."""
+    mesh.topology.create_entities(1)
+    mesh.topology.create_connectivity(1, mesh.topology.dim)
+    own = np.arange(mesh.topology.index_map(1).size_local, dtype=np.int32)
+    ends = mesh.geometry.x[entities_to_geometry(mesh, 1, own), :2]
+    pieces = comm.gather(ends.reshape(-1, 2, 2), root=0)
+    return np.zeros((0, 2, 2)) if pieces is None else np.concatenate(pieces)
 
 
 class Study:
@@ -187,6 +207,7 @@ class Study:
         caption: str,
         draw: Callable[..., None],
         panels: int = 1,
+        rows: int = 1,
         size: tuple[float, float] = (7.5, 6.0),
     ) -> None:
         """Draw a picture on rank 0 and keep a reference to it.
@@ -196,12 +217,13 @@ class Study:
             caption: What it shows.
             draw: Called with as many axes as there are panels.
             panels: Axes side by side.
+            rows: Rows of them.
             size: Inches of one panel.
         """
 
         def paint() -> None:
-            figure = canvas.new_figure(size[0] * panels, size[1])
-            draw(*np.atleast_1d(figure.subplots(1, panels)))
+            figure = canvas.new_figure(size[0] * panels, size[1] * rows)
+            draw(*np.atleast_1d(figure.subplots(rows, panels)).ravel())
             canvas.save(figure, self.folder / file)
 
         on_root(comm, paint)
@@ -235,8 +257,9 @@ def loglog(
     y: str = "error",
     below: float = 0.5,
     dashed: Sequence[str] = (),
+    scale: str = "log",
 ) -> None:
-    """Draw curves in logarithmic scales, and dotted lines of given slopes below the last ones.
+    """Draw curves in logarithmic scales, and dotted lines of given slopes below them.
 
     Args:
         axes: Where.
@@ -247,9 +270,12 @@ def loglog(
         y: Label of the ordinate.
         below: The dotted lines pass so far below the lowest end of a curve.
         dashed: Labels of curves to draw dashed.
+        scale: Of the ordinate, "log" or "linear".
     """
+    axes.set_xscale("log")
+    axes.set_yscale(scale)
     for k, (label, (abscissae, ordinates)) in enumerate(curves.items()):
-        axes.loglog(
+        axes.plot(
             abscissae,
             ordinates,
             "--" if label in dashed else "-",
@@ -259,8 +285,8 @@ def loglog(
             linewidth=1.8,
             label=label,
         )
-    for slope, label in slopes.items():
-        guide(axes, list(curves.values()), slope, label, below)
+    for k, (slope, label) in enumerate(slopes.items()):
+        guide(axes, list(curves.values()), slope, label, below * 0.7**k)
     axes.set_xlabel(x, fontsize=14)
     axes.set_ylabel(y, fontsize=13)
     axes.tick_params(labelsize=11)
@@ -276,7 +302,7 @@ def loglog(
 
 
 def guide(axes: Axes, curves: Sequence[tuple], slope: float, label: str, below: float) -> None:
-    """A dotted line of one slope, below the curve whose own slope at the end is nearest to it."""
+    """A dotted line of one slope, below the curves whose own slope at the end is nearest to it."""
 
     def steepness(curve: tuple) -> float:
         (x0, x1), (y0, y1) = (np.log(np.asarray(values, dtype=float)[-2:]) for values in curve)
@@ -284,15 +310,17 @@ def guide(axes: Axes, curves: Sequence[tuple], slope: float, label: str, below: 
 
     near = min(abs(steepness(curve) - slope) for curve in curves)
     alike = [curve for curve in curves if abs(steepness(curve) - slope) < near + 0.2]
-    x, y = (np.asarray(v, dtype=float) for v in min(alike, key=lambda curve: curve[1][-1]))
+    lowest = min(alike, key=lambda curve: curve[1][-1] / curve[0][-1] ** slope)
+    x, y = (np.asarray(v, dtype=float) for v in lowest)
     line = below * y[-1] * (x / x[-1]) ** slope
-    axes.loglog(x, line, ":", color="black", linewidth=1.5)
+    axes.plot(x, line, ":", color="black", linewidth=1.5)
     middle = len(x) // 2
     axes.annotate(
         label,
         (x[middle], line[middle]),
         fontsize=13,
-        xytext=(5, -5),
+        xytext=(np.copysign(5, slope), -5),
         textcoords="offset points",
+        ha="left" if slope > 0 else "right",
         va="top",
     )

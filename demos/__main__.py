@@ -1,0 +1,111 @@
+"""Make every table and figure of the studies again.
+
+    mpirun -n 2 python3 demos [FOLDER]
+
+writes FOLDER/studies.md and the pictures in FOLDER/studies (FOLDER is docs without an argument).
+"""
+
+from __future__ import annotations
+
+import gc
+import runpy
+import sys
+import time
+from pathlib import Path
+
+import study
+from mpi4py import MPI
+
+from signorini_cr.errors import on_root
+
+DEMOS = (
+    "demo_s1",
+    "demo_theorem_31",
+    "demo_theorem_32_33",
+    "demo_theorem_34",
+    "demo_outside",
+    "demo_elements",
+    "demo_facet_sets",
+    "demo_pressure",
+    "demo_estimate",
+    "demo_families",
+    "demo_quadrature",
+)
+"""In the order in which they are read."""
+
+INTRODUCTION = """\
+# The theory of the paper, verified
+
+Each of the paper's statements has a study: a demo that anyone can run, a table and a picture. All
+of this page is made by
+
+    mpirun -n 2 python3 demos
+
+in {minutes:.1f} minutes on two cores; the finest meshes have {dofs:,} degrees of freedom. Every
+demo ends in assertions, so that the page is there only if they hold. The examples (S1, A, B, C, D,
+I, L) are those of `signorini_cr.exact`; h is the largest diameter of a triangle, and rates are
+those between a level and the one before it.
+
+| statement | seen in |
+|---|---|
+| Theorem 3.1, h^{{3/4}}: a floor, which no solution in H² comes near | [there](#{theorem_31}) |
+| Theorems 3.2 and 3.3, finitely many critical points | [there](#{theorem_32_33}) |
+| Theorem 3.4, infinitely many critical points | [there](#{theorem_34}) |
+| outside the theory: u not in H² | [there](#{outside}) |
+| the same rates as for the continuous element | [there](#{elements}) |
+| the facet sets (2.2) | [there](#{facet_sets}) |
+| the contact pressure, of which the paper says nothing | [there](#{pressure}) |
+| the abstract estimate (1.11), with the terms (4.2) | [there](#{estimate}) |
+
+## From figure to command
+
+| figure | command |
+|---|---|
+{figures}
+
+Each command takes the folder for its results as an argument; `SIGNORINI_DEMO_LEVELS=5` in the
+environment makes a quick run on fewer meshes.
+"""
+
+
+def main() -> None:
+    """Run all demos on all ranks and put their pages together."""
+    comm = MPI.COMM_WORLD
+    target = Path(sys.argv[1] if len(sys.argv) > 1 else "docs")
+    folder = target / "studies"
+    sys.argv[1:] = [str(folder)]
+    here = Path(__file__).parent
+    began = time.perf_counter()
+    for name in DEMOS:
+        start = time.perf_counter()
+        runpy.run_path(str(here / f"{name}.py"))
+        gc.collect()
+        if comm.rank == 0:
+            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    minutes = (time.perf_counter() - began) / 60
+    on_root(comm, _put_together, target, folder, minutes)
+
+
+def _put_together(target: Path, folder: Path, minutes: float) -> None:
+    """Make one page of the demos' pages; they go, the pictures stay."""
+    pages, figures, anchors = [], [], {}
+    for name in DEMOS:
+        path = folder / f"{name}.md"
+        lines = path.read_text(encoding="utf-8").splitlines()
+        heading = lines[0].removeprefix("## ")
+        kept = [c for c in heading.lower() if c.isalnum() or c in " -_"]
+        anchors[name.removeprefix("demo_")] = "".join(kept).replace(" ", "-")
+        body = "\n".join(lines[1:]).strip().replace("](", f"]({folder.name}/")
+        pages.append(f"## {heading}\n\n`mpirun -n 2 python3 demos/{name}.py`\n\n{body}\n")
+        figures += [
+            f"| [{file}]({folder.name}/{file}) | `mpirun -n 2 python3 demos/{name}.py` |"
+            for file in (line.split("](")[1].rstrip(")") for line in lines if line[:2] == "![")
+        ]
+        path.unlink()
+    introduction = INTRODUCTION.format(
+        minutes=minutes, dofs=study.most_dofs(), figures="\n".join(figures), **anchors
+    )
+    (target / "studies.md").write_text("\n".join([introduction, *pages]), encoding="utf-8")
+
+
+main()

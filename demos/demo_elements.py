@@ -1,0 +1,134 @@
+# %% [markdown]
+# # Crouzeix–Raviart and conforming P1
+#
+# **Aim.** Check the paper's claim that the nonconforming element converges like the continuous
+# one, and see what each costs: per mesh, and per degree of freedom.
+#
+# **Mathematics.** On the same triangles CR has a degree of freedom per facet and P1 one per
+# vertex, a third as many. Both have the best approximation error $O(h)$. CR pays for its
+# nonconformity with a consistency error (4.2), yet its best approximation is the best of *all*
+# piecewise affine functions, as $\nabla\Pi_h u$ is the mean of $\nabla u$ on every cell. Its
+# bounds are facet means, so $\Pi_h u \in K_h$, and with $u_D = 0$ it approaches $J(u)$ from below
+# in these examples, while P1 approaches it from above: together they enclose the energy.
+#
+#     mpirun -n 2 python3 demos/demo_elements.py [FOLDER]
+
+# %%
+import numpy as np
+from study import Study, column, levels_wanted, loglog, orders, run
+
+from signorini_cr import exact
+
+study = Study("demo_elements", "CR against conforming P1 on the same meshes")
+levels = levels_wanted(8)
+names = ("S1", "A", "B", "C", "C2", "I", "D")
+
+# %% [markdown]
+# ## Solve
+
+# %%
+results = {
+    (name, element): run(name, element, levels=levels) for name in names for element in ("CR", "P1")
+}
+h = column(results["S1", "CR"], "h")
+
+# %% [markdown]
+# ## Tables
+# First the rates of P1 (those of CR are in the other demos), then both errors side by side.
+
+# %%
+for norm, text in (("h1", "the broken norm"), ("l2", "L2")):
+    study.table(
+        f"Rates of P1 in {text}",
+        {"h": ("{:.5f}", h)}
+        | {name: ("{:.3f}", orders(results[name, "P1"], norm)) for name in names},
+    )
+for norm, text in (("h1", "Broken norm"), ("l2", "L2")):
+    study.table(
+        f"{text}: the error of CR over that of P1, on the same mesh",
+        {"h": ("{:.5f}", h)}
+        | {
+            name: ("{:.3f}", column(results[name, "CR"], norm) / column(results[name, "P1"], norm))
+            for name in names
+        },
+    )
+
+# %% [markdown]
+# Per degree of freedom: with $e \approx c N^{-1/2}$ (or $c N^{-1}$ in $L^2$) the numbers $c$ tell
+# which element makes more of $N$ degrees of freedom.
+
+# %%
+last = {key: rows[-1] for key, rows in results.items()}
+power = {"h1": 0.5, "l2": 1.0}
+smooth = [name for name in names if name != "D"]
+study.table(
+    "Per degree of freedom, finest level: √N ‖u − u_h‖_h and N ‖u − u_h‖",
+    {"": ("{}", smooth)}
+    | {
+        f"{element} {norm.upper()}": (
+            "{:.3f}",
+            [
+                getattr(last[name, element], norm) * last[name, element].dofs ** power[norm]
+                for name in smooth
+            ],
+        )
+        for norm in ("h1", "l2")
+        for element in ("CR", "P1")
+    },
+)
+study.table(
+    "S1: J(u_h) − J(u), from below and from above",
+    {
+        "h": ("{:.5f}", h),
+        **{
+            element: ("{:.3e}", column(results["S1", element], "energy") - exact.S1.energy)
+            for element in ("CR", "P1")
+        },
+    },
+)
+
+
+# %% [markdown]
+# ## Picture
+
+
+# %%
+def draw(left, right):
+    """S1, against h on the left and against the number of degrees of freedom right."""
+    for axes, x, label, scale in (
+        (left, "h", "$h$", 1.0),
+        (right, "dofs", "degrees of freedom $N$", -0.5),
+    ):
+        curves = {
+            f"{element}: {norm}": (
+                column(results["S1", element], x),
+                column(results["S1", element], attribute),
+            )
+            for norm, attribute in ((r"$\|u-u_h\|_h$", "h1"), (r"$\|u-u_h\|$", "l2"))
+            for element in ("CR", "P1")
+        }
+        slopes = {1.0: "$h$", 2.0: "$h^2$"} if x == "h" else {-0.5: "$N^{-1/2}$", -1.0: "$N^{-1}$"}
+        loglog(axes, curves, slopes, title=f"S1, both elements, against {label}", x=label,
+               dashed=[key for key in curves if "P1" in key])  # fmt: skip
+
+
+study.picture(
+    "elements.png",
+    "S1 with CR and P1: the same rates; which one is ahead depends on what is counted.",
+    draw,
+    panels=2,
+)
+
+# %% [markdown]
+# ## Check
+# Both elements have the rate 1 (2 in $L^2$), on D ½ (1), and they enclose the energy of S1.
+
+# %%
+loose = levels < 6
+for (name, element), rows in results.items():
+    h1, l2 = exact.ALL[name].rates
+    assert np.all(abs(orders(rows, "h1")[-2:] - h1) < (0.15 if loose else 0.03)), (name, element)
+    assert np.all(abs(orders(rows, "l2")[-2:] - l2) < (0.6 if loose else 0.1)), (name, element)
+below, above = (last["S1", element].energy - exact.S1.energy for element in ("CR", "P1"))
+assert below < 0.0 < above, (below, above)
+study.finish()
