@@ -125,6 +125,8 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
     solve.add_argument(
         "-v", "--verbose", action="store_true", help="print every step of the solver"
     )
+    for each in (parser, solve, check):
+        vars(each)["color"] = False  # messages are folded, which counts every character
     return parser, {"solve": solve, "check": check}
 
 
@@ -200,6 +202,7 @@ def launched() -> tuple[int, int]:
     for rank, size in (
         ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
         ("PMI_RANK", "PMI_SIZE"),
+        ("SLURM_PROCID", "SLURM_NTASKS"),
     ):
         if os.environ.get(rank, "").isdigit():
             number = os.environ.get(size, "")
