@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import basix
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import cpp, fem
 from dolfinx.mesh import CellType, GhostMode, Mesh, create_cell_partitioner
 from mpi4py import MPI
 
 IntArray = npt.NDArray[np.int32]
+_TAG = 1998
 
 
 def unghosted_partitioner() -> Callable:
@@ -33,6 +36,23 @@ def coordinate_map(mesh: Mesh) -> Any:
     geometry = mesh.geometry
     cmap = geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
     return cmap._cpp_object
+
+
+def index_map(
+    comm: MPI.Comm, owned: int, ghosts: npt.NDArray[np.int64], owners: IntArray
+) -> cpp.common.IndexMap:
+    """Distribution of entities over the ranks; collective.
+
+    Args:
+        comm: The ranks that share the entities.
+        owned: How many this rank owns.
+        ghosts: Global numbers of the others it sees, shape (n,).
+        owners: The ranks these belong to, shape (n,).
+    """
+    try:
+        return cpp.common.IndexMap(comm, owned, ghosts, owners)
+    except TypeError:  # since 0.10 with a tag for the messages
+        return cpp.common.IndexMap(comm, owned, ghosts, owners, _TAG)
 
 
 def create_topology(
@@ -91,19 +111,47 @@ def set_facets(
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(cells, start), tdim - 1, tdim)
 
 
-def evaluate_on_facets(
-    expression: fem.Expression, mesh: Mesh, entities: npt.NDArray[np.int32]
-) -> npt.NDArray[np.float64]:
-    """Evaluate an Expression with points on the reference facet.
+class FacetExpression:
+    """A UFL expression at points of the reference facet.
+
+    Newer versions may turn a facet before they lay the points on it, and do not say so. Where the
+    points came to lie is evaluated along with the expression, and the values are put in order.
 
     Args:
-        expression: Compiled on a mesh of the same kind.
-        mesh: Where to evaluate.
-        entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+        expression: Scalar or vector.
+        points: On the reference facet, shape (q, d − 1).
+        mesh: The mesh that the expression was written for.
     """
-    if not len(entities):
-        return np.zeros((0, len(expression.X()) * expression.value_size))
-    try:
-        return expression.eval(mesh, entities)
-    except (AssertionError, TypeError, ValueError, RuntimeError):  # 0.9 wants them flattened
-        return expression.eval(mesh, entities.ravel())
+
+    def __init__(self, expression: Any, points: npt.NDArray[np.float64], mesh: Mesh):
+        """Compile the expression."""
+        self._values = fem.Expression(expression, points, mesh.comm)
+        self._where = fem.Expression(ufl.SpatialCoordinate(mesh), points, mesh.comm)
+        self._shape = (len(points), -1)
+        self._hats = np.column_stack([1.0 - points.sum(axis=1), points])
+        self._corners = np.array(basix.topology(mesh.basix_cell())[-2])
+
+    def at(self, mesh: Mesh, entities: IntArray) -> npt.NDArray[np.float64]:
+        """Evaluate on boundary facets of a mesh of the same kind.
+
+        Args:
+            mesh: Where.
+            entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+
+        Returns:
+            Shape (n, q, components).
+        """
+        if not len(entities):
+            return np.zeros((0, len(self._hats), self._values.value_size))
+        shape = (len(entities), *self._shape)
+        try:
+            values = self._values.eval(mesh, entities).reshape(shape)
+        except (AssertionError, TypeError):  # 0.9 wants them flattened, and turns nothing
+            return self._values.eval(mesh, entities.ravel()).reshape(shape)
+        cells, local = entities.T
+        nodes = np.take_along_axis(cell_nodes(mesh)[cells], self._corners[local], axis=1)
+        wanted = self._hats @ mesh.geometry.x[nodes, : mesh.geometry.dim]
+        found = self._where.eval(mesh, entities).reshape(shape)
+        distance = np.linalg.norm(wanted[:, :, None] - found[:, None, :], axis=-1)
+        return np.take_along_axis(values, distance.argmin(axis=2)[:, :, None], axis=1)
+

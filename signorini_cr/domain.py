@@ -7,14 +7,13 @@ A `Domain` comes from a `Polygon`, from a gmsh file or from a mesh and facet tag
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import basix.ufl
 import numpy as np
 import numpy.typing as npt
-
 from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 from dolfinx.mesh import (
@@ -218,9 +217,11 @@ def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
     return _distribute(comm, gmshmesh.read, Path(path), PARTS)
 
 
-def _distribute(comm: MPI.Comm, make: object, *args: object) -> Domain:
+def _distribute(
+    comm: MPI.Comm, make: Callable[..., gmshmesh.Triangulation], *args: object
+) -> Domain:
     """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
-    raw = None
+    raw: gmshmesh.Triangulation | None = None
 
     def on_rank_0() -> None:
         nonlocal raw

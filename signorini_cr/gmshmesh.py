@@ -5,7 +5,6 @@ gmsh is loaded on first use, so a mesh of the user's own works without it.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -148,7 +147,8 @@ def read(path: Path, parts: dict[str, int]) -> Triangulation:
             raise InputError(f"{path}: gmsh cannot read it: {error}") from error
         _check_cells(gmsh, path)
         names = [
-            (tag, gmsh.model.getPhysicalName(dim, tag)) for dim, tag in gmsh.model.getPhysicalGroups(1)
+            (tag, gmsh.model.getPhysicalName(dim, tag))
+            for dim, tag in gmsh.model.getPhysicalGroups(1)
         ]
         found: dict[str, list[npt.NDArray[np.int64]]] = {name: [] for name in parts}
         for tag, name in names:
@@ -237,9 +237,7 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
             raise InputError(f"{path}: {facet(bad[0])} is labelled {name} but {fault}")
     order = np.lexsort((raw.labels, labelled))
     one, two = order[:-1], order[1:]
-    twice = np.flatnonzero(
-        (labelled[one] == labelled[two]) & (raw.labels[one] != raw.labels[two])
-    )
+    twice = np.flatnonzero((labelled[one] == labelled[two]) & (raw.labels[one] != raw.labels[two]))
     if len(twice):
         i, j = one[twice[0]], two[twice[0]]
         raise InputError(

@@ -22,15 +22,15 @@ IntArray = npt.NDArray[np.int32]
 
 
 def refine(domain: Domain) -> tuple[Domain, IntArray]:
-    """Cut every triangle into four similar ones; collective.
+    r"""Cut every triangle into four similar ones; collective.
 
     Child k < 3 of a cell keeps its vertex k, child 3 lies in the middle; m_i is the midpoint of
     the facet opposite vertex i:
 
                  v2
-                / 2 \\
+                / 2 \
               m1 --- m0
-             / 0 \\ 3 / 1 \\
+             / 0 \ 3 / 1 \
            v0 --- m2 --- v1
 
     Args:
@@ -70,7 +70,7 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
 
 
 def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, IntArray]:
-    """Halve the sides of the marked triangles and as much around them as conformity takes; collective.
+    """Halve the sides of the marked triangles, and what else conformity takes; collective.
 
     Sides are halved by bisecting longest edges first, which keeps the angles bounded from below
     however often it is repeated. A rank keeps the children of its cells: the load is not
@@ -181,7 +181,7 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     )
     owners = np.concatenate([vertex_map.owners[kept_v], facet_map.owners[kept_f]])
     owned = owned_v + owned_f
-    index_map = cpp.common.IndexMap(mesh.comm, owned, ghosts, owners)
+    index_map = compat.index_map(mesh.comm, owned, ghosts, owners)
 
     corner = np.full(owned_v + vertex_map.num_ghosts, -1, dtype=np.int32)
     corner[:owned_v] = np.arange(owned_v)
@@ -196,7 +196,12 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     ends = mesh.topology.connectivity(1, 0).array.reshape(-1, 2)
     x_middle = 0.5 * (x_coarse[ends[:, 0]] + x_coarse[ends[:, 1]])
     x = np.concatenate(
-        [x_coarse[:owned_v], x_middle[:owned_f], x_coarse[owned_v + kept_v], x_middle[owned_f + kept_f]]
+        [
+            x_coarse[:owned_v],
+            x_middle[:owned_f],
+            x_coarse[owned_v + kept_v],
+            x_middle[owned_f + kept_f],
+        ]
     )
     return _Vertices(index_map, corner, middle, x)
 

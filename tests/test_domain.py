@@ -186,8 +186,8 @@ def test_unknown_labels_name_the_allowed_ones():
     ("holes", "message"),
     [
         ([np.array(SQUARE) + 5], "hole 0 lies outside"),
-        ([np.array(SQUARE) + [0, 0.5]], "crosses"),
-        ([np.array(SQUARE) + [0, 0.25]], "lies on edge"),
+        ([np.add(SQUARE, [0, 0.5])], "crosses"),
+        ([np.add(SQUARE, [0, 0.25])], "lies on edge"),
         ([SQUARE, np.array(SQUARE) + 0.1], "crosses"),
         ([SQUARE, 0.5 + 0.5 * (np.array(SQUARE) - 0.5)], "hole 1 lies inside hole 0"),
         ([0.5 + 0.5 * (np.array(SQUARE) - 0.5), SQUARE], "hole 0 lies inside hole 1"),
@@ -341,7 +341,9 @@ def test_cut_off_gmsh_files(shared_tmp_path: Path, keep: float, version: float, 
     assert str(path) in fails_alike(read_gmsh, path)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\xc3\x28\xff\x00" * 99, b"$MeshFormat\n1 0 8"])
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"\xc3\x28\xff\x00" * 99, b"$MeshFormat\n1 0 8"]
+)
 def test_files_that_are_no_meshes(shared_tmp_path: Path, content: bytes):
     path = shared_tmp_path / "no.msh"
     on_root(COMM, lambda: path.write_bytes(content) and None)
