@@ -29,8 +29,17 @@ if TYPE_CHECKING:
 
 comm = MPI.COMM_WORLD
 
-COLOURS = (canvas.BLUE, canvas.RED, canvas.YELLOW, "#117733", "#66A6D9", "#882255", canvas.GREY)
-MARKERS = "osD^vP*"
+COLOURS = (
+    canvas.BLUE,
+    canvas.RED,
+    canvas.YELLOW,
+    "#117733",
+    "#66A6D9",
+    "#882255",
+    canvas.GREY,
+    "black",
+)
+MARKERS = "osD^vP*X"
 
 FAMILIES = {
     "structured": "squares cut in two",
