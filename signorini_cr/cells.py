@@ -39,6 +39,22 @@ def pick(values: FloatArray, where: slice | IntArray) -> FloatArray:
     return values if values.ndim == 0 else values[where]
 
 
+def sum_rows(a: FloatArray) -> FloatArray:
+    """Σ_i a_i, shape (n,); for few long rows much faster than ``a.sum(axis=0)``."""
+    out = a[0] + a[1]
+    for row in a[2:]:
+        out += row
+    return out
+
+
+def dot_rows(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Σ_i a_i b_i, shape (n,)."""
+    out = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        out += x * y
+    return out
+
+
 def poincare(tdim: int) -> float:
     """C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
 
@@ -90,16 +106,16 @@ class Cells:
         self.domain, self.V, self.comm = domain, V, mesh.comm
         d = self.tdim = mesh.topology.dim
         n = self.number = mesh.topology.index_map(d).size_local
-        self.facets = V.dofmap.list[:n].T.astype(np.intp)
+        self.facets = _rows(V.dofmap.list[:n])
         corners = mesh.topology.connectivity(d, 0).array.reshape(-1, d + 1)
-        self.vertices = corners[:n].T.astype(np.intp)
+        self.vertices = _rows(corners[:n])
         self.others = np.array([[j for j in range(d + 1) if j != i] for i in range(d + 1)])
         self.pairs = list(combinations(range(d + 1), 2))
         self.lengths = np.empty((len(self.pairs), n))
         self.stiffness = np.empty((len(self.pairs), n))
         self.volume = np.empty(n)
         x = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
-        nodes = compat.cell_nodes(mesh)[:n].T.astype(np.intp)
+        nodes = _rows(compat.cell_nodes(mesh)[:n])
         for part in blocks(n):
             corner = [[row.take(i) for row in x] for i in nodes[:, part]]
             edges = [[p - q for p, q in zip(c, corner[0], strict=True)] for c in corner[1:]]
@@ -180,12 +196,19 @@ class Cells:
             found = new
         return layers
 
-    def over_facets(self, values: FloatArray) -> FloatArray:
-        """Add up local values, shape (d + 1, cells), for each facet; ghosts included."""
+    def over_facets(self, values: FloatArray, shared: bool = True) -> FloatArray:
+        """Add up local values, shape (d + 1, cells), for each facet dof.
+
+        Args:
+            values: One for each cell and facet.
+            shared: Whether to add the other ranks' shares, ghosts included.
+        """
         index_map = self.V.dofmap.index_map
         size = index_map.size_local + index_map.num_ghosts
-        total = np.bincount(self.facets.ravel(), values.ravel(), minlength=size)
-        return self.share(total.astype(np.float64, copy=False))
+        total: FloatArray = np.bincount(self.facets.ravel(), values.ravel(), minlength=size).astype(
+            np.float64, copy=False
+        )
+        return self.share(total) if shared else total
 
     def share(self, values: FloatArray, dim: int | None = None) -> FloatArray:
         """Sum the ranks' shares of facet dofs, or of vertices (``dim`` = 0), in place."""
@@ -218,7 +241,7 @@ class Cells:
 
     def trace(self, part: slice) -> FloatArray:
         """|T| Σ |∇λ_i|²."""
-        return -2.0 * self.stiffness[:, part].sum(axis=0)
+        return -2.0 * sum_rows(self.stiffness[:, part])
 
 
 def corner_points(cells: Cells, side: Side) -> tuple[FloatArray, FloatArray]:
@@ -238,13 +261,18 @@ def measures(cells: Cells, side: Side) -> FloatArray:
     return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, cells.tdim))
 
 
+def _rows(table: npt.NDArray[np.int32]) -> IntArray:
+    """The transpose of a table of indices, row by row in memory."""
+    return np.ascontiguousarray(table.T, dtype=np.intp)
+
+
 def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Volumes and |T| ∇λ_i·∇λ_j of cells given by the edges from their first vertex."""
     if len(edges) == 2:
         (a, b), (c, d) = edges
         volume = 0.5 * np.abs(a * d - b * c)
         scale = 0.125 / volume
-        half = lengths.sum(axis=0)
+        half = sum_rows(lengths)
         return volume, (2.0 * lengths - half) * scale
     jacobian = np.stack([np.stack(e, axis=-1) for e in edges], axis=-2)
     size = len(edges)

@@ -11,7 +11,6 @@ import time
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -19,16 +18,15 @@ import ufl
 from dolfinx import fem
 
 from . import compat
-from .cells import Cells, blocks, measures, poincare
+from .cells import Cells, sum_rows
 from .companion import Companion, companion, on_facet
-from .domain import NEUMANN
-from .flux import Flux, equilibrate, unbalanced
+from .flux import equilibrate, unbalanced
 from .gap import Sums, integrate
-from .moments import Coefficient, Load, Rule, Trace, Volume
+from .loads import Load
+from .moments import Coefficient, Data
 
 if TYPE_CHECKING:
-    from .levels import Solution
-    from .problem import Forms
+    from .levels import Level, Solution
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -61,18 +59,18 @@ class Certificate:
     indicators: FloatArray | None = None
     reason: str | None = None
     seconds: float = 0.0
-    _made: tuple[Cells, Flux, Companion, FloatArray] | None = None
+    _made: _Made | None = None
 
     @cached_property
     def flux(self) -> fem.Function | None:
         """The flux y as a function in the Raviart-Thomas space of lowest order."""
         if self._made is None:
             return None
-        cells, flux, _, kappa_w = self._made
+        made = self._made
+        cells = Cells(made.level.domain, made.level.V)
         mesh, d = cells.domain.mesh, cells.tdim
-        fluxes = flux.excess.copy()
-        for part in blocks(cells.number):
-            fluxes[:, part] -= d * cells.apply(kappa_w[:, part], part)
+        everywhere = slice(0, cells.number)
+        fluxes = made.excess - d * made.kappa * cells.apply(vertex_rows(made.u, cells), everywhere)
         # y = slope x + shift on each cell
         corners = mesh.geometry.x[compat.cell_nodes(mesh)[: cells.number], : mesh.geometry.dim]
         constants = fem.functionspace(mesh, ("DG", 0))
@@ -95,7 +93,8 @@ class Certificate:
         """The companion v without its lifting: quadratic on cells for d = 2, affine else."""
         if self._made is None:
             return None
-        cells, _, made, _ = self._made
+        made = self._made
+        cells = Cells(made.level.domain, made.level.V)
         degree = 2 if cells.tdim == 2 else 1
         v = fem.Function(fem.functionspace(cells.domain.mesh, ("Lagrange", degree)))
         dofs = v.function_space.dofmap.list[: cells.number]
@@ -108,20 +107,17 @@ class Certificate:
         return v
 
 
-class _Data:
-    """The data of a problem, compiled for the certificate."""
+@dataclass(frozen=True)
+class _Made:
+    """What y and v are made of; the cells' geometry is made again when it is needed."""
 
-    def __init__(self, forms: Forms):
-        degree = forms.problem.quadrature_degree
-        rule = Rule(forms)
-        self.f = Volume(forms.f, forms, rule)
-        self.kappa = Volume(forms.kappa, forms, rule) if not ufl.shape(forms.kappa) else None
-        self.u_D = Trace(forms.dirichlet, forms, degree)
-        self.alpha = Trace(forms.obstacle, forms, degree)
-        self.g = Trace(forms.g, forms, degree, slopes=False)
+    level: Level
+    u: FloatArray
+    kappa: FloatArray
+    excess: FloatArray
+    vertices: FloatArray
+    bumps: FloatArray
 
-
-_DATA: WeakKeyDictionary[Forms, _Data] = WeakKeyDictionary()
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
 TENSOR = "the coefficient is not a scalar"
@@ -139,27 +135,23 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
     level, u = solution.level, solution.u
     if solution.element != "CR":
         return Certificate(reason=NO_FLUX)
-    data = _DATA.get(level.forms)
-    if data is None:
-        data = _DATA[level.forms] = _Data(level.forms)
+    data = Data.of(level.forms)
     if data.kappa is None:
         return Certificate(reason=TENSOR)
-    cells = Cells(level.domain, level.V)
+    cells, load, edge = level.cells, level.load, level.edge
     kappa = Coefficient(data.kappa, cells)
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
-    w = u.x.array[cells.facets]
-    w = w.sum(axis=0) - cells.tdim * w
-    load = Load.of(data.f, cells)
-    edge = _Neumann(cells, kappa, data.g)
-    flux = equilibrate(cells, kappa.mean, w, load, edge.shares)
+    w = vertex_rows(u.x.array, cells)
+    flux = equilibrate(cells, kappa.mean, w, load, edge)
     v = companion(cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, sweeps)
     sums = integrate(cells, kappa, w, load, flux, v)
     lift, lift_energy = _lifted(cells, kappa, load, v, sums)
-    edge_energy = edge.load(v)
+    on_edge = on_facet(cells, edge.side, edge.g, v.vertices, v.bumps)
+    edge_energy = edge.measure @ (edge.g.weights @ (edge.values * on_edge))
     total = dict(zip(_TOTALS, cells.total(*(getattr(sums, name) for name in _TOTALS)), strict=True))
     contact, edge_square, edge_energy, lift, lift_energy = cells.total(
-        np.sum(v.contact), edge.square, edge_energy, lift, lift_energy
+        np.sum(v.contact), edge.oscillation(kappa.low), edge_energy, lift, lift_energy
     )
     lift, edge_norm = np.sqrt(lift), np.sqrt(edge_square)
     left = unbalanced(level, cells, flux.left, kappa.low)
@@ -171,6 +163,7 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
     near = np.sqrt(max(same + mixed, 0.0)) + lift
     bound = near / 2 + loose / 2 + np.sqrt(far**2 / 4 + contact)
     energy = total["energy"] - edge_energy
+    level.tidy()
     reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
     if reason is not None:
         return Certificate(reason=reason, seconds=time.perf_counter() - began)
@@ -193,7 +186,7 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
         },
         indicators=sums.indicators,
         seconds=time.perf_counter() - began,
-        _made=(cells, flux, v, kappa.mean * w),
+        _made=_Made(level, u.x.array.copy(), kappa.mean, flux.excess, v.vertices, v.bumps),
     )
 
 
@@ -209,35 +202,10 @@ _TOTALS = (
 )
 
 
-class _Neumann:
-    """g on Γg.
-
-    Attributes:
-        shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
-        square: Σ_T (Σ_F c_F ‖g − g_F‖_F)²/κ with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, this rank's share.
-    """
-
-    def __init__(self, cells: Cells, kappa: Coefficient, g: Trace):
-        self._cells, self._g = cells, g
-        side = self._side = cells.sides[NEUMANN]
-        _, _, self._values = g.at(cells, side)
-        self._measure = measures(cells, side)
-        self.shares = self._measure * (g.hats.T * g.weights @ self._values)
-        mean = g.weights @ self._values
-        variance = g.weights @ (self._values - mean) ** 2
-        at, d = side.cells, cells.tdim
-        h = np.sqrt(cells.diameter2[at])
-        # |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F
-        c = poincare(d) * h
-        trace = self._measure / cells.volume[at] * c * (c + 2.0 * h / d)
-        sizes = np.bincount(at, np.sqrt(trace * self._measure * variance), minlength=1)
-        low = kappa.low[: len(sizes)] if kappa.low.ndim else kappa.low
-        self.square = float(np.sum(sizes**2 / low)) if cells.number else 0.0
-
-    def load(self, v: Companion) -> float:
-        """∫_Γg g v, this rank's share."""
-        values = on_facet(self._cells, self._side, self._g, v.vertices, v.bumps)
-        return float(self._measure @ (self._g.weights @ (self._values * values)))
+def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
+    """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
+    values = u[cells.facets]
+    return sum_rows(values) - cells.tdim * values
 
 
 def _lifted(

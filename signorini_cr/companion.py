@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .cells import Cells, Side, blocks, corner_points, pick
+from .cells import Cells, Side, blocks, corner_points, dot_rows, pick
 from .domain import CONTACT, DIRICHLET
 from .flux import Flux
 from .moments import Trace
@@ -209,7 +209,7 @@ def _across(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
 
 def bump_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
     """‖∇ Σ height_i b_i‖²_T for d = 2, shape (cells in the part,)."""
-    out = cells.trace(part) * np.einsum("ij,ij->j", height, height)
+    out = cells.trace(part) * dot_rows(height, height)
     for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
         out += 4.0 * s * height[i] * height[j]
     out *= 4 / 3

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from .cells import Cells, blocks, pick, poincare
+from .cells import Cells, blocks, pick, poincare, sum_rows
 from .domain import CONTACT, NEUMANN
-from .moments import Load
+from .loads import Edge, Load
 
 if TYPE_CHECKING:
     from .levels import Level
@@ -39,9 +39,7 @@ class Flux:
     left: FloatArray
 
 
-def equilibrate(
-    cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, neumann: FloatArray
-) -> Flux:
+def equilibrate(cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge: Edge) -> Flux:
     """Find the facet fluxes of y from the local residuals of u_h.
 
     Seen from T the flux through F is ∫_T κ∇u_h·∇ψ_F − ∫_T f ψ_F − ∫_{∂T∩Γg} g ψ_F, so that the two
@@ -53,7 +51,7 @@ def equilibrate(
         kappa: Mean of κ, shape (cells,) or ().
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f.
-        neumann: ∫_F g λ_j for the ends j of the facets of Γg, shape (d, n).
+        edge: Integrals of g.
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
@@ -63,10 +61,12 @@ def equilibrate(
         np.negative(shares, out=excess[:, part])
         fluxes[:, part] = -d * pick(kappa, part) * cells.apply(w[:, part], part) - shares
     on_contact, on_neumann = cells.sides[CONTACT], cells.sides[NEUMANN]
-    through = neumann.sum(axis=0)
-    for j, share in zip(cells.others[on_neumann.local].T, through - d * neumann, strict=True):
-        np.subtract.at(excess, (j, on_neumann.cells), share)
-        np.subtract.at(fluxes, (j, on_neumann.cells), share)
+    through = edge.shares.sum(axis=0)
+    for i, share in enumerate(edge.to_cells()):
+        # the facet itself gets all of it further down
+        share = np.where(on_neumann.local == i, 0.0, share)
+        np.subtract.at(excess[i], on_neumann.cells, share)
+        np.subtract.at(fluxes[i], on_neumann.cells, share)
     half = cells.over_facets(fluxes)
     half *= 0.5
     half[cells.exterior] = 0.0
@@ -77,7 +77,8 @@ def equilibrate(
     excess[there] += contact - fluxes[there]
     there = on_neumann.local, on_neumann.cells
     excess[there] += through - fluxes[there]
-    left = excess.sum(axis=0) + cells.volume * load.mean
+    left = sum_rows(excess)
+    left += cells.volume * load.mean
     return Flux(excess, contact, left)
 
 
@@ -149,10 +150,10 @@ def field_squares(cells: Cells, fluxes: FloatArray, part: slice) -> FloatArray:
     p = (s (x − x_T) − Σ a_i X_i) / (d |T|) with s the sum of the fluxes and a_i = flux_i − s/(d+1).
     """
     d = cells.tdim
-    s = fluxes.sum(axis=0)
+    s = sum_rows(fluxes)
     a = fluxes - s / (d + 1)
     lengths = cells.lengths[:, part]
-    squares = s**2 * lengths.sum(axis=0) / ((d + 1) ** 2 * (d + 2))
+    squares = s**2 * sum_rows(lengths) / ((d + 1) ** 2 * (d + 2))
     for (i, j), length in zip(cells.pairs, lengths, strict=True):
         squares -= a[i] * a[j] * length
     return squares / (d**2 * cells.volume[part])

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .cells import Cells, blocks, pick, poincare
+from .cells import Cells, blocks, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bump_squares
 from .flux import Flux, field_squares
-from .moments import Coefficient, Load
+from .loads import Load
+from .moments import Coefficient
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -73,18 +74,18 @@ def integrate(
         height = v.bumps[cells.facets[:, part]] if d == 2 else None
         forms = _exact if kappa.values is None else _by_quadrature
         pp, bb, pb, vv = forms(cells, kappa, part, P, c, W, height)
-        volume, s = cells.volume[part], P.sum(axis=0)
-        total = c.sum(axis=0) + W.sum(axis=0)
+        volume, s = cells.volume[part], sum_rows(P)
+        total = sum_rows(c) + sum_rows(W)
         fv = load.mean[part] * total / (d + 1)
         if height is not None:
-            fv += load.mean[part] * height.sum(axis=0) / 3
+            fv += load.mean[part] * sum_rows(height) / 3
         indicators = pp + bb
         if load.hats is not None and load.bumps is not None and load.variance is not None:
             hats, bumps = load.hats[:, part], load.bumps[:, part]
-            moment = _dot(hats, c)
-            fv += _dot(hats, W)
+            moment = dot_rows(hats, c)
+            fv += dot_rows(hats, W)
             if height is not None:
-                moment += _dot(bumps, height)
+                moment += dot_rows(bumps, height)
             fv += moment
             square = poincare(d) ** 2 * cells.diameter2[part] * volume * load.variance[part]
             osc = square / pick(kappa.low, part)
@@ -100,7 +101,7 @@ def integrate(
             if kappa.values is not None:
                 # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
                 spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
-                steep = np.sqrt(np.maximum(_dot(W, cells.apply(W, part)), 0.0))
+                steep = np.sqrt(np.maximum(dot_rows(W, cells.apply(W, part)), 0.0))
                 y = np.sqrt(field_squares(cells, P, part)) + mean * steep
                 sums.slack += float(np.sum(np.sqrt(square) * spread * y))
         sums.flux += float(np.sum(pp))
@@ -109,10 +110,6 @@ def integrate(
         sums.energy += float(np.sum(0.5 * vv - volume * fv))
         sums.indicators[part], sums.steepness[part] = indicators, vv
     return sums
-
-
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.einsum("ij,ij->j", a, b)
 
 
 def _exact(
@@ -136,17 +133,17 @@ def _exact(
         height: Heights of v's bumps.
     """
     d, k = cells.tdim, pick(kappa.mean, part)
-    s, c_sum = P.sum(axis=0), c.sum(axis=0)
+    s, c_sum = sum_rows(P), sum_rows(c)
     z = c + W
     Sc, Sz = cells.apply(c, part), cells.apply(z, part)
-    bb, vv = _dot(c, Sc), _dot(z, Sz)
+    bb, vv = dot_rows(c, Sc), dot_rows(z, Sz)
     # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
-    pb = (s * c_sum - _dot(P, c)) / d - s * c_sum / (d + 1)
+    pb = (s * c_sum - dot_rows(P, c)) / d - s * c_sum / (d + 1)
     if height is not None:
         squares = bump_squares(cells, height, part)
-        bb += squares - 8 / 3 * _dot(height, Sc)
-        vv += squares - 8 / 3 * _dot(height, Sz)
-        pb += 2 / 3 * _dot(P, height) - s * height.sum(axis=0) / 3
+        bb += squares - 8 / 3 * dot_rows(height, Sc)
+        vv += squares - 8 / 3 * dot_rows(height, Sz)
+        pb += 2 / 3 * dot_rows(P, height) - s * sum_rows(height) / 3
     return field_squares(cells, P, part) / k, k * bb, pb, k * vv
 
 
@@ -167,8 +164,8 @@ def _by_quadrature(
     """
     d, mean, volume = cells.tdim, pick(kappa.mean, part), cells.volume[part]
     assert kappa.values is not None
-    s = P.sum(axis=0)
-    gg = _dot(W, cells.apply(W, part))
+    s = sum_rows(P)
+    gg = dot_rows(W, cells.apply(W, part))
     pp, bb, pb, vv = np.zeros((4, len(volume)))
     for k, weight, hat in zip(
         kappa.values[:, part], kappa.rule.weights, kappa.rule.hats.T, strict=True
@@ -184,11 +181,11 @@ def _by_quadrature(
             qq -= Q[i] * Q[j] * length
         qq /= d**2 * volume
         S_gamma = cells.apply(gamma, part)
-        bend, along = _dot(gamma, S_gamma), _dot(W, S_gamma)
+        bend, along = dot_rows(gamma, S_gamma), dot_rows(W, S_gamma)
         off = k - mean
-        pp += weight / k * (qq - 2.0 * off * _dot(Q, W) / d + off**2 * gg)
+        pp += weight / k * (qq - 2.0 * off * dot_rows(Q, W) / d + off**2 * gg)
         bb += weight * k * bend
-        pb += weight * (_dot(Q, gamma) / d - off * along)
+        pb += weight * (dot_rows(Q, gamma) / d - off * along)
         vv += weight * k * (gg + 2.0 * along + bend)
     return pp, bb, pb, vv
 
@@ -217,5 +214,5 @@ def _against_potential(
         arm[i] += a[j] * length
         arm[j] += a[i] * length
         square -= bumps[3 - i - j] * length / 4
-    square += _dot(hats, reach) / (d + 1)
-    return (s * square + _dot(hats, arm)) / (2 * d)
+    square += dot_rows(hats, reach) / (d + 1)
+    return (s * square + dot_rows(hats, arm)) / (2 * d)

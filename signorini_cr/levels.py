@@ -15,11 +15,14 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from .cells import Cells
 from .certificate import Certificate, certify
 from .contact import Contact, contact_facts
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import InputError, raise_together
 from .hierarchy import refine
+from .loads import Edge, Load, chi
+from .moments import Data
 from .multigrid import Grid, cr_grid
 from .nested import Coarse, nested_start
 from .problem import Forms, Problem
@@ -54,6 +57,26 @@ class Level:
     def V(self) -> fem.FunctionSpace:
         """The discrete space."""
         return function_space(self.domain.mesh, self.forms.element)
+
+    @cached_property
+    def cells(self) -> Cells:
+        """The mesh as arrays, for the Crouzeix-Raviart element."""
+        return Cells(self.domain, self.V)
+
+    @cached_property
+    def load(self) -> Load:
+        """Moments of f."""
+        return Load.of(Data.of(self.forms).f, self.cells)
+
+    @cached_property
+    def edge(self) -> Edge:
+        """Moments of g."""
+        return Edge(Data.of(self.forms).g, self.cells)
+
+    def tidy(self) -> None:
+        """Drop what only solution and certificate needed; it is made again if asked for."""
+        for name in ("cells", "load", "edge"):
+            self.__dict__.pop(name, None)
 
     @cached_property
     def system(self) -> System:
@@ -111,7 +134,10 @@ class System:
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
         if forms.chi is not None:
-            fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
+            if forms.element == "CR":
+                self.chi.x.array[:] = chi(level.load, level.edge, level.cells)
+            else:
+                fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
         self.b = fem.Function(V)
         self.b.x.array[:] = self.chi.x.array
         fem.apply_lifting(self.b.x.array, [a], [[bc]])

@@ -7,6 +7,7 @@ where they are numbers exactly.
 from __future__ import annotations
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import basix
 import numpy as np
@@ -15,7 +16,7 @@ import ufl
 from dolfinx import fem
 
 from . import compat
-from .cells import Cells, Side, blocks
+from .cells import Cells, Side
 from .problem import Forms
 from .ranges import Range, range_of
 
@@ -70,56 +71,6 @@ class Volume:
         assert self._values is not None
         which = np.arange(cells.number, dtype=np.int32)
         return self._values.eval(cells.domain.mesh, which).reshape(cells.number, -1)
-
-
-class Load:
-    """f as the certificate sees it: a few moments on each cell.
-
-    Attributes:
-        mean: f_T, the mean of f, shape (cells,).
-        hats: Means of (f − f_T) λ_i, shape (d + 1, cells); None where f is constant on each cell.
-        bumps: Means of (f − f_T) b_i, shape (d + 1, cells), b_i as in `Rule`; or None.
-        variance: Means of (f − f_T)², shape (cells,); or None.
-    """
-
-    def __init__(self, mean: FloatArray, rows: FloatArray | None, variance: FloatArray | None):
-        """Take the moments; the rows are those of hats and bumps."""
-        self.mean, self.variance = mean, variance
-        half = 0 if rows is None else len(rows) // 2
-        self.hats = None if rows is None else rows[:half]
-        self.bumps = None if rows is None else rows[half:]
-
-    def shares(self, cells: Cells, part: slice) -> FloatArray:
-        """∫_T f ψ_i for the Crouzeix-Raviart functions ψ_i = 1 − d λ_i, shape (d + 1, n)."""
-        d = cells.tdim
-        out = np.empty((d + 1, part.stop - part.start))
-        out[:] = self.mean[part] / (d + 1)
-        if self.hats is not None:
-            out -= d * self.hats[:, part]
-        out *= cells.volume[part]
-        return out
-
-    @classmethod
-    def of(cls, f: Volume, cells: Cells) -> Load:
-        """Integrate f."""
-        n, rule = cells.number, f.rule
-        if f.number is not None:
-            return cls(np.full(n, f.number), None, None)
-        values = f.at(cells)
-        mean, variance = np.empty(n), np.empty(n)
-        tests = np.concatenate(
-            [
-                (rule.hats - (rule.hats @ rule.weights)[:, None]) * rule.weights,
-                (rule.bumps - (rule.bumps @ rule.weights)[:, None]) * rule.weights,
-            ]
-        )
-        rows = np.empty((len(tests), n))
-        for part in blocks(n):
-            here = values[part]
-            mean[part] = here @ rule.weights
-            rows[:, part] = tests @ here.T
-            variance[part] = (here - mean[part, None]) ** 2 @ rule.weights
-        return cls(mean, rows, variance)
 
 
 class Coefficient:
@@ -184,11 +135,11 @@ class Trace:
             self._constant = float(expression)
             return
         at = np.vstack([corners, corners.mean(axis=0), self.points])
-        self._values = fem.Expression(expression, at, forms.mesh.comm)
+        self._values = compat.FacetExpression(expression, at, forms.mesh)
         gradient = ufl.grad(expression) if slopes else None
         self._slopes = None
         if gradient is not None and not isinstance(gradient, ufl.constantvalue.Zero):
-            self._slopes = fem.Expression(gradient, self.points, forms.mesh.comm)
+            self._slopes = compat.FacetExpression(gradient, self.points, forms.mesh)
 
     @property
     def vanishes(self) -> bool:
@@ -205,8 +156,8 @@ class Trace:
         if self._constant is not None:
             count = len(self.weights)
             return tuple(np.full(s, self._constant) for s in ((k, n), n, (count, n)))  # type: ignore
-        values = compat.evaluate_on_facets(self._values, cells.domain.mesh, side.entities)
-        values = np.ascontiguousarray(values.reshape(n, k + 1 + len(self.weights)).T)
+        values = self._values.at(cells.domain.mesh, side.entities)
+        values = np.ascontiguousarray(values[:, :, 0].T)
         return values[:k], values[k], values[k + 1 :]
 
     def slopes(self, cells: Cells, side: Side) -> FloatArray:
@@ -214,5 +165,36 @@ class Trace:
         n = len(side.cells)
         if self._constant is not None or self._slopes is None:
             return np.zeros((1, n, self._gdim))
-        values = compat.evaluate_on_facets(self._slopes, cells.domain.mesh, side.entities)
-        return values.reshape(n, len(self.weights), self._gdim).transpose(1, 0, 2)
+        return self._slopes.at(cells.domain.mesh, side.entities).transpose(1, 0, 2)
+
+
+class Data:
+    """The data of a problem, compiled for evaluation.
+
+    Attributes:
+        f: Volume load.
+        kappa: Coefficient; None if it isn't a scalar.
+        u_D: Values on Γ0.
+        alpha: Obstacle.
+        g: Flux on Γg.
+    """
+
+    def __init__(self, forms: Forms):
+        """Compile what isn't a number."""
+        degree = forms.problem.quadrature_degree
+        rule = Rule(forms)
+        self.f = Volume(forms.f, forms, rule)
+        self.kappa = Volume(forms.kappa, forms, rule) if not ufl.shape(forms.kappa) else None
+        self.u_D = Trace(forms.dirichlet, forms, degree)
+        self.alpha = Trace(forms.obstacle, forms, degree)
+        self.g = Trace(forms.g, forms, degree, slopes=False)
+
+    @classmethod
+    def of(cls, forms: Forms) -> Data:
+        """The data of these forms, compiled once."""
+        if forms not in _DATA:
+            _DATA[forms] = cls(forms)
+        return _DATA[forms]
+
+
+_DATA: WeakKeyDictionary[Forms, Data] = WeakKeyDictionary()
