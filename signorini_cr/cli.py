@@ -18,6 +18,7 @@ from .screen import Screen
 
 if TYPE_CHECKING:
     from .domain import Domain
+    from .errors import NotConverged
     from .levels import Solution
     from .problemfile import ProblemFile
 
@@ -118,6 +119,7 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         failure = NotConverged("out of memory", len(records))
     except InputError as error:
         raise InputError(f"{case.path}: {error}") from None
+    failure = failure or _above_tolerance(case, records)
     screen.progress("writing")
     if finest is not None:
         report = output.make_report(case.title, args.element.upper(), comm, records)
@@ -224,11 +226,30 @@ def _facts(record: dict[str, Any]) -> str:
     return line
 
 
+def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotConverged | None:
+    """What stopped an adaptive run before the bound that was asked for was reached."""
+    if case.mode == "uniform" or case.tolerance == 0.0 or not records:
+        return None
+    from .errors import NotConverged
+
+    bound = records[-1]["bound_h1"]
+    if bound is not None and bound <= case.tolerance:
+        return None
+    limit = (
+        f"levels = {case.levels}" if len(records) >= case.levels else f"max_dofs = {case.max_dofs}"
+    )
+    return NotConverged(
+        f"the certified bound is {bound:.3g}, above the tolerance of {case.tolerance:g}, and"
+        f" {limit} allows no further mesh",
+        records[-1]["level"],
+    )
+
+
 def _stopped(failure: Any, finished: int, folder: Path) -> str:
     kept = {
         0: "no level was finished, nothing was written",
-        1: f"level 0, finished before, is kept in {folder}",
-    }.get(finished, f"levels 0 to {finished - 1}, finished before, are kept in {folder}")
+        1: f"level 0 is finished and kept in {folder}",
+    }.get(finished, f"levels 0 to {finished - 1} are finished and kept in {folder}")
     level = finished if failure.level is None else failure.level
     return f"stopped on level {level}: {failure.reason}\n{kept}"
 

@@ -431,10 +431,27 @@ def test_levels_finished_before_a_failure_are_kept(finished: int, write, monkeyp
     assert f"case.toml: stopped on level {finished}: DIVERGED_MAX_IT after 50 steps" in message
     assert "Traceback" not in err
     if finished:
-        assert "levels 0 to 1, finished before, are kept in" in message
+        assert "levels 0 to 1 are finished and kept in" in message
         assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
     else:
         assert "nothing was written" in message and not out.exists()
+
+
+@pytest.mark.parametrize("limit", ["levels = 2", "max_dofs = 100"])
+def test_an_adaptive_run_that_a_limit_stops(limit: str, write) -> None:
+    text = with_("uniform", "adaptive").replace("levels = 2", limit)
+    path = write(text.replace("tolerance = 0", "tolerance = 1e-3"))
+    status, _, err = run("solve", path, "--out", "out", "-q")
+    assert status == cli.NOT_CONVERGED
+    if COMM.rank == 0:
+        message = " ".join(err.split())
+        assert "case.toml: stopped on level 1: the certified bound is" in message
+        assert f"above the tolerance of 0.001, and {limit} allows no further mesh" in message
+        assert len(json.loads(Path("out/report.json").read_text())["levels"]) == 2
+
+
+def test_an_adaptive_run_without_a_tolerance_ends_at_its_limit(write) -> None:
+    assert run("solve", write(with_("uniform", "adaptive")), "--out", "out", "-q") == (0, "", "")
 
 
 def _at_once(*_, **__):
