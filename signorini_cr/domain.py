@@ -27,8 +27,9 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from signorini_cr import gmshmesh
-from signorini_cr.compat import unghosted_partitioner
+from signorini_cr.compat import coordinate_map, unghosted_partitioner
 from signorini_cr.errors import InputError, on_root, raise_together
+from signorini_cr.loops import check_labels, check_loops, coordinates
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
@@ -146,6 +147,10 @@ def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
     kind = mesh.topology.cell_type.name
     if kind not in ("triangle", "tetrahedron"):
         return f"the mesh consists of {kind} cells: triangles or tetrahedra are needed"
+    if mesh.geometry.dim != tdim:
+        return f"{kind} cells in {mesh.geometry.dim} dimensions: the mesh has to fill its space"
+    if coordinate_map(mesh).degree != 1:
+        return "the mesh has curved cells: straight-sided ones are needed"
     if facet_tags.dim != tdim - 1:
         return f"the tags have dimension {facet_tags.dim}: facets have dimension {tdim - 1}"
     return None
@@ -167,11 +172,11 @@ class Polygon:
 
     def __post_init__(self) -> None:
         """Take lists as well as arrays and check everything that can be checked at once."""
-        object.__setattr__(self, "vertices", _coordinates(self.vertices))
+        object.__setattr__(self, "vertices", coordinates(self.vertices))
         object.__setattr__(self, "boundary", tuple(self.boundary))
         object.__setattr__(self, "holes", tuple(self.holes))
-        _check_labels(self.boundary, len(self.vertices))
-        _check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
+        check_labels(self.boundary, len(self.vertices), tuple(PARTS))
+        check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
         if any(hole.holes for hole in self.holes):
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
@@ -244,102 +249,3 @@ def _distribute(
     values = np.full(_count(mesh, 1), NEUMANN, dtype=np.int32)
     values[found.indices] = found.values
     return Domain(mesh, meshtags(mesh, 1, exterior, values[exterior]))
-
-
-def _coordinates(vertices: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    try:
-        points = np.array(vertices, dtype=np.float64)
-    except (TypeError, ValueError):
-        points = np.empty(0)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise InputError("vertices are not a list of [x, y] pairs of numbers")
-    if len(points) < 3:
-        raise InputError(f"{len(points)} vertices: a polygon has at least 3")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(bad):
-        raise InputError(f"vertex {bad[0]} is {_point(points[bad[0]])}: not a finite point")
-    points.flags.writeable = False
-    return points
-
-
-def _point(x: npt.NDArray[np.float64]) -> str:
-    return f"({x[0]:g}, {x[1]:g})"
-
-
-def _check_labels(labels: Sequence[str], edges: int) -> None:
-    if len(labels) != edges:
-        raise InputError(
-            f"{len(labels)} boundary labels for {edges} edges: one for each edge is needed"
-        )
-    for i, label in enumerate(labels):
-        if label not in tuple(PARTS):
-            raise InputError(f"edge {i} is labelled {label!r}: allowed are {_list(PARTS)}")
-
-
-def _check_loops(loops: Sequence[npt.NDArray[np.float64]]) -> None:
-    """Insist on simple loops, apart from each other, the first around all the others.
-
-    Edges touch if they come closer than 1e-12 of the polygon's extent.
-
-    Args:
-        loops: Vertices of the polygon and of each hole, shapes (n, 2).
-    """
-    a = np.concatenate(loops)
-    sizes = np.array([len(loop) for loop in loops])
-    starts = np.repeat(np.cumsum(sizes) - sizes, sizes)
-    local = np.arange(len(a)) - starts
-    ring = np.repeat(np.arange(len(loops)), sizes)
-    after = starts + (local + 1) % np.repeat(sizes, sizes)
-    b = a[after]
-    near = 1e-12 * np.ptp(loops[0], axis=0).max()
-
-    def vertex(i: int) -> str:
-        return f"vertex {local[i]}{_where(ring[i])} at {_point(a[i])}"
-
-    def edge(i: int) -> str:
-        return f"edge {local[i]}{_where(ring[i])}"
-
-    for i in range(len(a)):  # the polygon's own vertices: few
-        same = np.flatnonzero(np.abs(a[i + 1 :] - a[i]).max(axis=1) <= near)
-        if len(same):
-            raise InputError(f"{vertex(i)} is the same point as {vertex(i + 1 + same[0])}")
-    direction = b - a
-    length2 = (direction**2).sum(axis=1)
-    for i in range(len(a)):
-        t = np.clip(((a[i] - a) * direction).sum(axis=1) / length2, 0, 1)
-        gap = np.linalg.norm(a + t[:, None] * direction - a[i], axis=1)
-        gap[(np.arange(len(a)) == i) | (after == i)] = np.inf
-        if gap.min() <= near:
-            raise InputError(f"{vertex(i)} lies on {edge(int(gap.argmin()))}")
-        crossing = (_side(a[i], b[i], a) * _side(a[i], b[i], b) < 0) & (
-            _side(a, b, a[i]) * _side(a, b, b[i]) < 0
-        )
-        if crossing.any():
-            raise InputError(f"{edge(i)} crosses {edge(int(crossing.argmax()))}")
-    for k in range(1, len(loops)):
-        if not _inside(loops[k][0], loops[0]):
-            raise InputError(f"hole {k - 1} lies outside the polygon")
-        for j in range(1, len(loops)):
-            if j != k and _inside(loops[k][0], loops[j]):
-                raise InputError(f"hole {k - 1} lies inside hole {j - 1}")
-
-
-def _where(ring: int) -> str:
-    return f" of hole {ring - 1}" if ring else ""
-
-
-def _side(
-    a: npt.NDArray[np.float64], b: npt.NDArray[np.float64], x: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Sign of the area of the triangles a, b, x."""
-    u, v = b - a, x - a
-    return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
-
-
-def _inside(x: npt.NDArray[np.float64], loop: npt.NDArray[np.float64]) -> bool:
-    """Whether a point, not on the loop, lies inside: a ray to the right crosses it oddly often."""
-    a, b = loop, np.roll(loop, -1, axis=0)
-    spans = (a[:, 1] > x[1]) != (b[:, 1] > x[1])
-    a, b = a[spans], b[spans]
-    hit = a[:, 0] + (x[1] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-    return bool(np.count_nonzero(hit > x[0]) % 2)

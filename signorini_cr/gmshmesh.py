@@ -19,6 +19,7 @@ _MOST_TRIANGLES = 2e7
 _MOST_FACETS = 1e5  # on the boundary
 _UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
+_GROWTH = 0.3  # of the size, per length, away from short facets
 _OPTIONS = {
     "General.Terminal": 0,
     "General.AbortOnError": 2,  # raise instead of going on
@@ -100,13 +101,13 @@ def triangulate(
         raise InputError(
             f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
         )
+    facets = [length / count for length, count in zip(lengths, counts)]
+    shortest = min(map(np.min, facets))
     with _session() as gmsh:
         geo = gmsh.model.geo
         curves: list[int] = []
         rings = []
-        for loop, length, count in zip(loops, lengths, counts):
-            facet = length / count
-            near = np.minimum(facet, np.roll(facet, 1))  # at each vertex
+        for loop, facet, count, near in zip(loops, facets, counts, _sizes(loops, facets)):
             even = np.minimum(near, np.roll(near, -1)) > _UNEVEN * facet
             points = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(loop, near)]
             lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1])]
@@ -114,20 +115,37 @@ def triangulate(
                 geo.mesh.setTransfiniteCurve(lines[i], int(count[i]) + 1)
             rings.append(geo.addCurveLoop(lines))
             curves += lines
-        geo.addPlaneSurface(rings)
+        surface = geo.addPlaneSurface(rings)
         geo.synchronize()
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+        if shortest < _UNEVEN * size:
+            _widen_inwards(gmsh, curves, surface, size)
         try:
             gmsh.model.mesh.generate(2)
         except Exception as error:
             raise InputError(f"gmsh could not triangulate the polygon: {error}") from error
-        facets = [_elements(gmsh, 1, _LINE, curve) for curve in curves]
+        found = [_elements(gmsh, 1, _LINE, curve) for curve in curves]
         return _compact(
             gmsh,
             _elements(gmsh, 2, _TRIANGLE),
-            np.concatenate(facets),
-            np.repeat(labels, [len(ends) for ends in facets]),
+            np.concatenate(found),
+            np.repeat(labels, [len(ends) for ends in found]),
         )
+
+
+def _sizes(
+    loops: Sequence[npt.NDArray[np.float64]], facets: Sequence[npt.NDArray[np.float64]]
+) -> list[npt.NDArray[np.float64]]:
+    """Facet length at every vertex: the shorter of its edges', growing slowly.
+
+    Args:
+        loops: Vertices of the polygon and of each hole, shapes (n, 2).
+        facets: Facet length of every edge, shapes (n,).
+    """
+    near = [np.minimum(facet, np.roll(facet, 1)) for facet in facets]
+    x, h = np.concatenate(loops), np.concatenate(near)
+    slow = np.array([np.min(h + _GROWTH * np.hypot(*(x - p).T)) for p in x])
+    return np.split(slow, np.cumsum([len(loop) for loop in loops])[:-1])
 
 
 def read(path: Path, parts: dict[str, int]) -> Triangulation:
@@ -303,6 +321,18 @@ def _compact(
         position,
         labels.astype(np.int32),
     )
+
+
+def _widen_inwards(gmsh: Any, curves: list[int], surface: int, size: float) -> None:
+    """Let triangles grow from short facets on the boundary to `size` inside."""
+    field = gmsh.model.mesh.field.add("Extend")
+    gmsh.model.mesh.field.setNumbers(field, "CurvesList", curves)
+    gmsh.model.mesh.field.setNumbers(field, "SurfacesList", [surface])
+    gmsh.model.mesh.field.setNumber(field, "SizeMax", size)
+    gmsh.model.mesh.field.setNumber(field, "DistMax", size / _GROWTH)
+    gmsh.model.mesh.field.setAsBackgroundMesh(field)
+    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+    gmsh.option.setNumber("Mesh.Algorithm", 5)  # Delaunay: Frontal-Delaunay can give up early here
 
 
 def _area(loop: npt.NDArray[np.float64]) -> float:

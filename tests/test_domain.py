@@ -3,6 +3,7 @@
 import itertools
 from pathlib import Path
 
+import basix.ufl
 import dolfinx.mesh
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
+from signorini_cr.compat import unghosted_partitioner
 from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
 
@@ -121,11 +123,23 @@ def test_vertices_are_mesh_vertices():
     assert lengths(domain) == pytest.approx([1.3, 4, 0.7])
 
 
-def test_short_edges_get_a_facet_and_angles_stay_away_from_zero():
+@pytest.mark.parametrize("size", [0.1, 0.25, 0.5, 1.0])
+def test_short_edges_get_a_facet_and_angles_stay_away_from_zero(size: float):
     vertices = [[-1, 0], [0, 0], [0.01, 0], [1, 0], [1, 1], [-1, 1]]
     labels = ["contact", "neumann", "contact", "dirichlet", "dirichlet", "dirichlet"]
-    domain = Polygon(vertices, labels).mesh(0.25)
+    domain = Polygon(vertices, labels).mesh(size)
     assert counts(domain)[2] == 1
+    assert smallest_angle(domain) > 20
+
+
+def test_triangles_grow_away_from_short_edges():
+    """A disk with 200 corners at the size of its radius: far fewer cells than if all were small."""
+    angle = 2 * np.pi * np.arange(200) / 200
+    labels = ["contact", "dirichlet"] * 100
+    domain = Polygon(np.stack([np.cos(angle), np.sin(angle)], axis=1), labels).mesh(1.0)
+    assert area(domain) == pytest.approx(100 * np.sin(np.pi / 100))
+    assert counts(domain) == [100, 100, 0]
+    assert domain.mesh.topology.index_map(2).size_global < 2500  # 7300 equilateral ones
     assert smallest_angle(domain) > 20
 
 
@@ -441,3 +455,18 @@ def test_own_quadrilaterals():
     )
     tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
     assert "quadrilateral" in fails_alike(lambda: Domain.from_tags(mesh, tags))
+
+
+def test_own_surfaces_in_space():
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1]], dtype=np.float64)
+    root = COMM.rank == 0
+    mesh = dolfinx.mesh.create_mesh(
+        COMM,
+        cells=np.arange(3 if root else 0, dtype=np.int64).reshape(-1, 3),
+        x=x if root else x[:0],
+        e=basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)),
+        partitioner=unghosted_partitioner(),
+    )
+    mesh.topology.create_entities(1)
+    tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
+    assert "3 dimensions" in fails_alike(lambda: Domain.from_tags(mesh, tags))

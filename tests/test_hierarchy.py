@@ -238,7 +238,7 @@ def test_what_cannot_be_refined():
             way(domain)
 
 
-def curved_square() -> Domain:
+def curved_triangle() -> Domain:
     x = np.array([[0, 0], [1, 0], [0, 1], [0.6, 0.6], [0, 0.5], [0.5, 0]])
     root = COMM.rank == 0
     mesh = dolfinx.mesh.create_mesh(
@@ -251,12 +251,15 @@ def curved_square() -> Domain:
     mesh.topology.create_connectivity(1, 2)
     facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     values = np.arange(len(facets), dtype=np.int32) % 2 + 1
-    return Domain.from_tags(mesh, dolfinx.mesh.meshtags(mesh, 1, facets, values))
+    return Domain(mesh, dolfinx.mesh.meshtags(mesh, 1, facets, values))
 
 
 def test_curved_cells_are_refused():
+    domain = curved_triangle()
     with pytest.raises(InputError, match="curved"):
-        refine(curved_square())
+        refine(domain)
+    with pytest.raises(InputError, match="curved"):
+        Domain.from_tags(domain.mesh, domain.tags)
 
 
 # marked cells
