@@ -120,43 +120,44 @@ def contact_facts(
     vertices, measure = facet_measures(mesh, facets)
     dofs = closure_dofs(V, facets)
 
-    def shared(values: FloatArray) -> FloatArray:
-        """Spread the owned values to the ghosts."""
-        field = fem.Function(V)
-        field.x.array[:owned] = values
-        field.x.scatter_forward()
-        return field.x.array
+    work = fem.Function(V)
+    np.add.at(work.x.array, dofs, (measure / dofs.shape[1])[:, None])
+    work.x.scatter_reverse(InsertMode.add)
+    bounded = np.flatnonzero(lower[:owned] > PETSc.NINFINITY)
+    weight = work.x.array[bounded]
+    work.x.array[:] = 0.0
 
-    weight = fem.Function(V)
-    np.add.at(weight.x.array, dofs, (measure / dofs.shape[1])[:, None])
-    weight.x.scatter_reverse(InsertMode.add)
-    bounded = lower[:owned] > PETSc.NINFINITY
-    gap = np.where(bounded, u.x.array[:owned] - np.where(bounded, lower[:owned], 0.0), 0.0)
-    force = np.where(bounded, residual.x.array[:owned], 0.0)
-    pressure = np.where(bounded, force / np.where(bounded, weight.x.array[:owned], 1.0), 0.0)
+    def on_facets(values: FloatArray) -> FloatArray:
+        """Values at bounded dofs, 0 at others, as the facets see them."""
+        work.x.array[bounded] = values
+        work.x.scatter_forward()
+        return work.x.array[dofs]
+
+    gap = u.x.array[bounded] - lower[bounded]
+    force = residual.x.array[bounded]
+    pressure = force / weight
+    stiff_gap = diagonal[bounded] * gap
     # The primal-dual criterion: it tells gap from pressure also where both are nearly zero
-    active = bounded & (force > diagonal * gap)
+    state = on_facets(np.where(force > stiff_gap, 1.0, -1.0))
+    is_active: npt.NDArray[np.bool_] = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
     # What is left of the equations: all of r off Γ1, min(r, a_ii gap) on it
-    left = np.where(bounded, np.minimum(force, diagonal * gap), residual.x.array[:owned])
-    on_facets = shared(pressure)[dofs].mean(axis=1)
-    is_active = (shared(active | ~bounded)[dofs] > 0.5).all(axis=1) & (
-        shared(active)[dofs] > 0.5
-    ).any(axis=1)
+    left = residual.x.array[:owned].copy()
+    left[bounded] = np.minimum(force, stiff_gap)
 
     local = _cells_values(u, facets)
     total = _Totals(comm)
     kkt = Kkt(
-        min_gap=total.min(gap[bounded]),
-        min_pressure=total.min(pressure[bounded]),
+        min_gap=total.min(gap),
+        min_pressure=total.min(pressure),
         complementarity=total.sum(np.abs(force * gap)),
-        residual=float(np.sqrt(total.sum(left**2))) / (load or 1.0),
+        residual=float(np.sqrt(total.sum(left @ left))) / (load or 1.0),
     )
-    fields = {
+    fields: dict[str, npt.NDArray] = {
         "vertices": vertices,
         "measure": measure,
         "obstacle": obstacle_at_vertices.mean(axis=1) if dofs.shape[1] > 1 else lower[dofs[:, 0]],
         "u": local.mean(axis=1),
-        "pressure": on_facets,
+        "pressure": on_facets(pressure).mean(axis=1),
         "active": is_active,
         "gap_at_vertices": local - obstacle_at_vertices,
     }
@@ -181,7 +182,7 @@ class _Totals:
     def __init__(self, comm: MPI.Comm):
         self.comm = comm
 
-    def sum(self, values: npt.NDArray) -> float:
+    def sum(self, values: npt.ArrayLike) -> float:
         return float(self.comm.allreduce(float(np.sum(values))))
 
     def min(self, values: npt.NDArray) -> float:
@@ -206,7 +207,8 @@ def _along_boundary(
     """
     columns = dict(fields) | {"reverse": _clockwise(mesh, facets, fields["vertices"])}
     gathered = mesh.comm.gather(columns, root=0)
-    table, transitions = None, np.zeros((0, 3))
+    table = None
+    transitions: FloatArray = np.zeros((0, 3))
     if gathered is not None:
         rows = {name: np.concatenate([part[name] for part in gathered]) for name in columns}
         table, transitions = _ordered(rows)

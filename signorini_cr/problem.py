@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import basix
 import numpy as np
@@ -20,14 +20,14 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import Mesh
+from ufl.core.expr import Expr
 
 from . import compat
 from .domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from .errors import InputError
 from .space import facet_entities, ufl_element
 
-Expr = ufl.core.expr.Expr
-Data = float | Expr | Callable[[Expr], Any]
+Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
 
 
@@ -212,8 +212,8 @@ class FacetData:
         self._size = len(corners)
         self._constant = float(expression) if _is_constant(expression) else None
         if self._constant is None:
-            self._expression = fem.Expression(
-                expression, np.vstack([corners, points]), forms.mesh.comm
+            self._expression = compat.FacetExpression(
+                expression, np.vstack([corners, points]), forms.mesh
             )
 
     def at(self, domain: Domain, facets: npt.NDArray[np.int32]) -> tuple[Any, Any]:
@@ -232,9 +232,7 @@ class FacetData:
                 np.full(len(facets), self._constant),
                 np.full((len(facets), self._size), self._constant),
             )
-        values = compat.evaluate_on_facets(
-            self._expression, domain.mesh, facet_entities(domain.mesh, facets)
-        ).reshape(len(facets), self._size + len(self._weights))
+        values = self._expression.at(domain.mesh, facet_entities(domain.mesh, facets))[:, :, 0]
         return values[:, self._size :] @ self._weights, values[:, : self._size]
 
 

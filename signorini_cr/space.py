@@ -128,11 +128,10 @@ def ghosted_vector(V: fem.FunctionSpace, array: FloatArray | None = None) -> PET
     """A PETSc vector with room for the ghosts of V, on ``array`` if given (no copy)."""
     index_map = V.dofmap.index_map
     size = (index_map.size_local, index_map.size_global)
+    ghosts = index_map.ghosts.astype(PETSc.IntType)
     if array is None:
-        return PETSc.Vec().createGhost(index_map.ghosts.astype(PETSc.IntType), size, comm=V.mesh.comm)
-    return PETSc.Vec().createGhostWithArray(
-        index_map.ghosts.astype(PETSc.IntType), array, size, comm=V.mesh.comm
-    )
+        return PETSc.Vec().createGhost(ghosts, size, comm=V.mesh.comm)
+    return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=V.mesh.comm)
 
 
 def shared_maximum(V: fem.FunctionSpace, array: FloatArray) -> None:
