@@ -126,9 +126,8 @@ def facet_values(
     expression = as_expression(data, x) + 0.0 * x[0]
     if not ufl.domain.extract_domains(expression):
         return np.full((len(facets), len(points)), float(expression))
-    compiled = fem.Expression(expression, points, mesh.comm)
-    entities = facet_entities(mesh, facets)
-    return compat.evaluate_on_facets(compiled, mesh, entities).reshape(len(facets), len(points))
+    compiled = compat.FacetExpression(expression, points, mesh)
+    return compiled.at(mesh, facet_entities(mesh, facets))[:, :, 0]
 
 
 def _total(mesh: Mesh, share: float) -> float:
