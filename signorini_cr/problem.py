@@ -133,7 +133,9 @@ class Forms:
         self.x = ufl.SpatialCoordinate(cell)
         self.kappa = as_expression(problem.coefficient, self.x)
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
-        flux = None if self.exact is None else self.kappa * ufl.grad(self.exact)
+        # UFL can't differentiate a number
+        level = self.exact is None or _is_constant(self.exact)
+        flux = None if level else self.kappa * ufl.grad(self.exact)
         n = ufl.FacetNormal(cell)
 
         def given(data: Data | None, derived: Callable[[], Expr]) -> Expr:
@@ -143,7 +145,8 @@ class Forms:
 
         self.f = given(problem.f, lambda: -ufl.div(flux))
         self.g = given(problem.g, lambda: ufl.dot(flux, n))
-        self.dirichlet = given(problem.dirichlet, lambda: self.exact)
+        boundary = self.exact if problem.dirichlet is None else problem.dirichlet
+        self.dirichlet = as_expression(0.0 if boundary is None else boundary, self.x)
         self.obstacle = as_expression(problem.obstacle, self.x)
 
     @cached_property

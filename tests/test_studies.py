@@ -125,10 +125,10 @@ def replace_parts(domain, old, new):
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize(
     ("coefficient", "contact"),
-    [(1.0, True), (1.0, False), (2.5, True), (2.5, False), ("jump", True)],
+    [(1.0, True), (1.0, False), (2.5, True), (2.5, False), ("jump", True), ("jump", None)],
 )
 def test_patch(element, coefficient, contact):
-    """An affine u is reproduced, in contact (λ = 3κ) or free, with a coefficient as well."""
+    """An affine u is reproduced, in contact (λ = 3κ) or free, or a constant, whatever κ."""
     slope = -3.0 if contact else 0.0
 
     def u(x):
@@ -140,6 +140,8 @@ def test_patch(element, coefficient, contact):
         )
 
     problem = Problem(f=0.0, exact=u, obstacle=u if contact else -9.0, coefficient=kappa)
+    if contact is None:
+        problem = Problem(exact=2.0, obstacle=-9.0, coefficient=kappa)
     # The jump lies on facets of the mesh without jitter
     solution = solve(problem, exact.D.structured(4, jitter=0.0 if coefficient == "jump" else 0.2))
     assert solution.errors[0] < 1e-7 and solution.errors[1] < 1e-8
