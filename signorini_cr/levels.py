@@ -23,7 +23,7 @@ from .errors import InputError, raise_together
 from .hierarchy import refine
 from .loads import Edge, Load, chi
 from .moments import Data
-from .multigrid import Grid, cr_grid
+from .multigrid import Below, Grid, p1_grid
 from .nested import Coarse, nested_start
 from .problem import Forms, Problem
 from .solver import ContactRows, Iterations, solve_vi
@@ -84,21 +84,40 @@ class Level:
         return System(self)
 
     @cached_property
-    def grids(self) -> tuple[Grid, Grid, Layout]:
-        """The multigrid that starts here; in it P1 on this mesh, and the dofs of that."""
-        A, dofs = self.system.A, Layout.of_space(self.V)
-        dirichlet = self.system.dirichlet[self.system.dirichlet < dofs.size[0]]
-        below = None
-        if self.coarser is not None and self.parent_cell is not None:
-            below = (*self.coarser.grids[1:], self.parent_cell)
+    def grid(self) -> Grid:
+        """The multigrid that starts with the discrete space."""
+        A, dofs, dirichlet = self.system.A, Layout.of_space(self.V), self._owned_dirichlet
+        if self._below is not None:
+            grid, coarse_dofs, parent_cell = self._below
+            transfer = prolongation(coarse_dofs, dofs, parent_cell)
+            return Grid(A, dirichlet, transfer, grid, sweeps=2 if dofs.cr else 1)
         if dofs.cr:
-            grid, conforming, dofs = cr_grid(A, dofs, dirichlet, below)
-            return grid, conforming, dofs
-        if below is None:
-            grid = Grid(A, dirichlet)
-        else:
-            grid = Grid(A, dirichlet, prolongation(below[1], dofs, below[2]), below[0])
-        return grid, grid, dofs
+            p1, _, into_cr = self._p1
+            return Grid(A, dirichlet, into_cr, p1, on_same_mesh=True)
+        return Grid(A, dirichlet)
+
+    @cached_property
+    def conforming(self) -> tuple[Grid, Layout]:
+        """P1 on this mesh, for the next one, and its dofs."""
+        if self.forms.element == "P1":
+            return self.grid, Layout.of_space(self.V)
+        return self._p1[:2]
+
+    @cached_property
+    def _p1(self) -> tuple[Grid, Layout, PETSc.Mat]:
+        dofs = Layout.of_space(self.V)
+        return p1_grid(self.system.A, dofs, self._owned_dirichlet, self._below)
+
+    @property
+    def _below(self) -> Below | None:
+        if self.coarser is None or self.parent_cell is None:
+            return None
+        return (*self.coarser.conforming, self.parent_cell)
+
+    @property
+    def _owned_dirichlet(self) -> npt.NDArray[np.int32]:
+        dofs = self.system.dirichlet
+        return dofs[dofs < self.V.dofmap.index_map.size_local]
 
 
 class System:
@@ -331,6 +350,7 @@ def solve_sequence(
         refined = step(solution)
         if refined is None:
             return
+        level.tidy()
         level = Level(level.forms, refined[0], level.number + 1, level, refined[1])
         seconds = {"mesh": time.perf_counter() - began}
         solution = _solve(level, solution if nested else None, monitor, seconds)
@@ -354,17 +374,17 @@ def _solve(
         below = Coarse(coarser.domain, coarser.u, coarser.residual, coarser.level.system.lower)
         b, dirichlet = system.b.x.array, system.dirichlet
         nested_start(below, level.domain, level.parent_cell, u, rows, b, dirichlet)
-    grid, conforming, _ = level.grids
     iterations = solve_vi(
-        grid,
+        level.grid,
         rows,
         *vectors,
         load=system.load,
         monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
         level=level.number,
     )
-    if grid is not conforming:
-        grid.free()  # the next level needs P1 alone
+    if level.forms.element != "P1":
+        level.grid.free()  # the next level needs P1 alone
+        del level.grid
     for thing in (rows, *vectors):
         thing.destroy()
     for function in (u, residual):
