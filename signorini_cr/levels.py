@@ -222,7 +222,7 @@ class Solution:
 
     @property
     def element(self) -> str:
-        """ "CR" or "P1"."""
+        """The element's name: "CR" or "P1"."""
         return self.level.forms.element
 
     @property

@@ -17,10 +17,18 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from .options import PREFIX, defaults
 from .transfer import Layout, inclusion, prolongation
 
 DIRECT = 2000
 """Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
+
+# Gauss-Seidel forward on the way down and backward on the way up: as symmetric as PETSc's default,
+# which goes both ways each time, and a third cheaper
+_AMG = {
+    "pc_hypre_boomeramg_relax_type_down": "SOR/Jacobi",
+    "pc_hypre_boomeramg_relax_type_up": "backward-SOR/Jacobi",
+}
 
 _SWEEP = PETSc.Mat.SORType.LOCAL_SYMMETRIC_SWEEP
 _FIRST_SWEEP = _SWEEP | PETSc.Mat.SORType.ZERO_INITIAL_GUESS
@@ -33,6 +41,7 @@ class Grid:
         matrix: Its matrix, the identity in the rows and columns of the dofs on Γ0.
         masked: The same, with the identity for the fixed dofs as well; `fix` keeps it so.
         coarser: The next space, None at the bottom.
+        meshes: Number of meshes in the chain.
     """
 
     def __init__(
@@ -41,6 +50,8 @@ class Grid:
         dirichlet: npt.NDArray[np.int32],
         transfer: PETSc.Mat | None = None,
         coarser: Grid | None = None,
+        sweeps: int = 1,
+        on_same_mesh: bool = False,
     ):
         """Join a space to the chain.
 
@@ -49,7 +60,11 @@ class Grid:
             dirichlet: Its owned dofs on Γ0, local numbers.
             transfer: The matrix that writes functions of the coarser space in this one.
             coarser: The next space.
+            sweeps: Number of symmetric Gauss-Seidel sweeps before and after.
+            on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
         """
+        self.meshes = (coarser.meshes if coarser else 0) + (not on_same_mesh)
+        self._sweeps = sweeps
         self.matrix, self.coarser = matrix, coarser
         self.masked = matrix.duplicate(copy=True)
         self._transfer = transfer
@@ -91,23 +106,18 @@ class Grid:
         if self.coarser is None or self._transfer is None:
             self._solve_bottom(b, x)
             return
-        self.masked.SOR(b, x, sortype=_FIRST_SWEEP)
+        self.masked.SOR(b, x, sortype=_FIRST_SWEEP, its=self._sweeps)
         self.masked.mult(x, self._r)
         self._r.aypx(-1.0, b)
         self._transfer.multTranspose(self._r, self._b)
         self._b.array[self.coarser._silent] = 0.0
         self.coarser.cycle(self._b, self._x)
         self._transfer.multAdd(self._x, x, x)
-        self.masked.SOR(b, x, sortype=_SWEEP)
+        self.masked.SOR(b, x, sortype=_SWEEP, its=self._sweeps)
 
     def apply(self, _: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """The V-cycle as PETSc's preconditioner of type python."""
         self.cycle(b, x)
-
-    @property
-    def grids(self) -> int:
-        """Number of spaces in the chain."""
-        return 1 if self.coarser is None else 1 + self.coarser.grids
 
     @property
     def bottom_is_direct(self) -> bool:
@@ -121,9 +131,11 @@ class Grid:
     def describe(self) -> str:
         """What the cycle is, in words."""
         bottom = "a direct solver" if self.bottom_is_direct else "BoomerAMG"
-        if self.grids <= 2:
+        if self.coarser is None:
+            return bottom
+        if self.meshes == 1:
             return f"P1 auxiliary space with {bottom} (there is no coarser mesh)"
-        return f"geometric multigrid on {self.grids - 1} meshes with {bottom} on the coarsest"
+        return f"geometric multigrid on {self.meshes} meshes with {bottom} on the coarsest"
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what belongs to this space alone, not the matrix it was made with."""
@@ -136,49 +148,55 @@ class Grid:
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:
-            pc = self._bottom = PETSc.PC().create(self.matrix.getComm())
-            if not self.bottom_is_direct:
-                pc.setType(PETSc.PC.Type.HYPRE)
-            elif self.matrix.getComm().getSize() == 1:
-                pc.setType(PETSc.PC.Type.CHOLESKY)
-            else:
-                pc.setType(PETSc.PC.Type.REDUNDANT)
+            self._bottom = self._bottom_solver()
         if self._changed:
             self._bottom.setOperators(self.masked)
             self._bottom.setUp()
             self._changed = False
         self._bottom.apply(b, x)
 
+    def _bottom_solver(self) -> PETSc.PC:
+        pc = PETSc.PC().create(self.matrix.getComm())
+        pc.setOptionsPrefix(PREFIX + "bottom_")
+        if not self.bottom_is_direct:
+            pc.setType(PETSc.PC.Type.HYPRE)
+        elif self.matrix.getComm().getSize() == 1:
+            pc.setType(PETSc.PC.Type.CHOLESKY)
+        else:
+            pc.setType(PETSc.PC.Type.REDUNDANT)
+        with defaults(_AMG if not self.bottom_is_direct else {}, PREFIX + "bottom_"):
+            pc.setFromOptions()
+        return pc
 
-def cr_grid(
-    A: PETSc.Mat,
-    cr: Layout,
-    dirichlet: npt.NDArray[np.int32],
-    coarser: tuple[Grid, Layout, npt.NDArray[np.int32]] | None = None,
-) -> tuple[Grid, Grid, Layout]:
-    """The chain that starts with CR on a mesh.
+
+Below = tuple[Grid, Layout, npt.NDArray[np.int32]]
+"""P1 on the coarser mesh, its dofs, and for each local cell the coarse one that holds it."""
+
+
+def p1_grid(
+    A: PETSc.Mat, cr: Layout, dirichlet: npt.NDArray[np.int32], below: Below | None = None
+) -> tuple[Grid, Layout, PETSc.Mat]:
+    """P1 as a subspace of CR on the same mesh.
 
     Args:
-        A: Matrix of a_h, with the identity in the rows and columns of Γ0's dofs.
+        A: Matrix of a_h in CR, with the identity in the rows and columns of Γ0's dofs.
         cr: The dofs of CR.
-        dirichlet: Owned dofs on Γ0.
-        coarser: P1 on the coarser mesh, its dofs, and the parent of each local cell.
+        dirichlet: Owned CR dofs on Γ0.
+        below: What comes next, if there is a coarser mesh.
 
     Returns:
-        CR, the P1 space that comes next, and the dofs of that.
+        P1, its dofs, and the matrix that writes its functions in CR.
     """
-    p1 = Layout.of_vertices(cr.mesh)
+    p1 = Layout.of_p1(cr.mesh)
     into_cr = inclusion(p1, cr)
     K = A.ptap(into_cr)
     # On Γ0 the product holds rubbish, in rows and columns that become the identity's
     vertices = _touched(into_cr, dirichlet)
     K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
-    if coarser is None:
-        conforming = Grid(K, vertices)
-    else:
-        grid, dofs, parent_cell = coarser
-        conforming = Grid(K, vertices, prolongation(dofs, p1, parent_cell), grid)
-    return Grid(A, dirichlet, into_cr, conforming), conforming, p1
+    if below is None:
+        return Grid(K, vertices), p1, into_cr
+    grid, dofs, parent_cell = below
+    return Grid(K, vertices, prolongation(dofs, p1, parent_cell), grid), p1, into_cr
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -21,8 +21,7 @@ Newton step with a wrong set ends early and one with the right set is the last.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +30,7 @@ from petsc4py import PETSc
 
 from .errors import NotConverged
 from .multigrid import Grid
-
-PREFIX = "signorini_"
-"""Prefix of the PETSc options that reach the solver, as in ``-signorini_ksp_rtol 1e-10``."""
+from .options import PREFIX, defaults
 
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
 # usual line search tests a norm that may rightly rise. A contact dof counts as active within the
@@ -157,7 +154,7 @@ def solve_vi(
             monitor(step, norm, number, snes.getLinearSolveIterations())
 
     snes.setMonitor(report)
-    with _defaults(DEFAULTS):
+    with defaults(DEFAULTS):
         snes.setFromOptions()
     snes.solve(None, x)
     reason = snes.getConvergedReason()
@@ -192,7 +189,7 @@ class _MaskedSolver:
     ):
         self._grid, self._contact, self._x, self._residual = grid, contact, x, residual
         self._first = grid.matrix.getOwnershipRange()[0]
-        self._inactive = np.empty(0, dtype=np.int32)
+        self._is_active = np.zeros(len(contact.dofs), dtype=bool)
         self._rhs, self._step = x.duplicate(), x.duplicate()
         self.ksp = ksp = PETSc.KSP().create(grid.matrix.getComm())
         ksp.setOptionsPrefix(PREFIX)
@@ -230,8 +227,14 @@ class _MaskedSolver:
         self, matrix: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, _: PETSc.Mat | None
     ) -> PETSc.Mat:
         """Note which dofs are inactive, and return a matrix of the right size."""
-        self._inactive = rows.getIndices() - self._first
-        size = (len(self._inactive), PETSc.DECIDE)
+        contact, inactive = self._contact, rows.array
+        numbers = contact.dofs + self._first
+        place = np.searchsorted(inactive, numbers)
+        if len(inactive):
+            self._is_active = inactive.take(place, mode="clip") != numbers
+        else:
+            self._is_active = np.ones(len(numbers), dtype=bool)
+        size = (len(inactive), PETSc.DECIDE)
         nominal = PETSc.Mat().createPython((size, size), comm=matrix.getComm())
         nominal.setPythonContext(_Nominal())
         nominal.setUp()
@@ -243,9 +246,6 @@ class _MaskedSolver:
     def solve(self, outer: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Solve the reduced system, given what SNES knows: its right-hand side is the residual."""
         contact = self._contact
-        place = np.searchsorted(self._inactive, contact.dofs)
-        inactive = self._inactive.take(place, mode="clip") == contact.dofs if place.size else []
-        self._is_active = ~np.asarray(inactive, dtype=bool)
         active = contact.dofs[self._is_active]
         self._grid.fix(active, deep=self._uses_grid)
         self._at_start = self._x.array_r[contact.dofs], self._residual.array_r[contact.dofs]
@@ -254,7 +254,7 @@ class _MaskedSolver:
         self._step.set(0.0)
         self.ksp.setOperators(self._grid.masked)
         self.ksp.solve(self._rhs, self._step)
-        x.array[:] = self._step.array_r.take(self._inactive)
+        x.array[:] = np.delete(self._step.array_r, active)
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 
@@ -294,20 +294,6 @@ def _active_dofs(x: PETSc.Vec, residual: PETSc.Vec, contact: ContactRows) -> int
     on_bound = x.array_r[contact.dofs] <= contact.lower
     active = on_bound & (residual.array_r[contact.dofs] > 0)
     return int(x.getComm().tompi4py().allreduce(int(active.sum())))
-
-
-@contextmanager
-def _defaults(options: dict[str, object]) -> Iterator[None]:
-    """Set options for the time of a block, those the user has set excepted."""
-    database = PETSc.Options(PREFIX)
-    ours = {name: value for name, value in options.items() if not database.hasName(name)}
-    for name, value in ours.items():
-        database.setValue(name, value)
-    try:
-        yield
-    finally:
-        for name in ours:
-            database.delValue(name)
 
 
 def _name(reasons: type, value: int) -> str:

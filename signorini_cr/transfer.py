@@ -22,7 +22,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from . import compat
-from .space import ghosted_vector
+from .space import function_space, ghosted_vector
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
@@ -52,11 +52,15 @@ class Layout:
         return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr)
 
     @classmethod
-    def of_vertices(cls, mesh: Mesh) -> Layout:
-        """P1 without building a space: the nodes of a straight-sided mesh are its vertices."""
+    def of_p1(cls, mesh: Mesh) -> Layout:
+        """P1 without building a space: the nodes of a straight-sided mesh are its vertices.
+
+        On refined meshes those of the coarse mesh come first, which also suits Gauss-Seidel better
+        than the order of a DOLFINx space.
+        """
         if compat.coordinate_map(mesh).degree == 1:
             return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False)
-        return cls.of_space(fem.functionspace(mesh, ("Lagrange", 1)))
+        return cls.of_space(function_space(mesh, "P1"))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -85,7 +89,7 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
 
 
 def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.Mat:
-    """The matrix of the prolongation between two nested meshes, from CR to CR or from P1 to P1.
+    """The matrix of the prolongation between two nested meshes, from CR to CR or from P1 to either.
 
     Args:
         coarse: The coarse dofs.
@@ -94,17 +98,19 @@ def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.M
     """
     weights = parent_weights(coarse, fine, parent_cell)
     corners = fine.cells.shape[1]
-    if not fine.cr:  # one cell tells all
+    if not coarse.cr:  # continuous: one cell tells all
         slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
-        slot[fine.cells.ravel()] = np.arange(fine.cells.size, dtype=np.int32)
+        slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
         slot = slot[: fine.size[0]]
-        values = weights.reshape(-1, corners)[slot % (len(weights) * corners)]
-        columns = coarse.cells[parent_cell[slot // corners]]
-        kept = np.abs(values) > 1e-10
+        values = weights.reshape(-1, corners).take(slot % (len(weights) * corners), axis=0)
+        columns = coarse.cells.take(parent_cell.take(slot // corners), axis=0)
+        if fine.cr:  # few zeros: leave them
+            return _matrix(fine, coarse, np.full(len(slot), corners), columns, values.ravel())
+        kept = values != 0.0
         return _matrix(fine, coarse, kept.sum(axis=1, dtype=np.int32), columns[kept], values[kept])
     repeats = len(parent_cell) // len(weights)
     values = np.tile(weights, (repeats, 1, 1)) / touching_cells(fine)[fine.cells][:, :, None]
-    kept = np.abs(values) > 1e-10
+    kept = values != 0.0
     columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)
     start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
     np.cumsum(kept.sum(axis=2), out=start[1:])
@@ -137,9 +143,16 @@ def prolongate(u: fem.Function, V: fem.FunctionSpace, parent_cell: IntArray) -> 
         values = np.einsum("cij,cj->ci", weights, local[parent_cell])
     else:  # the same pattern in each parent
         values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
-    size = fine.index_map.size_local + fine.index_map.num_ghosts
-    total = np.bincount(fine.cells.ravel(), values.ravel(), minlength=size)
-    return shared_sum(V, total.astype(np.float64, copy=False)) / touching_cells(fine)
+    first = np.zeros(fine.index_map.size_local + fine.index_map.num_ghosts)
+    last = np.zeros_like(first)
+    dofs, values = fine.cells.ravel(), values.ravel()
+    last[dofs] = values
+    first[dofs[::-1].copy()] = values[::-1].copy()  # NumPy walks through a reversed view forwards
+    # A facet has two cells, on one rank or on two; what a P1 dof's cells say is all the same
+    average = 0.5 * (first + last)
+    if V.mesh.comm.size > 1:
+        average = shared_sum(V, average) / shared_sum(V, np.ones_like(average))
+    return average
 
 
 def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
@@ -154,7 +167,9 @@ def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> Float
     d = corners - 1
     if fine.cr:  # facet midpoints
         barycentric = (barycentric.sum(axis=1, keepdims=True) - barycentric) / d
-    return 1.0 - d * barycentric if coarse.cr else barycentric
+    weights = 1.0 - d * barycentric if coarse.cr else barycentric
+    weights[np.abs(weights) < 1e-10] = 0.0
+    return weights
 
 
 def touching_cells(layout: Layout) -> FloatArray:

@@ -94,19 +94,6 @@ def test_p1_in_cr_has_the_p1_stiffness_matrix():
     assert product.norm() < 1e-12
 
 
-def test_vertices_of_the_mesh_serve_as_p1():
-    mesh = CROOKED.mesh(0.3).mesh
-    V = function_space(mesh, "CR")
-    nodes = Layout.of_vertices(mesh)
-    u = fem.Function(V)
-    u.interpolate(affine)
-    matrix = inclusion(nodes, Layout.of_space(V))
-    at_nodes, means = matrix.createVecRight(), matrix.createVecLeft()
-    at_nodes.array = affine(mesh.geometry.x[: nodes.size[0]].T)
-    matrix.mult(at_nodes, means)
-    assert difference(means.array_r, u.x.array[: means.local_size]) < 1e-12
-
-
 def last(problem, domain, levels, **more):
     *_, solution = solve_levels(problem, domain, levels, **more)
     return solution
@@ -229,7 +216,7 @@ def test_the_cycle_is_symmetric_and_keeps_fixed_dofs_out():
     solution = last(exact.S1.problem, exact.S1.mesh(0.25), 3)
     level = Level(solution.level.forms, solution.domain, 2, solution.level.coarser)
     level.parent_cell = solution.level.parent_cell
-    grid, _, _ = level.grids
+    grid = level.grid
     V = level.V
     rows = ContactRows(level.system.A, ghosted_vector(V, level.system.lower))
     for fixed in (rows.dofs[::2], rows.dofs[:0], rows.dofs):

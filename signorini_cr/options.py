@@ -1,0 +1,25 @@
+"""PETSc options: all of ours stand under one prefix, and those the user has set come first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from petsc4py import PETSc
+
+PREFIX = "signorini_"
+"""Prefix of the PETSc options that reach the solver, as in ``-signorini_ksp_rtol 1e-10``."""
+
+
+@contextmanager
+def defaults(options: Mapping[str, object], prefix: str = PREFIX) -> Iterator[None]:
+    """Set options for the time of a block, those the user has set excepted."""
+    database = PETSc.Options(prefix)
+    ours = {name: value for name, value in options.items() if not database.hasName(name)}
+    for name, value in ours.items():
+        database.setValue(name, value)
+    try:
+        yield
+    finally:
+        for name in ours:
+            database.delValue(name)
