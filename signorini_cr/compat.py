@@ -111,6 +111,25 @@ def set_facets(
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(cells, start), tdim - 1, tdim)
 
 
+def compile_expression(
+    expression: Any, points: npt.NDArray[np.float64], mesh: Mesh
+) -> fem.Expression:
+    """Compile an expression for meshes of the same kind as one mesh.
+
+    Newer versions insist that it depends on x, even if all that is left of it is a number.
+
+    Args:
+        expression: Scalar or vector.
+        points: On the reference cell or facet.
+        mesh: The mesh that the expression was written for.
+    """
+    x = ufl.SpatialCoordinate(mesh)
+    nothing = x[0] - x[0]
+    if shape := expression.ufl_shape:
+        nothing = ufl.as_vector([nothing] * shape[0])
+    return fem.Expression(expression + nothing, points, mesh.comm)
+
+
 class FacetExpression:
     """A UFL expression at points of the reference facet.
 
@@ -125,7 +144,7 @@ class FacetExpression:
 
     def __init__(self, expression: Any, points: npt.NDArray[np.float64], mesh: Mesh):
         """Compile the expression."""
-        self._values = fem.Expression(expression, points, mesh.comm)
+        self._values = compile_expression(expression, points, mesh)
         self._where = fem.Expression(ufl.SpatialCoordinate(mesh), points, mesh.comm)
         self._shape = (len(points), -1)
         self._hats = np.column_stack([1.0 - points.sum(axis=1), points])
@@ -154,4 +173,3 @@ class FacetExpression:
         found = self._where.eval(mesh, entities).reshape(shape)
         distance = np.linalg.norm(wanted[:, :, None] - found[:, None, :], axis=-1)
         return np.take_along_axis(values, distance.argmin(axis=2)[:, :, None], axis=1)
-

@@ -13,7 +13,6 @@ import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem
 
 from . import compat
 from .cells import Cells, Side
@@ -64,7 +63,7 @@ class Volume:
         self.number, self.rule, self.expression = number(expression), rule, expression
         self._values = None
         if self.number is None:
-            self._values = fem.Expression(expression, rule.points, forms.mesh.comm)
+            self._values = compat.compile_expression(expression, rule.points, forms.mesh)
 
     def at(self, cells: Cells) -> FloatArray:
         """Values at the quadrature points of owned cells, shape (cells, q)."""

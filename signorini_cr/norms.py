@@ -121,11 +121,7 @@ def facet_values(
     Returns:
         Shape (n, q).
     """
-    x = ufl.SpatialCoordinate(mesh)
-    # A constant is not an expression in x that could be compiled
-    expression = as_expression(data, x) + 0.0 * x[0]
-    if not ufl.domain.extract_domains(expression):
-        return np.full((len(facets), len(points)), float(expression))
+    expression = as_expression(data, ufl.SpatialCoordinate(mesh))
     compiled = compat.FacetExpression(expression, points, mesh)
     return compiled.at(mesh, facet_entities(mesh, facets))[:, :, 0]
 

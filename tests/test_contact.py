@@ -69,9 +69,7 @@ def test_table_runs_along_the_boundary(solution):
 
 def test_closed_curves_and_several_parts():
     hole = Polygon([[-0.2, 0.4], [0.2, 0.4], [0.2, 0.7], [-0.2, 0.7]], ["contact"] * 4)
-    domain = rectangle(
-        0.1, ["contact", "dirichlet", "contact", "dirichlet"], holes=[hole]
-    )
+    domain = rectangle(0.1, ["contact", "dirichlet", "contact", "dirichlet"], holes=[hole])
     contact = solve(Problem(f=-1.0, obstacle=-0.05), domain).contact
     table = contact.table()
     if MPI.COMM_WORLD.rank == 0:
@@ -105,7 +103,8 @@ def test_symmetry_gives_symmetric_facts():
 
 @pytest.mark.parametrize("obstacle", [-5.0, 5.0])
 def test_no_contact_and_all_contact(obstacle):
-    contact = solve(Problem(f=1.0, obstacle=obstacle, dirichlet=max(obstacle, 0.0)), rectangle(0.2)).contact
+    problem = Problem(f=1.0, obstacle=obstacle, dirichlet=max(obstacle, 0.0))
+    contact = solve(problem, rectangle(0.2)).contact
     assert len(contact.transitions) == 0
     if obstacle < 0:
         assert contact.number_active == 0 and abs(contact.force) < 1e-8
