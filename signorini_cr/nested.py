@@ -20,7 +20,7 @@ from . import compat
 from .domain import CONTACT, Domain
 from .solver import ContactRows
 from .space import closure_dofs, facet_entities, facet_measures, ghosted_vector
-from .transfer import barycentric_coordinates, prolongate, shared_sum
+from .transfer import Layout, barycentric_coordinates, prolongate, shared_sum
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,13 @@ def nested_start(
     free[dirichlet] = free[contact.dofs] = False
     movable = free[others] & active[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
-    vector = ghosted_vector(V, x)
+    vector, layout = ghosted_vector(V, x), Layout.of_space(V)
     for _ in range(ROUNDS):
         surplus = contact.times(vector) - b[contact.dofs] - force
         shift = surplus / contact.diagonal * (others.shape[1] - 1) / number
         moves = np.zeros(len(x))
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
-        x += shared_sum(V, moves)
+        x += shared_sum(layout, moves)
     vector.destroy()
 
 

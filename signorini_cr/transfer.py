@@ -22,7 +22,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from . import compat
-from .space import function_space, ghosted_vector
+from .space import function_space
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
@@ -84,8 +84,7 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
         others = [j for j in range(d + 1) if j != i]
         for k, j in enumerate(others):
             columns[cr.cells[:, i], k] = p1.cells[:, j]
-    lengths, values = np.full(owned, d, dtype=np.int32), np.full(owned * d, 1.0 / d)
-    return _matrix(cr, p1, lengths, columns[:owned], values)
+    return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d))
 
 
 def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.Mat:
@@ -105,7 +104,7 @@ def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.M
         values = weights.reshape(-1, corners).take(slot % (len(weights) * corners), axis=0)
         columns = coarse.cells.take(parent_cell.take(slot // corners), axis=0)
         if fine.cr:  # few zeros: leave them
-            return _matrix(fine, coarse, np.full(len(slot), corners), columns, values.ravel())
+            return _matrix(fine, coarse, corners, columns, values.ravel())
         kept = values != 0.0
         return _matrix(fine, coarse, kept.sum(axis=1, dtype=np.int32), columns[kept], values[kept])
     repeats = len(parent_cell) // len(weights)
@@ -143,16 +142,10 @@ def prolongate(u: fem.Function, V: fem.FunctionSpace, parent_cell: IntArray) -> 
         values = np.einsum("cij,cj->ci", weights, local[parent_cell])
     else:  # the same pattern in each parent
         values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
-    first = np.zeros(fine.index_map.size_local + fine.index_map.num_ghosts)
-    last = np.zeros_like(first)
-    dofs, values = fine.cells.ravel(), values.ravel()
-    last[dofs] = values
-    first[dofs[::-1].copy()] = values[::-1].copy()  # NumPy walks through a reversed view forwards
-    # A facet has two cells, on one rank or on two; what a P1 dof's cells say is all the same
-    average = 0.5 * (first + last)
-    if V.mesh.comm.size > 1:
-        average = shared_sum(V, average) / shared_sum(V, np.ones_like(average))
-    return average
+    values = values.ravel()
+    total = shared_sum(fine, _sums(fine, values))
+    values[:] = 1.0
+    return total / shared_sum(fine, _sums(fine, values))
 
 
 def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
@@ -174,15 +167,18 @@ def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> Float
 
 def touching_cells(layout: Layout) -> FloatArray:
     """The number of cells that touch each local dof, over all ranks."""
-    size = layout.index_map.size_local + layout.index_map.num_ghosts
-    count = np.bincount(layout.cells.ravel(), minlength=size).astype(np.float64)
-    if layout.mesh.comm.size == 1:
-        return count
-    vector = PETSc.Vec().createGhostWithArray(
-        layout.index_map.ghosts.astype(PETSc.IntType), count, layout.size, comm=layout.mesh.comm
-    )
-    _add_ghosts(vector)
-    return count
+    return shared_sum(layout, _sums(layout, np.ones(layout.cells.size)))
+
+
+def _sums(layout: Layout, values: FloatArray) -> FloatArray:
+    """Sum of what the local cells have for each local dof; PETSc's loop needs no copies."""
+    result = np.zeros(layout.index_map.size_local + layout.index_map.num_ghosts)
+    vector = PETSc.Vec().createWithArray(result, comm=PETSc.COMM_SELF)
+    dofs = layout.cells.ravel().astype(PETSc.IntType, copy=False)
+    vector.setValues(dofs, values, PETSc.InsertMode.ADD_VALUES)
+    vector.assemble()
+    vector.destroy()
+    return result
 
 
 def _barycentric(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
@@ -225,25 +221,28 @@ def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatA
 
 
 def _matrix(
-    rows: Layout, columns: Layout, lengths: IntArray, dofs: IntArray, values: FloatArray
+    rows: Layout, columns: Layout, lengths: IntArray | int, dofs: IntArray, values: FloatArray
 ) -> PETSc.Mat:
     """A matrix from the owned rows' entries, one row after the other; columns as local dofs."""
-    start = np.zeros(len(lengths) + 1, dtype=PETSc.IntType)
-    np.cumsum(lengths, out=start[1:])
+    owned = rows.size[0]
+    if isinstance(lengths, int):
+        start = np.arange(0, (owned + 1) * lengths, lengths, dtype=PETSc.IntType)
+    else:
+        start = np.zeros(owned + 1, dtype=PETSc.IntType)
+        np.cumsum(lengths, out=start[1:])
     csr = start, columns.numbers(dofs.ravel()).astype(PETSc.IntType, copy=False), values
     matrix = PETSc.Mat().createAIJ((rows.size, columns.size), csr=csr, comm=rows.mesh.comm)
     matrix.assemble()
     return matrix
 
 
-def shared_sum(V: fem.FunctionSpace, array: FloatArray) -> FloatArray:
+def shared_sum(layout: Layout, array: FloatArray) -> FloatArray:
     """Sum up, in place, what the ranks have for each shared dof."""
-    if V.mesh.comm.size > 1:
-        _add_ghosts(ghosted_vector(V, array))
+    comm = layout.mesh.comm
+    if comm.size > 1:
+        ghosts = layout.index_map.ghosts.astype(PETSc.IntType)
+        vector = PETSc.Vec().createGhostWithArray(ghosts, array, layout.size, comm=comm)
+        vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        vector.destroy()
     return array
-
-
-def _add_ghosts(vector: PETSc.Vec) -> None:
-    vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
-    vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-    vector.destroy()
