@@ -63,7 +63,7 @@ class Grid:
             sweeps: Number of symmetric Gauss-Seidel sweeps before and after.
             on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
         """
-        self.meshes = (coarser.meshes if coarser else 0) + (not on_same_mesh)
+        self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
         self._sweeps = sweeps
         self.matrix, self.coarser = matrix, coarser
         self.masked = matrix.duplicate(copy=True)
