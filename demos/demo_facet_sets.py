@@ -15,9 +15,7 @@
 
 # %%
 import numpy as np
-from study import COLOURS, MARKERS, Study, levels_wanted, solutions
-
-from signorini_cr import exact, theory
+from study import COLOURS, MARKERS, Study, levels_wanted, run
 
 study = Study("demo_facet_sets", "The facet sets (2.2) against the discrete active set")
 levels = levels_wanted(8)
@@ -34,13 +32,10 @@ cases = [
 # ## Solve and judge
 
 # %%
-judged = {}
-for name, family in cases:
-    example = exact.ALL[name]
-    judged[name, family] = [
-        (solution.h, theory.judge(solution, example))
-        for solution in solutions(example, "CR", family, levels)
-    ]
+judged = {
+    (name, family): [(row.h, row.judgement) for row in run(name, family=family, levels=levels)]
+    for name, family in cases
+}
 
 # %% [markdown]
 # ## Tables

@@ -19,7 +19,7 @@ import numpy as np
 from dolfinx.mesh import Mesh, entities_to_geometry
 from mpi4py import MPI
 
-from signorini_cr import canvas, exact, norms, solve, solve_levels
+from signorini_cr import canvas, exact, norms, solve, solve_levels, theory
 from signorini_cr.errors import on_root
 from signorini_cr.exact import Example
 from signorini_cr.levels import Solution
@@ -65,6 +65,7 @@ class Row:
     newton: int
     active: int
     facets: int
+    judgement: theory.Judgement | None
 
 
 def levels_wanted(default: int) -> int:
@@ -126,6 +127,7 @@ def run(
                 solution.iterations.newton,
                 solution.contact.number_active,
                 solution.contact.number,
+                None if example.pressure is None else theory.judge(solution, example),
             )
         )
         before = solution
