@@ -8,6 +8,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import DiagonalType, create_rectangle, locate_entities_boundary, meshtags
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from signorini_cr import Domain, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.cells import Cells
@@ -268,6 +269,23 @@ def test_unfinished_solve_is_still_bounded(noise):
         assert after.parts["solver"] > before.parts["solver"]
         if example.energy is not None:
             assert after.energy[0] <= example.energy <= after.energy[1]
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-4, 1e-2, 1.0])
+@pytest.mark.parametrize("levels", [1, 4])
+def test_loose_tolerance(tolerance, levels):
+    """The solver itself stops early, down to not starting at all."""
+    options = PETSc.Options("signorini_")
+    options["snes_atol"], options["ksp_rtol"] = tolerance, 0.3
+    try:
+        domain = exact.S1.structured(32 if levels == 1 else 4)
+        *_, solution = solve_levels(exact.S1.problem, domain, levels)
+    finally:
+        for name in ("snes_atol", "ksp_rtol"):
+            options.delValue(name)
+    certificate = solution.certificate
+    assert solution.errors[0] <= certificate.bound_h1 <= 4 * solution.errors[0]
+    assert certificate.energy[0] <= exact.S1.energy <= certificate.energy[1]
 
 
 def test_smooth_residual_is_bounded_without_a_hierarchy():
