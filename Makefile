@@ -4,10 +4,14 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo test lint types clean purge
+.PHONY: demo studies test lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
+
+# docs/studies.md with all its tables and pictures
+studies:
+	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 demos docs
 
 test:
 	$(run) $(limit) python3 -m pytest
