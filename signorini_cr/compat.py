@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import basix
@@ -10,19 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import cpp, fem
-from dolfinx.mesh import CellType, GhostMode, Mesh, create_cell_partitioner
+from dolfinx.mesh import CellType, Mesh
 from mpi4py import MPI
 
 IntArray = npt.NDArray[np.int32]
 _TAG = 1998
-
-
-def unghosted_partitioner() -> Callable:
-    """DOLFINx's partitioner for meshes whose ranks see their own cells only."""
-    try:
-        return create_cell_partitioner(GhostMode.none)
-    except TypeError:  # a second argument since 0.10: how many cells meet in a facet
-        return create_cell_partitioner(GhostMode.none, 2)
 
 
 def cell_nodes(mesh: Mesh) -> IntArray:

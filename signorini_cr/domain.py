@@ -27,9 +27,10 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from signorini_cr import gmshmesh
-from signorini_cr.compat import coordinate_map, unghosted_partitioner
+from signorini_cr.compat import coordinate_map
 from signorini_cr.errors import InputError, on_root, raise_together
 from signorini_cr.loops import check_labels, check_loops, coordinates
+from signorini_cr.partition import by_position
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
@@ -240,7 +241,11 @@ def _distribute(
         )
     element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
     mesh = create_mesh(
-        comm, cells=raw.triangles, x=raw.points, e=element, partitioner=unghosted_partitioner()
+        comm,
+        cells=raw.triangles,
+        x=raw.points,
+        e=element,
+        partitioner=by_position(raw.points, raw.triangles),
     )
     exterior = _exterior(mesh)
     ends, labels = distribute_entity_data(mesh, 1, raw.facets, raw.labels)

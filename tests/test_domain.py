@@ -8,18 +8,24 @@ import dolfinx.mesh
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
+from dolfinx import cpp, fem
 from mpi4py import MPI
 
-from signorini_cr.compat import unghosted_partitioner
 from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
+from signorini_cr.partition import bisect
 
 COMM = MPI.COMM_WORLD
 MESHES = Path(__file__).parent.parent / "meshes"
 RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
 LABELS = ["contact", "dirichlet", "neumann", "dirichlet"]
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
+
+
+def stay(comm, parts, kinds, corners):
+    """A partitioner that leaves every triangle where it is."""
+    ranks = np.full((corners[0].size // 3, 1), comm.rank, dtype=np.int32)
+    return cpp.graph.AdjacencyList_int32(ranks)
 
 
 def integral(form: ufl.Form, comm: MPI.Comm = COMM) -> float:
@@ -165,6 +171,28 @@ def test_the_same_polygon_gives_the_same_mesh():
     a, b = (polygon.mesh(0.2, MPI.COMM_SELF).mesh.geometry.x for _ in range(2))
     assert np.array_equal(a, b)
     assert len(set(COMM.allgather(a.tobytes()))) == 1
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3, 1.0])
+def test_every_rank_gets_its_share(size: float):
+    cells = Polygon(RECTANGLE, LABELS).mesh(size).mesh.topology.index_map(2)
+    fair = cells.size_global / COMM.size
+    assert abs(cells.size_local - fair) < 2 + np.log2(COMM.size)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 4, 7, 12])
+def test_parts_are_even_and_compact(parts: int):
+    points = np.stack(np.meshgrid(np.arange(24.0), np.arange(12.0)), axis=-1).reshape(-1, 2)
+    part = bisect(points, parts)
+    sizes = np.bincount(part, minlength=parts)
+    assert len(sizes) == parts
+    assert np.ptp(sizes) <= 2
+    extents = [np.ptp(points[part == i], axis=0) + 1 for i in range(parts)]
+    assert sum(extent.prod() for extent in extents) <= 1.5 * len(points)
+
+
+def test_more_parts_than_points():
+    assert sorted(bisect(np.eye(3), 8)) == sorted(set(bisect(np.eye(3), 8)))
 
 
 @pytest.mark.parametrize(
@@ -465,7 +493,7 @@ def test_own_surfaces_in_space():
         cells=np.arange(3 if root else 0, dtype=np.int64).reshape(-1, 3),
         x=x if root else x[:0],
         e=basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)),
-        partitioner=unghosted_partitioner(),
+        partitioner=stay,
     )
     mesh.topology.create_entities(1)
     tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
