@@ -12,6 +12,7 @@ RUN apt-get update \
 ENV OMP_NUM_THREADS=1 \
     MPLBACKEND=Agg \
     OMPI_MCA_btl=self,sm \
+    OMPI_MCA_mpi_yield_when_idle=1 \
     PRTE_MCA_rmaps_default_mapping_policy=:oversubscribe \
     PYTHONPATH=/opt/signorini_cr \
     PATH=/opt/signorini_cr/container/bin:$PATH \
