@@ -20,8 +20,9 @@ from dolfinx import fem
 from . import compat
 from .cells import Cells, sum_rows
 from .companion import Companion, companion, on_facet
+from .domain import CONTACT
 from .flux import equilibrate, unbalanced
-from .gap import Sums, integrate
+from .gap import Sums, integrate, integrate_edge
 from .loads import Load
 from .moments import Coefficient, Data
 
@@ -146,16 +147,19 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
     flux = equilibrate(cells, kappa.mean, w, load, edge)
     v = companion(cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, sweeps)
     sums = integrate(cells, kappa, w, load, flux, v)
+    assert sums.indicators is not None
+    np.add.at(sums.indicators, cells.sides[CONTACT].cells, v.contact)
+    edge_square = integrate_edge(cells, kappa, w, load, edge, flux, v, sums)
     lift, lift_energy = _lifted(cells, kappa, load, v, sums)
     on_edge = on_facet(cells, edge.side, edge.g, v.vertices, v.bumps)
     edge_energy = edge.measure @ (edge.g.weights @ (edge.values * on_edge))
     total = dict(zip(_TOTALS, cells.total(*(getattr(sums, name) for name in _TOTALS)), strict=True))
     contact, edge_square, edge_energy, lift, lift_energy = cells.total(
-        np.sum(v.contact), edge.oscillation(kappa.low), edge_energy, lift, lift_energy
+        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy
     )
-    lift, edge_norm = np.sqrt(lift), np.sqrt(edge_square)
+    lift = np.sqrt(lift)
     left = unbalanced(level, cells, flux.left, kappa.low)
-    loose = edge_norm + left
+    loose = np.sqrt(edge_square) + left
     same = total["flux"] + total["companion"] + total["load"]
     same += 2 * (total["load_flux"] + total["slack"])
     mixed = 2 * (total["cross"] + total["load_companion"])
@@ -180,7 +184,7 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
             "companion": float(np.sqrt(total["companion"])),
             "contact": float(np.sqrt(contact)),
             "load": float(np.sqrt(total["load"])),
-            "neumann": float(edge_norm),
+            "neumann": float(np.sqrt(total["neumann"])),
             "boundary": float(lift),
             "solver": float(left),
         },
@@ -199,6 +203,7 @@ _TOTALS = (
     "load_companion",
     "slack",
     "energy",
+    "neumann",
 )
 
 
@@ -223,5 +228,7 @@ def _lifted(
         f = np.hypot(f, np.sqrt(load.variance[which]))
     assert sums.steepness is not None
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
+    assert sums.indicators is not None
+    sums.indicators[which] += steep**2
     change = before * steep + 0.5 * steep**2 + np.sqrt(cells.volume[which]) * f * area
     return float(np.sum(steep**2)), float(np.sum(change))

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .cells import Cells, blocks, dot_rows, pick, poincare, sum_rows
-from .companion import Companion, bump_squares
+from .cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
+from .companion import Companion, bump_squares, on_facet
 from .flux import Flux, field_squares
-from .loads import Load
+from .loads import Edge, Load
 from .moments import Coefficient
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,6 +37,7 @@ class Sums:
         load_companion: ∫ κ^{-1/2}σ·b.
         slack: How far load_flux may be from the truth.
         energy: ½∫ κ|∇v|² − ∫ f v.
+        neumann: The part of load that comes from g alone.
         indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).
         steepness: ∫_T κ|∇v|², shape (cells,).
     """
@@ -49,6 +50,7 @@ class Sums:
     load_companion: float = 0.0
     slack: float = 0.0
     energy: float = 0.0
+    neumann: float = 0.0
     indicators: FloatArray | None = None
     steepness: FloatArray | None = None
 
@@ -110,6 +112,66 @@ def integrate(
         sums.energy += float(np.sum(0.5 * vv - volume * fv))
         sums.indicators[part], sums.steepness[part] = indicators, vv
     return sums
+
+
+def integrate_edge(
+    cells: Cells,
+    kappa: Coefficient,
+    w: FloatArray,
+    load: Load,
+    edge: Edge,
+    flux: Flux,
+    v: Companion,
+    sums: Sums,
+) -> float:
+    """Add what g has beyond its means on Γg.
+
+    σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
+    Where κ varies within cells, y − κ∇u_h is no gradient, and the norm is returned instead.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        load: Moments of f.
+        edge: Values of g.
+        flux: y.
+        v: v.
+        sums: What to add to.
+
+    Returns:
+        This rank's share of the square of what goes into ω.
+    """
+    side, d = edge.side, cells.tdim
+    at, sizes = edge.oscillation()
+    low = pick(kappa.low, at)
+    assert sums.indicators is not None
+    sums.indicators[at] += sizes**2 / low
+    sums.neumann = float(np.sum(sizes**2 / low))
+    if kappa.values is not None or d != 2:
+        return sums.neumann
+    of_f = np.zeros(len(at))
+    if load.variance is not None:
+        square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
+        of_f = poincare(d) * np.sqrt(square)
+    sums.load += float(np.sum((2.0 * of_f * sizes + sizes**2) / low))
+    ends = cells.others[side.local].T, side.cells
+    weights = edge.measure * edge.g.weights[:, None] * edge.rest
+    jump = on_facet(cells, side, edge.g, v.vertices, v.bumps) - edge.g.hats @ w[ends]
+    sums.load_companion += float(np.sum(weights * jump))
+    # The potential of y − κ_T∇u_h, as in _against_potential
+    P = flux.excess[:, side.cells]
+    s = sum_rows(P)
+    a = P - s / (d + 1)
+    apex, base = corner_points(cells, side)
+    middle = (apex + base.sum(axis=0)) / (d + 1)
+    pull = a[side.local, np.arange(len(s))][:, None] * (apex - middle)
+    pull += np.einsum("in,ink->nk", a[ends[0], np.arange(len(s))], base - middle)
+    x = np.einsum("qi,ink->qnk", edge.g.hats, base) - middle
+    potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
+    potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
+    sums.load_flux += float(np.sum(weights * potential))
+    return 0.0
 
 
 def _exact(

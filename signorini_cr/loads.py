@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from .cells import Cells, blocks, measures, pick, poincare
+from .cells import Cells, blocks, measures, poincare
 from .domain import NEUMANN
 from .moments import Trace, Volume
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
 
 
 class Load:
@@ -97,21 +98,22 @@ class Edge:
             out[j, at] -= d * share
         return out
 
-    def oscillation(self, kappa_low: FloatArray) -> float:
-        """Σ_T (Σ_F c_F ‖g − g_F‖_F)²/κ with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, this rank's share."""
-        cells, g, side = self._cells, self.g, self.side
-        if not len(side.cells):
-            return 0.0
-        mean = g.weights @ self.values
-        variance = g.weights @ (self.values - mean) ** 2
-        at, d = side.cells, cells.tdim
-        h = np.sqrt(cells.diameter2[at])
+    @property
+    def rest(self) -> FloatArray:
+        """What g has beyond its mean, at the quadrature points, shape (q, n)."""
+        return self.values - self.g.weights @ self.values
+
+    def oscillation(self) -> tuple[IntArray, FloatArray]:
+        """Cells at Γg and Σ_F c_F ‖g − g_F‖_F for each, where ‖e − e_T‖_F ≤ c_F ‖∇e‖_T."""
+        cells, side, d = self._cells, self.side, self._cells.tdim
+        at, place = np.unique(side.cells, return_inverse=True)
+        h = np.sqrt(cells.diameter2[side.cells])
         # |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F
         c = poincare(d) * h
-        trace = self.measure / cells.volume[at] * c * (c + 2.0 * h / d)
-        which, place = np.unique(at, return_inverse=True)
-        sizes = np.bincount(place, np.sqrt(trace * self.measure * variance))
-        return float(np.sum(sizes**2 / pick(kappa_low, which)))
+        trace = self.measure / cells.volume[side.cells] * c * (c + 2.0 * h / d)
+        norms = np.sqrt(trace * self.measure * (self.g.weights @ self.rest**2))
+        sizes: FloatArray = np.bincount(place, norms, minlength=len(at)).astype(np.float64)
+        return at, sizes
 
 
 def chi(load: Load, edge: Edge, cells: Cells) -> FloatArray:
