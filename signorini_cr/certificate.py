@@ -110,7 +110,11 @@ class Certificate:
 
 @dataclass(frozen=True)
 class _Made:
-    """What y and v are made of; the cells' geometry is made again when it is needed."""
+    """What y and v are made of; the cells' geometry is made again when it is needed.
+
+    κ is given by its means; whether it varies within cells is told. force is this rank's share of
+    ∫_Γ1 y·n, reach the radius of the ball around (y + κ∇v)/2 that has κ∇u in it, loose ends added.
+    """
 
     level: Level
     u: FloatArray
@@ -118,6 +122,9 @@ class _Made:
     excess: FloatArray
     vertices: FloatArray
     bumps: FloatArray
+    varies: bool
+    force: float
+    reach: float
 
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
@@ -190,7 +197,17 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
         },
         indicators=sums.indicators,
         seconds=time.perf_counter() - began,
-        _made=_Made(level, u.x.array.copy(), kappa.mean, flux.excess, v.vertices, v.bumps),
+        _made=_Made(
+            level=level,
+            u=u.x.array.copy(),
+            kappa=kappa.mean,
+            varies=any(cells.comm.allgather(kappa.values is not None)),
+            excess=flux.excess,
+            vertices=v.vertices,
+            bumps=v.bumps,
+            force=float(flux.contact.sum()),
+            reach=float(bound - near / 2 + loose + lift / 2),
+        ),
     )
 
 

@@ -10,10 +10,11 @@ from dolfinx.mesh import DiagonalType, create_rectangle, locate_entities_boundar
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import Domain, Polygon, Problem, exact, solve, solve_levels
+from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.cells import Cells
 from signorini_cr.certificate import certify
 from signorini_cr.flux import unbalanced
+from signorini_cr.force import force_bounds
 from signorini_cr.ranges import range_of
 
 WORLD = MPI.COMM_WORLD
@@ -318,6 +319,26 @@ def test_residual_functional_is_bounded():
             work = abs(WORLD.allreduce(left @ means))
             norm = np.sqrt(integral(ufl.inner(ufl.grad(e), ufl.grad(e)), mesh))
             assert all(work <= bound * norm for bound in bounds)
+
+
+# ---- the contact force
+
+
+def test_force_is_bracketed():
+    """λ = |x|³ on the left half of Γ1: the force is ¼. The bracket shrinks like h."""
+    polygon = Polygon(exact.RECTANGLE.vertices, ["contact", "neumann", "dirichlet", "neumann"])
+    widths = []
+    for solution in solve_levels(Problem(exact=exact.A.problem.exact), polygon.mesh(0.3), 4):
+        low, high = force_bounds(solution)
+        assert low <= 0.25 <= high
+        assert low <= solution.contact.force <= high
+        widths.append(high - low)
+    assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
+
+
+def test_force_needs_distance():
+    with pytest.raises(InputError, match="Γ1 touches Γ0"):
+        force_bounds(solve(exact.S1.problem, exact.S1.structured(6)))
 
 
 # ---- ranks, refusals
