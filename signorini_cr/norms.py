@@ -93,7 +93,7 @@ def cell_gradients(u: fem.Function) -> tuple[FloatArray, FloatArray]:
     tdim, gdim = mesh.topology.dim, mesh.geometry.dim
     cells = slice(mesh.topology.index_map(tdim).size_local)
     values = vertex_values(u, cells)
-    x = mesh.geometry.x[mesh.geometry.dofmap[cells], :gdim]
+    x = mesh.geometry.x[compat.cell_nodes(mesh)[cells], :gdim]
     edges = x[:, 1:] - x[:, :1]
     rises = (values[:, 1:] - values[:, :1])[..., None]
     volumes = np.abs(np.linalg.det(edges)) / np.prod(np.arange(1, tdim + 1))

@@ -66,6 +66,16 @@ def is_picture(path):
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("name", ["demo_adaptive", "demo_certificate", "demo_theorem_31"])
+def test_demos_on_their_own(name, ranks, tmp_path):
+    result = run(ranks, DEMOS / f"{name}.py", tmp_path, levels=4)
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
+    pictures = list(tmp_path.glob("*.png"))
+    assert pictures and all(is_picture(path) for path in pictures)
+
+
+@pytest.mark.serial
 def test_demos_are_notebooks_too():
     """In py:percent format: cells of Markdown and of code, the aim first."""
     for path in DEMOS.glob("demo_*.py"):

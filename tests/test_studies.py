@@ -8,6 +8,7 @@ from mpi4py import MPI
 from scipy.optimize import lsq_linear
 
 from signorini_cr import Problem, exact, norms, solve, solve_levels
+from signorini_cr.compat import cell_nodes
 from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 
 COMM = MPI.COMM_WORLD
@@ -40,7 +41,7 @@ def dense(domain, load, obstacle, dirichlet):
     """
     mesh = domain.mesh
     c2f = mesh.topology.connectivity(2, 1).array.reshape(-1, 3)
-    x = mesh.geometry.x[mesh.geometry.dofmap, :2]
+    x = mesh.geometry.x[cell_nodes(mesh), :2]
     barycentric = np.linalg.inv(np.concatenate([np.ones((len(x), 3, 1)), x], axis=2))
     gradients = -2.0 * np.moveaxis(barycentric[:, 1:], 1, 2)  # (cells, i, component)
     area = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / 2
