@@ -84,7 +84,7 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
         others = [j for j in range(d + 1) if j != i]
         for k, j in enumerate(others):
             columns[cr.cells[:, i], k] = p1.cells[:, j]
-    return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d))
+    return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d), ordered=True)
 
 
 def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.Mat:
@@ -221,9 +221,23 @@ def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatA
 
 
 def _matrix(
-    rows: Layout, columns: Layout, lengths: IntArray | int, dofs: IntArray, values: FloatArray
+    rows: Layout,
+    columns: Layout,
+    lengths: IntArray | int,
+    dofs: IntArray,
+    values: FloatArray,
+    ordered: bool = False,
 ) -> PETSc.Mat:
-    """A matrix from the owned rows' entries, one row after the other; columns as local dofs."""
+    """A matrix from the owned rows' entries, one row after the other; columns as local dofs.
+
+    Args:
+        rows: Its rows.
+        columns: Its columns.
+        lengths: Number of entries of each row.
+        dofs: Their columns.
+        values: The entries.
+        ordered: Whether columns have to ascend, as products with other matrices ask for.
+    """
     owned = rows.size[0]
     if isinstance(lengths, int):
         start = np.arange(0, (owned + 1) * lengths, lengths, dtype=PETSc.IntType)
@@ -231,7 +245,11 @@ def _matrix(
         start = np.zeros(owned + 1, dtype=PETSc.IntType)
         np.cumsum(lengths, out=start[1:])
     csr = start, columns.numbers(dofs.ravel()).astype(PETSc.IntType, copy=False), values
-    matrix = PETSc.Mat().createAIJ((rows.size, columns.size), csr=csr, comm=rows.mesh.comm)
+    size, comm = (rows.size, columns.size), rows.mesh.comm
+    if ordered or comm.size > 1:
+        matrix = PETSc.Mat().createAIJ(size, csr=csr, comm=comm)
+    else:  # enough for products with vectors, and takes the arrays as they are
+        matrix = PETSc.Mat().createAIJWithArrays(size, csr, comm=comm)
     matrix.assemble()
     return matrix
 

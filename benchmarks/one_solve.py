@@ -1,0 +1,326 @@
+"""What a variational inequality costs in units of one linear solve with the same matrix.
+
+    container/run python3 benchmarks/one_solve.py
+    container/run mpirun -n 2 python3 benchmarks/one_solve.py
+
+Each case is solved on a sequence of nested meshes, several times over. On each mesh, right after
+the variational inequality, one linear system with the same matrix and right-hand side is solved by
+CG and BoomerAMG with PETSc's defaults to rtol 1e-8, set-up included, and one product is timed.
+Times are medians over the repetitions, the quotients medians of those of each repetition, memory is
+the largest ever held until the variational inequality on that mesh was solved.
+
+Every run adds its file to the folder of results; the table and the picture are made of all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import gc
+import resource
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import petsc4py
+
+petsc4py.init(["one_solve", "-options_left", "no"])
+
+import ufl  # noqa: E402
+from mpi4py import MPI  # noqa: E402
+from petsc4py import PETSc  # noqa: E402
+
+from signorini_cr import Polygon, Problem, exact, solve_levels  # noqa: E402
+from signorini_cr.domain import Domain  # noqa: E402
+from signorini_cr.levels import Solution  # noqa: E402
+from signorini_cr.space import ghosted_vector  # noqa: E402
+
+comm = MPI.COMM_WORLD
+
+COARSEST = 23
+"""Squares per unit length on the coarsest mesh: 0.05, 0.2, 0.8, 3.3, 13 M dofs on the third on."""
+
+CROOKED = Polygon(
+    [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],
+    ["contact", "contact", "dirichlet", "neumann", "dirichlet"],
+    holes=[Polygon([[1, 0.5], [1.7, 0.4], [1.3, 0.9]], ["contact", "neumann", "dirichlet"])],
+)
+PUSHED = Problem(
+    f=lambda x: 3 * ufl.sin(5 * x[0]), g=lambda x: x[1], dirichlet=lambda x: 0.5 + x[1]
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One mesh of one case. Times in seconds, medians; shares of the mesh's own total.
+
+    Attributes:
+        case: The problem and the kind of mesh.
+        ranks: Number of processes.
+        dofs: Degrees of freedom.
+        newton: Newton steps on this mesh.
+        cg: CG steps on this mesh.
+        vi: Time of the variational inequality on this mesh.
+        all_levels: The same, with all coarser meshes.
+        linear: Time of one linear solve.
+        linear_cg: Its CG steps.
+        product: Time of one product with the matrix.
+        finest_ratio: vi / linear.
+        all_ratio: all_levels / linear.
+        mesh: Time for refinement, on this mesh.
+        assemble: Time for assembly.
+        estimate: Time for what is computed from the solution.
+        bytes: Peak memory a dof, everything included; not a number where an earlier case took more.
+    """
+
+    case: str
+    ranks: int
+    dofs: int
+    newton: int
+    cg: int
+    vi: float
+    all_levels: float
+    linear: float
+    linear_cg: int
+    product: float
+    finest_ratio: float
+    all_ratio: float
+    mesh: float
+    assemble: float
+    estimate: float
+    bytes: float
+
+
+def cases() -> dict[str, tuple[Problem, Callable[[], Domain]]]:
+    """Problems and coarsest meshes by name."""
+    result: dict[str, tuple[Problem, Callable[[], Domain]]] = {}
+    for name, example in (
+        ("S1", exact.S1),
+        ("A", exact.A),
+        ("C 7/2", exact.root(3.5)),
+        ("C 11/2", exact.root(5.5)),
+    ):
+        for kind, shift in (("", 0.0), (" mapped", 0.31)):
+            result[name + kind] = (
+                example.problem,
+                lambda example=example, shift=shift: example.structured(COARSEST, shift=shift),
+            )
+    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(1.6 / COARSEST))
+    return result
+
+
+def peak() -> int:
+    """Peak memory of this run in bytes, over all ranks (Linux)."""
+    return int(comm.allreduce(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Wall time of the slowest rank."""
+    comm.barrier()
+    began = time.perf_counter()
+    action()
+    return float(comm.allreduce(time.perf_counter() - began, op=MPI.MAX))
+
+
+def linear_solve(A: PETSc.Mat, b: PETSc.Vec) -> tuple[float, int]:
+    """Time and steps of CG + BoomerAMG with PETSc's defaults, rtol 1e-8, set-up included."""
+    x, steps = b.duplicate(), 0
+
+    def action() -> None:
+        nonlocal steps
+        ksp = PETSc.KSP().create(A.getComm())
+        ksp.setOperators(A)
+        ksp.setType("cg")
+        ksp.getPC().setType("hypre")
+        ksp.setTolerances(rtol=1e-8)
+        ksp.solve(b, x)
+        steps = ksp.getIterationNumber()
+        ksp.destroy()
+
+    seconds = timed(action)
+    x.destroy()
+    return seconds, steps
+
+
+def product(A: PETSc.Mat) -> float:
+    """Time of one product, the median of several."""
+    x, y = A.createVecs()
+    x.set(1.0)
+    seconds = median(timed(lambda: A.mult(x, y)) for _ in range(7))
+    x.destroy()
+    y.destroy()
+    return seconds
+
+
+def facts(solution: Solution) -> dict[str, float]:
+    """What one mesh shows in one repetition."""
+    memory = peak()
+    system = solution.level.system
+    b = ghosted_vector(solution.level.V, system.b.x.array)
+    linear, linear_cg = linear_solve(system.A, b)
+    b.destroy()
+    times = {name: comm.allreduce(value, op=MPI.MAX) for name, value in solution.seconds.items()}
+    return {
+        "dofs": solution.dofs,
+        "newton": solution.iterations.newton,
+        "cg": solution.iterations.linear,
+        "vi": times["solve"],
+        "linear": linear,
+        "linear_cg": linear_cg,
+        "product": product(system.A),
+        "mesh": times["mesh"],
+        "assemble": times["assemble"],
+        "estimate": times["estimate"],
+        "memory": memory,
+    }
+
+
+def measure(name: str, dofs: float, repeats: int) -> Iterator[Row]:
+    """Solve one case several times over."""
+    problem, domain = cases()[name]
+    before = peak()
+    runs: list[list[dict[str, float]]] = []
+    for _ in range(repeats):
+        run: list[dict[str, float]] = []
+        for solution in solve_levels(problem, domain(), 99):
+            run.append(facts(solution))
+            if 4 * solution.dofs > 1.1 * dofs:
+                break
+        del solution
+        gc.collect()
+        PETSc.garbage_cleanup(comm)
+        runs.append(run)
+    for level in range(len(runs[0])):
+        sums = [sum(row["vi"] for row in run[: level + 1]) for run in runs]
+        at = {key: [run[level][key] for run in runs] for key in runs[0][level]}
+        middle = {key: median(values) for key, values in at.items()}
+        yield Row(
+            case=name,
+            ranks=comm.size,
+            dofs=int(middle["dofs"]),
+            newton=int(max(at["newton"])),
+            cg=int(max(at["cg"])),
+            vi=middle["vi"],
+            all_levels=median(sums),
+            linear=middle["linear"],
+            linear_cg=int(middle["linear_cg"]),
+            product=middle["product"],
+            finest_ratio=median(v / s for v, s in zip(at["vi"], at["linear"], strict=True)),
+            all_ratio=median(v / s for v, s in zip(sums, at["linear"], strict=True)),
+            mesh=middle["mesh"],
+            assemble=middle["assemble"],
+            estimate=middle["estimate"],
+            bytes=at["memory"][0] / middle["dofs"] if at["memory"][0] > before else np.nan,
+        )
+
+
+KINDS = {"str": str, "int": int, "float": float}
+COLUMNS = {
+    "case": lambda r: r.case,
+    "ranks": lambda r: f"{r.ranks}",
+    "dofs": lambda r: f"{r.dofs / 1e6:.2f} M",
+    "Newton": lambda r: f"{r.newton}",
+    "CG": lambda r: f"{r.cg}",
+    "VI / linear solve": lambda r: f"{r.finest_ratio:.2f}",
+    "all meshes / linear solve": lambda r: f"**{r.all_ratio:.2f}**",
+    "VI, products": lambda r: f"{r.vi / r.product:.0f}",
+    "linear solve, products": lambda r: f"{r.linear / r.product:.0f}",
+    "VI, µs a dof": lambda r: f"{1e6 * r.vi / r.dofs:.2f}",
+    "linear solve, µs a dof": lambda r: f"{1e6 * r.linear / r.dofs:.2f}",
+    "mesh": lambda r: share(r, r.mesh),
+    "assembly": lambda r: share(r, r.assemble),
+    "VI": lambda r: share(r, r.vi),
+    "facts": lambda r: share(r, r.estimate),
+    "kB a dof": lambda r: f"{r.bytes / 1e3:.2f}" if r.bytes == r.bytes else "–",
+}
+
+
+def share(row: Row, seconds: float) -> str:
+    """A phase's part of the time spent on one mesh."""
+    return f"{100 * seconds / (row.mesh + row.assemble + row.vi + row.estimate):.0f} %"
+
+
+def table(rows: list[Row]) -> str:
+    """The results in Markdown."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|---|" + "---:|" * (len(COLUMNS) - 1)]
+    lines += ["| " + " | ".join(show(r) for show in COLUMNS.values()) + " |" for r in rows]
+    return "\n".join(lines) + "\n"
+
+
+def picture(rows: list[Row], path: Path) -> None:
+    """All meshes together against one linear solve, and CG steps, over the number of dofs."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
+    for i, name in enumerate(dict.fromkeys(r.case for r in rows)):
+        mine = [r for r in rows if r.case == name and r.ranks == 1]
+        if not mine:
+            continue
+        dofs = np.array([r.dofs for r in mine])
+        style = {"color": f"C{i // 2 % 10}", "marker": "o", "markersize": 3.5, "label": name}
+        style["linestyle"] = "--" if "mapped" in name else "-"
+        axes[0].semilogx(dofs, [r.all_ratio for r in mine], **style)
+        axes[1].semilogx(dofs, [1e6 * r.all_levels / r.dofs for r in mine], **style)
+        axes[2].semilogx(dofs, [r.cg for r in mine], **style)
+    axes[0].axhline(1.0, color="grey", linewidth=0.8)
+    titles = "all meshes / one linear solve", "all meshes, µs a dof", "CG steps on the mesh"
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("dofs")
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    axes[2].legend(fontsize=7, ncols=2)
+    figure.savefig(path, dpi=130)
+
+
+def read(folder: Path) -> list[Row]:
+    """All results in a folder."""
+    rows = []
+    for path in sorted(folder.glob("*.csv")):
+        with path.open(newline="") as file:
+            for record in csv.DictReader(file):
+                kinds = {"str": str, "int": int, "float": float}
+                rows.append(
+                    Row(**{f.name: kinds[str(f.type)](record[f.name]) for f in fields(Row)})
+                )
+    return rows
+
+
+def main() -> None:
+    """Measure what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--name", help="of the file of results")
+    arguments = parser.parse_args()
+    rows: list[Row] = []
+    if comm.rank == 0:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    for name in arguments.cases:
+        for row in measure(name, arguments.dofs, arguments.repeats):
+            rows.append(row)
+            if comm.rank == 0:
+                print(table([row]).splitlines()[-1], flush=True)
+        if comm.rank == 0:
+            path = arguments.out / f"{arguments.name or f'ranks-{comm.size}'}.csv"
+            with path.open("w", newline="") as file:
+                writer = csv.DictWriter(file, [f.name for f in fields(Row)])
+                writer.writeheader()
+                writer.writerows(vars(r) for r in rows)
+    if comm.rank == 0:
+        everything = read(arguments.out)
+        large = [r for r in everything if r.dofs > 0.7e6]
+        (arguments.out / "table.md").write_text(table(large))
+        picture(everything, arguments.out / "one_solve.png")
+
+
+if __name__ == "__main__":
+    main()
