@@ -99,11 +99,15 @@ def solutions(
     yield from solve_levels(example.problem, domain, levels, element)
 
 
-@cache
 def run(
     name: str, element: str = "CR", family: str = "structured", levels: int = 8
 ) -> tuple[Row, ...]:
     """Solve `exact.ALL[name]` on a sequence of meshes; asked again, the answer is there."""
+    return _run(name, element, family, levels)
+
+
+@cache
+def _run(name: str, element: str, family: str, levels: int) -> tuple[Row, ...]:
     example = exact.ALL[name]
     rows: list[Row] = []
     before: Solution | None = None
@@ -201,16 +205,18 @@ class Study:
             for heading, (form, values) in columns.items()
         ]
         widths = [max(len(cell) for cell in column) for column in cells]
-        lines = [
-            " | ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+        rows = [
+            [cell.rjust(width) for cell, width in zip(line, widths, strict=True)]
             for line in zip(*cells, strict=True)
         ]
-        rule = " | ".join("-" * (width - 1) + ":" for width in widths)
-        markdown = [f"| {line} |" for line in (lines[0], rule, *lines[1:])]
+        rule = ["-" * (width - 1) + ":" for width in widths]
+        markdown = [
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+            for row in (rows[0], rule, *rows[1:])
+        ]
         self._parts.append("\n".join([f"{caption}\n", *markdown]) + "\n")
         if comm.rank == 0:
-            print("\n".join(["", caption, *(line.replace(" | ", "  ") for line in lines)]))
-            sys.stdout.flush()
+            print("\n".join(["", caption, *("  ".join(row) for row in rows)]), flush=True)
 
     def picture(
         self,
