@@ -96,7 +96,7 @@ def _put_together(target: Path, folder: Path, minutes: float) -> None:
         kept = [c for c in heading.lower() if c.isalnum() or c in " -_"]
         anchors[name.removeprefix("demo_")] = "".join(kept).replace(" ", "-")
         body = "\n".join(lines[1:]).strip().replace("](", f"]({folder.name}/")
-        pages.append(f"## {heading}\n\n`mpirun -n 2 python3 demos/{name}.py`\n\n{body}\n")
+        pages.append(f"## {heading}\n\n{body}\n")
         figures += [
             f"| [{file}]({folder.name}/{file}) | `mpirun -n 2 python3 demos/{name}.py` |"
             for file in (line.split("](")[1].rstrip(")") for line in lines if line[:2] == "![")

@@ -59,22 +59,26 @@ for element in ("CR", "P1"):
 
 
 # %%
-def draw(axes):
+def draw(left, right):
     """Errors of D and distances of L, both elements."""
-    curves = {}
-    for (name, element), rows in results.items():
-        y = column(rows, measure[name])
-        known = np.isfinite(y)
-        curves[f"{name}, {element}"] = (column(rows, "h")[known], y[known])
-    loglog(axes, curves, {0.5: "$h^{1/2}$", 2 / 3: "$h^{2/3}$"}, title="outside $H^2$",
-           y=r"D: $\|u-u_h\|_h$,  L: $\|u_{2h}-u_h\|_h$",
-           dashed=["D, P1", "L, P1"])  # fmt: skip
+    for axes, name, slope, title, label in (
+        (left, "D", {0.5: "$h^{1/2}$"}, r"D: $u=\sqrt{r}\,\sin(\theta/2)$", r"$\|u-u_h\|_h$"),
+        (right, "L", {2 / 3: "$h^{2/3}$"}, "L: re-entrant corner", r"$\|u_{2h}-u_h\|_h$"),
+    ):
+        curves = {}
+        for element in ("CR", "P1"):
+            y = column(results[name, element], measure[name])
+            known = np.isfinite(y)
+            curves[element] = (column(results[name, element], "h")[known], y[known])
+        loglog(axes, curves, slope, title=title, y=label, dashed=["P1"])
 
 
 study.picture(
     "outside.png",
     "Solutions outside H²: the rates are those of the singularities, ½ and ⅔, on both elements.",
     draw,
+    panels=2,
+    size=(7.0, 5.0),
 )
 
 # %% [markdown]

@@ -181,14 +181,15 @@ class Study:
         """Take the folder from the command line and make it; collective."""
         self.name = name
         self.folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
-        self._parts = [f"## {title}\n"]
+        self._title = title
+        self._parts: list[tuple[int, str]] = []
         on_root(comm, lambda: self.folder.mkdir(parents=True, exist_ok=True))
         if comm.rank == 0:
             print(f"\n{title}\n{'=' * len(title)}", flush=True)
 
     def say(self, text: str) -> None:
         """Add a paragraph."""
-        self._parts.append(text + "\n")
+        self._keep(text)
         if comm.rank == 0:
             print("\n" + text, flush=True)
 
@@ -214,7 +215,7 @@ class Study:
             "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
             for row in (rows[0], rule, *rows[1:])
         ]
-        self._parts.append("\n".join([f"{caption}\n", *markdown]) + "\n")
+        self._keep("\n".join([f"{caption}\n", *markdown]))
         if comm.rank == 0:
             print("\n".join(["", caption, *("  ".join(row) for row in rows)]), flush=True)
 
@@ -244,18 +245,39 @@ class Study:
             canvas.save(figure, self.folder / file)
 
         on_root(comm, paint)
-        self._parts.append(f"![{caption}]({file})\n\n*{caption}*\n")
+        self._keep(f"![{caption}]({file})\n\n*{caption}*")
+
+    def _keep(self, text: str) -> None:
+        """Remember a part of the page and the line of the demo it belongs to."""
+        frame = sys._getframe(2)
+        self._script = Path(frame.f_code.co_filename)
+        self._parts.append((frame.f_lineno, text))
 
     def finish(self) -> None:
-        """Write what was kept."""
-        on_root(
-            comm,
-            lambda: (self.folder / f"{self.name}.md").write_text(
-                "\n".join(self._parts), encoding="utf-8"
-            ),
-        )
+        """Write what was kept, among the demo's Markdown cells."""
+
+        def write() -> None:
+            parts = sorted([*_markdown_cells(self._script), *self._parts], key=lambda part: part[0])
+            page = [f"## {self._title}", *(text for _, text in parts)]
+            path = self.folder / f"{self.name}.md"
+            path.write_text("\n\n".join(page) + "\n", encoding="utf-8")
+
+        on_root(comm, write)
         if comm.rank == 0:
             print(f"\nwritten: {self.folder}/{self.name}.md and the pictures it shows", flush=True)
+
+
+def _markdown_cells(script: Path) -> Iterator[tuple[int, str]]:
+    """Line numbers and texts of the Markdown cells, headings one level down, the title left out."""
+    lines = script.read_text(encoding="utf-8").splitlines()
+    starts = [k for k, line in enumerate(lines) if line.startswith("# %%")]
+    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+        if lines[start].endswith("[markdown]"):
+            text = [line.removeprefix("#").removeprefix(" ") for line in lines[start + 1 : end]]
+            text = [f"#{line}" if line.startswith("## ") else line for line in text]
+            body = "\n".join(line for line in text if not line.startswith("# ")).strip()
+            if "\n" in body:  # more than a heading
+                yield start, body
 
 
 def _cell(form: str, value: object) -> str:
