@@ -108,6 +108,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
                 solution.seconds["mesh"] = seconds
             records.append(output.level_record(solution, records[-1] if records else None))
             finest = solution
+            if screen.verbose:
+                screen.line(f"  linear systems: {solution.iterations.preconditioner}")
             if len(records) == 1:
                 screen.line(output.table_header(records[0]))
             screen.line(output.table_row(records[-1], records[0]))
