@@ -239,6 +239,13 @@ class Cells:
             out[j] -= flow
         return out
 
+    def opposite(self, side: Side) -> FloatArray:
+        """|T| |∇λ_i|² for the vertices opposite boundary facets, shape (n,)."""
+        out = np.zeros(len(side.cells))
+        for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
+            out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
+        return out
+
     def trace(self, part: slice) -> FloatArray:
         """|T| Σ |∇λ_i|²."""
         return -2.0 * sum_rows(self.stiffness[:, part])

@@ -71,7 +71,7 @@ class Certificate:
         cells = Cells(made.level.domain, made.level.V)
         mesh, d = cells.domain.mesh, cells.tdim
         everywhere = slice(0, cells.number)
-        fluxes = made.excess - d * made.kappa * cells.apply(vertex_rows(made.u, cells), everywhere)
+        fluxes = made.excess - d * made.kappa * cells.apply(made.w, everywhere)
         # y = slope x + shift on each cell
         corners = mesh.geometry.x[compat.cell_nodes(mesh)[: cells.number], : mesh.geometry.dim]
         constants = fem.functionspace(mesh, ("DG", 0))
@@ -117,7 +117,7 @@ class _Made:
     """
 
     level: Level
-    u: FloatArray
+    w: FloatArray
     kappa: FloatArray
     excess: FloatArray
     vertices: FloatArray
@@ -127,21 +127,23 @@ class _Made:
     reach: float
 
 
-NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
+NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
 TENSOR = "the coefficient is not a scalar"
 ADRIFT = "part of the domain has no way to Γ0, or a figure is not finite"
 
 
-def certify(solution: Solution, sweeps: int = 1) -> Certificate:
+def certify(solution: Solution, sweeps: int = 1, flux_from: Solution | None = None) -> Certificate:
     """Bound the error of a solution; collective.
 
     Args:
         solution: From `solve` or `solve_levels`; it need not be converged.
         sweeps: How often the companion's bumps are improved.
+        flux_from: A Crouzeix-Raviart solution on the same mesh whose flux to take; P1 has none.
     """
     began = time.perf_counter()
-    level, u = solution.level, solution.u
-    if solution.element != "CR":
+    base = solution if flux_from is None else flux_from
+    level, u = base.level, base.u
+    if base.element != "CR" or base.domain is not solution.domain:
         return Certificate(reason=NO_FLUX)
     data = Data.of(level.forms)
     if data.kappa is None:
@@ -151,11 +153,20 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
-    flux = equilibrate(cells, kappa.mean, w, load, edge)
-    v = companion(cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, sweeps)
+    contact_side = cells.sides[CONTACT]
+    obstacle = data.alpha.at(cells, contact_side)
+    gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
+    flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
+    if solution.element != "CR":
+        conforming = solution.u.function_space.dofmap.list[: cells.number]
+        own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
+        change = cells.apply(w - own, slice(0, cells.number))
+        flux.excess -= cells.tdim * kappa.mean * change
+        w = own
+    v = companion(cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps)
     sums = integrate(cells, kappa, w, load, flux, v)
     assert sums.indicators is not None
-    np.add.at(sums.indicators, cells.sides[CONTACT].cells, v.contact)
+    np.add.at(sums.indicators, contact_side.cells, v.contact)
     edge_square = integrate_edge(cells, kappa, w, load, edge, flux, v, sums)
     lift, lift_energy = _lifted(cells, kappa, load, v, sums)
     on_edge = on_facet(cells, edge.side, edge.g, v.vertices, v.bumps)
@@ -199,7 +210,7 @@ def certify(solution: Solution, sweeps: int = 1) -> Certificate:
         seconds=time.perf_counter() - began,
         _made=_Made(
             level=level,
-            u=u.x.array.copy(),
+            w=w,
             kappa=kappa.mean,
             varies=any(cells.comm.allgather(kappa.values is not None)),
             excess=flux.excess,

@@ -55,6 +55,7 @@ def companion(
     flux: Flux,
     u_D: Trace,
     alpha: Trace,
+    on_contact: tuple[FloatArray, FloatArray, FloatArray],
     sweeps: int,
 ) -> Companion:
     """Make v.
@@ -67,14 +68,13 @@ def companion(
         flux: y.
         u_D: Values on Γ0.
         alpha: Obstacle on Γ1.
+        on_contact: Its values.
         sweeps: How often the bumps are improved.
     """
     fixed, contact = cells.sides[DIRICHLET], cells.sides[CONTACT]
-    on_fixed, on_contact = u_D.at(cells, fixed), alpha.at(cells, contact)
+    on_fixed = u_D.at(cells, fixed)
     obstacle, middle, inside = on_contact
-    # In contact: the primal-dual criterion with the facet's diagonal entry of A
-    diagonal = cells.tdim**2 * pick(kappa, contact.cells) * _diagonal(cells, contact)
-    touching = flux.contact > diagonal * (u[contact.dofs] - alpha.weights @ inside)
+    touching = flux.touching
     v = _at_vertices(cells, w, fixed, on_fixed[0], contact, obstacle, touching)
     scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
     scale = max(cells.comm.allgather(scale))
@@ -213,14 +213,6 @@ def bump_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
     for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
         out += 4.0 * s * height[i] * height[j]
     out *= 4 / 3
-    return out
-
-
-def _diagonal(cells: Cells, side: Side) -> FloatArray:
-    """|T| |∇λ_i|² for the facets' opposite vertices, shape (n,)."""
-    out = np.zeros(len(side.cells))
-    for (i, j), s in zip(cells.pairs, cells.stiffness, strict=True):
-        out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
     return out
 
 

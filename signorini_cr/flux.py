@@ -31,20 +31,25 @@ class Flux:
     Attributes:
         excess: Fluxes out of each cell of y − κ_T ∇u_h, shape (d + 1, cells), κ_T the mean of κ.
         contact: Fluxes through the facets of Γ1, not negative, shape (n,).
+        touching: Whether the facet of Γ1 is in contact, shape (n,).
         left: ∫_T (f + div y), shape (cells,).
     """
 
     excess: FloatArray
     contact: FloatArray
+    touching: npt.NDArray[np.bool_]
     left: FloatArray
 
 
-def equilibrate(cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge: Edge) -> Flux:
+def equilibrate(
+    cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge: Edge, gap: FloatArray
+) -> Flux:
     """Find the facet fluxes of y from the local residuals of u_h.
 
     Seen from T the flux through F is ∫_T κ∇u_h·∇ψ_F − ∫_T f ψ_F − ∫_{∂T∩Γg} g ψ_F, so that the two
     sides of F differ by what the solver left of the equation of F; y takes the mean of the
-    two. On Γ1 a negative flux becomes 0, on Γg the flux is ∫_F g.
+    two. On Γ1 it is 0 where
+    there is no contact, on Γg it is ∫_F g.
 
     Args:
         cells: The mesh.
@@ -52,6 +57,7 @@ def equilibrate(cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f.
         edge: Integrals of g.
+        gap: u_h − α on the facets of Γ1, by means, shape (n,).
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
@@ -73,13 +79,16 @@ def equilibrate(cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge
     for part in blocks(cells.number):
         excess[:, part] -= half[cells.facets[:, part]]
     there = on_contact.local, on_contact.cells
-    contact = np.maximum(fluxes[there], 0.0)
+    # In contact: the primal-dual criterion with the facet's diagonal entry of A
+    diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
+    touching = fluxes[there] > np.maximum(diagonal * gap, 0.0)
+    contact = np.where(touching, fluxes[there], 0.0)
     excess[there] += contact - fluxes[there]
     there = on_neumann.local, on_neumann.cells
     excess[there] += through - fluxes[there]
     left = sum_rows(excess)
     left += cells.volume * load.mean
-    return Flux(excess, contact, left)
+    return Flux(excess, contact, touching, left)
 
 
 def unbalanced(level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray) -> float:

@@ -13,7 +13,6 @@ from dolfinx.la import InsertMode
 from petsc4py import PETSc
 
 from .cells import dot_rows, sum_rows
-from .certificate import vertex_rows
 from .domain import CONTACT, DIRICHLET
 from .errors import InputError
 from .space import ghosted_vector
@@ -56,7 +55,7 @@ def force_bounds(solution: Solution) -> tuple[float, float]:
     )
     everywhere = slice(0, cells.number)
     slopes = cells.apply(at_vertices, everywhere)
-    w = vertex_rows(made.u, cells)
+    w = made.w
     v = made.vertices[cells.vertices]
     P, d = made.excess, cells.tdim
     # ½ ∫ (κ∇v − y − σ)·∇φ

@@ -321,6 +321,27 @@ def test_residual_functional_is_bounded():
             assert all(work <= bound * norm for bound in bounds)
 
 
+# ---- P1
+
+
+@pytest.mark.parametrize("name", ["S1", "A", "S1_NEUMANN"])
+def test_conforming_solution_with_the_flux_of_the_other_element(name):
+    example = getattr(exact, name)
+    domain = example.structured(16, jitter=0.2)
+    other = solve(example.problem, domain)
+    solution = solve(example.problem, domain, "P1")
+    assert solution.certificate.bound_h1 is None
+    certificate = certify(solution, flux_from=other)
+    assert 1.0 <= certificate.bound_h1 / solution.errors[0] <= 2.0
+    assert certificate.energy[0] <= example.energy <= certificate.energy[1]
+    difference = ufl.grad(certificate.companion - solution.u)
+    assert np.isclose(
+        np.sqrt(integral(ufl.inner(difference, difference), domain.mesh)),
+        certificate.parts["companion"],
+        atol=1e-8,
+    )
+
+
 # ---- the contact force
 
 
