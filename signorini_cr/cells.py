@@ -177,8 +177,7 @@ class Cells:
         way_out = np.full(self.number, -1, dtype=np.intp)
         front = np.zeros(len(self.exterior))
         front[self.sides[DIRICHLET].dofs] = 1.0
-        self.share(front)
-        seen = front > 0
+        seen = self.share(front) > 0
         found, layers = np.flatnonzero(seen), []
         while self.comm.allreduce(len(found)) > 0:
             near = owners[:, found].ravel()
@@ -189,9 +188,8 @@ class Cells:
             layers.append((layer, way_out[layer]))
             new = np.unique(facets[~seen[facets]])
             if self.comm.size > 1:
-                front[:] = 0.0
-                front[new] = 1.0
-                new = np.flatnonzero((self.share(front) > 0) & ~seen)
+                theirs = self.from_others(new, np.ones(len(new))) > 0
+                new = np.union1d(new, self.between[theirs & ~seen[self.between]])
             seen[new] = True
             found = new
         return layers
@@ -221,6 +219,36 @@ class Cells:
             vector.scatter_forward()
             values[:] = vector.array
         return values
+
+    @cached_property
+    def between(self) -> IntArray:
+        """Facet dofs that other ranks see as well, shape (n,)."""
+        index_map = self.V.dofmap.index_map
+        mark = la.vector(index_map, dtype=np.float64)
+        mark.array[index_map.size_local :] = 1.0
+        mark.scatter_reverse(la.InsertMode.add)
+        return np.flatnonzero(mark.array > 0)
+
+    @cached_property
+    def _mailbox(self) -> la.Vector:
+        return la.vector(self.V.dofmap.index_map, dtype=np.float64)
+
+    def from_others(self, where: IntArray, values: FloatArray) -> FloatArray:
+        """Sums of what the other ranks have, in the order of ``between``; collective.
+
+        Args:
+            where: Dofs that this rank has something for, each once.
+            values: What it has, shape (n,).
+        """
+        box = self._mailbox
+        box.array[where] = values
+        mine = box.array[self.between]
+        box.scatter_reverse(la.InsertMode.add)
+        box.scatter_forward()
+        theirs = box.array[self.between] - mine
+        box.array[where] = 0.0
+        box.array[self.between] = 0.0
+        return theirs
 
     def owned_facets(self) -> int:
         """Number of facet dofs this rank owns."""

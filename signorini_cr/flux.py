@@ -142,10 +142,10 @@ def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray) -> float:
         outflow = -left[layer] - inflow.sum(axis=0)
         fluxes[:, layer] = inflow
         fluxes[way_out, layer] = outflow
-        sent = np.zeros_like(arrived) if comm.size > 1 else arrived
-        sent[cells.facets[way_out, layer]] = -outflow
+        through = cells.facets[way_out, layer]
+        arrived[through] = -outflow
         if comm.size > 1:
-            arrived += cells.share(sent)
+            arrived[cells.between] += cells.from_others(through, -outflow)
     reached = cells.total(sum(len(layer) for layer, _ in cells.layers), cells.number)
     if reached[0] != reached[1]:
         return np.inf
