@@ -200,6 +200,7 @@ class Solution:
         energy: J(u_h) = ½ a_h(u_h, u_h) − χ(u_h).
         iterations: Newton steps and linear iterations.
         seconds: Wall time of the phases mesh, assemble, solve, estimate.
+        before: The solution on the mesh below that it was started from, if it was.
     """
 
     level: Level
@@ -209,6 +210,7 @@ class Solution:
     energy: float
     iterations: Iterations
     seconds: dict[str, float] = field(default_factory=dict)
+    before: fem.Function | None = None
 
     @property
     def domain(self) -> Domain:
@@ -371,7 +373,10 @@ def _solve(
     vectors = [ghosted_vector(level.V, array) for array in arrays]
     rows = ContactRows(system.A, vectors[1])
     if coarser is not None and level.parent_cell is not None:
-        below = Coarse(coarser.domain, coarser.u, coarser.residual, coarser.level.system.lower)
+        parents = coarser.level.parent_cell
+        before = None if coarser.before is None or parents is None else (coarser.before, parents)
+        lower = coarser.level.system.lower
+        below = Coarse(coarser.domain, coarser.u, coarser.residual, lower, before)
         b, dirichlet = system.b.x.array, system.dirichlet
         nested_start(below, level.domain, level.parent_cell, u, rows, b, dirichlet)
     iterations = solve_vi(
@@ -406,7 +411,8 @@ def _solve(
         0.5 * fem.assemble_scalar(form) - system.chi.x.array[:owned] @ u.x.array[:owned]
     )
     seconds["estimate"] = time.perf_counter() - clock
-    return Solution(level, u, residual, contact, float(energy), iterations, seconds)
+    before = None if coarser is None else coarser.u
+    return Solution(level, u, residual, contact, float(energy), iterations, seconds, before)
 
 
 def _boundary_values(

@@ -32,12 +32,14 @@ class Coarse:
         u: The solution there, CR or P1, ghosts up to date.
         residual: A u − b there, ghosts up to date.
         lower: Bounds, `PETSc.NINFINITY` where there are none, ghosts included.
+        below: u on the mesh below this one and the parents there of this mesh's cells, if any.
     """
 
     domain: Domain
     u: fem.Function
     residual: fem.Function
     lower: npt.NDArray[np.float64]
+    below: tuple[fem.Function, npt.NDArray[np.int32]] | None = None
 
 
 ROUNDS = 3
@@ -67,7 +69,7 @@ def nested_start(
     V = start.function_space
     x = start.x.array
     values = x[dirichlet].copy()
-    x[:] = prolongate(coarse.u, V, parent_cell)
+    x[:] = prolongate(coarse.u, V, parent_cell, coarse.below)
     x[dirichlet] = values
     facets = fine.facets(CONTACT)
     dofs = closure_dofs(V, facets)

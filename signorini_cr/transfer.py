@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import Mesh
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from . import compat
@@ -123,13 +124,24 @@ def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.M
     return matrix
 
 
-def prolongate(u: fem.Function, V: fem.FunctionSpace, parent_cell: IntArray) -> FloatArray:
-    """Apply the prolongation once, without its matrix.
+def prolongate(
+    u: fem.Function,
+    V: fem.FunctionSpace,
+    parent_cell: IntArray,
+    below: tuple[fem.Function, IntArray] | None = None,
+) -> FloatArray:
+    """Apply the prolongation once, without its matrix, and extrapolate if there is what it takes.
+
+    What u has beyond the prolongation of its predecessor is, where the solution is smooth, h²
+    times a function of the place and of the kind of facet: which child, which of its facets. The
+    next mesh adds a quarter of that, to each family of children what its parent's family got.
 
     Args:
         u: A CR or P1 function on the coarse mesh, ghosts up to date.
         V: The same kind of space on the fine mesh.
         parent_cell: For each local fine cell the local coarse cell that holds it.
+        below: u's predecessor on the mesh below, and the parent there of each coarse cell. Not
+            used where either of the meshes is not a regular refinement.
 
     Returns:
         Values of all local dofs, ghosts included.
@@ -142,6 +154,13 @@ def prolongate(u: fem.Function, V: fem.FunctionSpace, parent_cell: IntArray) -> 
         values = np.einsum("cij,cj->ci", weights, local[parent_cell])
     else:  # the same pattern in each parent
         values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+    if below is not None:
+        repeats = len(weights) < len(parent_cell) and _is_regular(below[0].function_space, below[1])
+        # A rank without cells has no say, but a part in what follows
+        if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
+            gain = u.x.array - prolongate(below[0], u.function_space, below[1])
+            if repeats:
+                values += 0.25 * gain[coarse.cells].reshape(-1, values.shape[1])[below[1]]
     values = values.ravel()
     total = shared_sum(fine, _sums(fine, values))
     values[:] = 1.0
@@ -185,13 +204,11 @@ def _barycentric(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatAr
     """The parent's barycentric coordinates of the fine cells' vertices, as in `parent_weights`."""
     d = fine.mesh.topology.dim
     children = 2**d
-    regular = len(parent_cell) > 0 and np.array_equal(
-        parent_cell, np.arange(len(parent_cell)) // children
-    )
     x, x_coarse = (mesh.geometry.x[:, : mesh.geometry.dim] for mesh in (fine.mesh, coarse.mesh))
     nodes = compat.cell_nodes(fine.mesh)[: len(parent_cell)]
     parents = compat.cell_nodes(coarse.mesh)
-    if regular:  # does the pattern of the first cell repeat? one vertex of each child tells
+    if len(parent_cell) > 0 and _is_regular(coarse, parent_cell):
+        # does the pattern of the first cell repeat? one vertex of each child tells
         first = x_coarse[parents[:1].repeat(children, axis=0)]
         pattern = barycentric_coordinates(first, x[nodes[:children]])
         inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
@@ -218,6 +235,16 @@ def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatA
     inverse = np.linalg.pinv(edges)
     rest = np.einsum("nmx,nxd->nmd", points - simplices[:, :1], inverse)
     return np.concatenate([1.0 - rest.sum(axis=2, keepdims=True), rest], axis=2)
+
+
+def _is_regular(coarse: Layout | fem.FunctionSpace, parent_cell: IntArray) -> bool:
+    """Whether every coarse cell has its 2^d children in a row, on this rank."""
+    topology = coarse.mesh.topology
+    cells = topology.index_map(topology.dim).size_local
+    children = 2**topology.dim
+    return len(parent_cell) == children * cells and np.array_equal(
+        parent_cell, np.arange(len(parent_cell)) // children
+    )
 
 
 def _matrix(

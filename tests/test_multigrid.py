@@ -189,6 +189,25 @@ def test_the_first_active_set_is_the_prediction(example):
     assert len(fine.facets(CONTACT)) == len(rows.dofs)
 
 
+def test_extrapolation_comes_nearer():
+    """By an order of magnitude where the solution is smooth."""
+    *_, middle, coarse = solve_levels(exact.A.problem, exact.A.mesh(0.2), 4)
+    fine, parent_cell = refine(coarse.domain)
+    level = Level(Forms(exact.A.problem, fine.mesh), fine, 4, coarse.level, parent_cell)
+    below = middle.u, coarse.level.parent_cell
+    norms = []
+    for start in (prolongate(coarse.u, level.V, parent_cell, b) for b in (None, below)):
+        u, residual = level.system.start(), fem.Function(level.V)
+        boundary = u.x.array[level.system.dirichlet].copy()
+        u.x.array[:] = start
+        u.x.array[level.system.dirichlet] = boundary
+        level.system.residual(u, residual)
+        inside = residual.x.array[: level.V.dofmap.index_map.size_local].copy()
+        inside[np.flatnonzero(level.system.lower[: len(inside)] > PETSc.NINFINITY)] = 0.0
+        norms.append(np.sqrt(MPI.COMM_WORLD.allreduce(float(inside @ inside))))
+    assert norms[1] < 0.3 * norms[0]
+
+
 def test_the_figures_do_not_depend_on_the_ranks():
     """Against the same run on one process, by every rank for itself."""
     example, comm = exact.A, MPI.COMM_WORLD
