@@ -130,7 +130,7 @@ def draw(left, right):
 
 study.picture(
     "elements.png",
-    "S1 with CR and P1: the same rates; which one is ahead depends on what is counted.",
+    "S1 with CR and P1: the same rates; level on the same mesh, P1 ahead per degree of freedom.",
     draw,
     panels=2,
 )

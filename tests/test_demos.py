@@ -83,3 +83,15 @@ def test_demos_are_notebooks_too():
         assert lines[0] == "# %% [markdown]", path.name
         assert lines[1].startswith("# # "), path.name
         assert sum(line.startswith("# %%") for line in lines) >= 6, path.name
+
+
+@pytest.mark.serial
+def test_the_page_in_docs_is_whole():
+    """Its pictures are there, and the commands that make them name demos that exist."""
+    docs = DEMOS.parent / "docs"
+    page = (docs / "studies.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\]\((studies/[^)]*\.png)\)", page))
+    assert shown and all(is_picture(docs / name) for name in shown)
+    assert {path.name for path in (docs / "studies").iterdir()} == {Path(n).name for n in shown}
+    named = set(re.findall(r"demos/(demo_\w+\.py)", page))
+    assert named and all((DEMOS / name).exists() for name in named)
