@@ -132,7 +132,7 @@ TENSOR = "the coefficient is not a scalar"
 ADRIFT = "part of the domain has no way to Γ0, or a figure is not finite"
 
 
-def certify(solution: Solution, sweeps: int = 1, flux_from: Solution | None = None) -> Certificate:
+def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = None) -> Certificate:
     """Bound the error of a solution; collective.
 
     Args:

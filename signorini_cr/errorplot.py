@@ -59,8 +59,8 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
             list(triangles),
             array=np.clip(values, bottom, top),
             norm=LogNorm(bottom, max(top, 1.0001 * bottom)),
-            edgecolors="white",
-            linewidths=np.clip(20 / np.sqrt(len(values)), 0.02, 0.5),
+            edgecolors="white" if len(values) < 10_000 else "face",
+            linewidths=np.clip(15 / np.sqrt(len(values)), 0.1, 0.5),
             rasterized=True,
         )
         axes.add_collection(cells, autolim=False)
