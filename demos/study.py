@@ -22,7 +22,7 @@ from mpi4py import MPI
 from signorini_cr import canvas, exact, norms, solve, solve_levels, theory
 from signorini_cr.errors import on_root
 from signorini_cr.exact import Example
-from signorini_cr.levels import Solution
+from signorini_cr.solution import Solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from .certificate import Certificate
     from .domain import Domain, Polygon, read_gmsh
     from .errors import InputError, NotConverged
-    from .levels import Solution, solve, solve_levels
+    from .levels import solve, solve_levels
     from .problem import Problem
+    from .solution import Solution
 
 __version__ = "0.1.0"
 
@@ -32,7 +33,7 @@ _ROOMS = {
     "read_gmsh": "domain",
     "InputError": "errors",
     "NotConverged": "errors",
-    "Solution": "levels",
+    "Solution": "solution",
     "solve": "levels",
     "solve_levels": "levels",
     "solve_adaptive": "adaptive",

@@ -15,8 +15,9 @@ from mpi4py import MPI
 from .domain import Domain
 from .errors import InputError
 from .hierarchy import refine_marked
-from .levels import LevelMonitor, Solution, solve_sequence
+from .levels import LevelMonitor, solve_sequence
 from .problem import Problem
+from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]
 

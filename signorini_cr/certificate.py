@@ -27,7 +27,8 @@ from .loads import Load
 from .moments import Coefficient, Data
 
 if TYPE_CHECKING:
-    from .levels import Level, Solution
+    from .assembly import Level
+    from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]
 

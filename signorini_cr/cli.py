@@ -19,8 +19,8 @@ from .screen import Screen
 if TYPE_CHECKING:
     from .domain import Domain
     from .errors import NotConverged
-    from .levels import Solution
     from .problemfile import ProblemFile
+    from .solution import Solution
 
 DONE, FAULT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 

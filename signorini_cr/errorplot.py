@@ -10,7 +10,7 @@ from . import compat
 from .canvas import draw_lines, grouped, headline, plane_axes, save
 from .domain import CONTACT, DIRICHLET, NEUMANN
 from .errors import InputError, on_root
-from .levels import Solution
+from .solution import Solution
 from .space import facet_measures
 
 Where = str | os.PathLike[str]

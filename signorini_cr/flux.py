@@ -19,7 +19,7 @@ from .domain import CONTACT, NEUMANN
 from .loads import Edge, Load
 
 if TYPE_CHECKING:
-    from .levels import Level
+    from .assembly import Level
 
 FloatArray = npt.NDArray[np.float64]
 

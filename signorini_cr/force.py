@@ -18,7 +18,7 @@ from .errors import InputError
 from .space import ghosted_vector
 
 if TYPE_CHECKING:
-    from .levels import Solution
+    from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]
 

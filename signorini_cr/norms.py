@@ -14,8 +14,8 @@ from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from . import compat
-from .levels import Solution
 from .problem import Data, Forms, as_expression
+from .solution import Solution
 from .space import facet_entities, vertex_values
 
 FloatArray = npt.NDArray[np.float64]

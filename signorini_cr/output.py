@@ -31,7 +31,7 @@ from .tables import table_row as table_row
 from .vtu import write_vtu
 
 if TYPE_CHECKING:
-    from .levels import Solution
+    from .solution import Solution
 
 FILES = (
     "report.json",

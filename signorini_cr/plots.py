@@ -35,7 +35,7 @@ from .raster import raster
 from .space import facet_measures
 
 if TYPE_CHECKING:
-    from .levels import Solution
+    from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]
 Where = str | os.PathLike[str]

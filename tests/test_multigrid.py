@@ -9,9 +9,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact, solve, solve_levels
+from signorini_cr.assembly import Level
 from signorini_cr.domain import CONTACT
 from signorini_cr.hierarchy import refine, refine_marked
-from signorini_cr.levels import Level
 from signorini_cr.multigrid import Grid
 from signorini_cr.nested import Coarse, nested_start
 from signorini_cr.problem import Forms

@@ -1,0 +1,209 @@
+"""One mesh and the variational inequality (1.8) that is assembled on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
+from dolfinx.la import InsertMode
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from .cells import Cells
+from .domain import CONTACT, DIRICHLET, Domain
+from .errors import raise_together
+from .loads import Edge, Load, chi
+from .moments import Data
+from .multigrid import Below, Grid, p1_grid
+from .problem import Forms
+from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
+from .transfer import Layout, prolongation
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass
+class Level:
+    """One mesh with everything that is assembled on it.
+
+    Attributes:
+        forms: The compiled forms, shared by all levels.
+        domain: Mesh and boundary parts.
+        number: Position in the sequence, from 0.
+        coarser: The level below, if there is one.
+        parent_cell: For each local cell the cell of the coarser mesh that holds it.
+    """
+
+    forms: Forms
+    domain: Domain
+    number: int = 0
+    coarser: Level | None = None
+    parent_cell: npt.NDArray[np.int32] | None = None
+
+    @cached_property
+    def V(self) -> fem.FunctionSpace:
+        """The discrete space."""
+        return function_space(self.domain.mesh, self.forms.element)
+
+    @cached_property
+    def cells(self) -> Cells:
+        """The mesh as arrays, for the Crouzeix-Raviart element."""
+        return Cells(self.domain, self.V)
+
+    @cached_property
+    def load(self) -> Load:
+        """Moments of f."""
+        return Load.of(Data.of(self.forms).f, self.cells)
+
+    @cached_property
+    def edge(self) -> Edge:
+        """Moments of g."""
+        return Edge(Data.of(self.forms).g, self.cells)
+
+    def tidy(self) -> None:
+        """Drop what only solution and certificate needed; it is made again if asked for."""
+        for name in ("cells", "load", "edge"):
+            self.__dict__.pop(name, None)
+
+    @cached_property
+    def system(self) -> System:
+        """The assembled variational inequality."""
+        return System(self)
+
+    @cached_property
+    def grid(self) -> Grid:
+        """The multigrid that starts with the discrete space."""
+        A, dofs, dirichlet = self.system.A, Layout.of_space(self.V), self._owned_dirichlet
+        if self._below is not None:
+            grid, coarse_dofs, parent_cell = self._below
+            transfer = prolongation(coarse_dofs, dofs, parent_cell)
+            return Grid(A, dirichlet, transfer, grid, sweeps=2 if dofs.cr else 1)
+        if dofs.cr:
+            p1, _, into_cr = self._p1
+            return Grid(A, dirichlet, into_cr, p1, on_same_mesh=True)
+        return Grid(A, dirichlet)
+
+    @cached_property
+    def conforming(self) -> tuple[Grid, Layout]:
+        """P1 on this mesh, for the next one, and its dofs."""
+        if self.forms.element == "P1":
+            return self.grid, Layout.of_space(self.V)
+        return self._p1[:2]
+
+    @cached_property
+    def _p1(self) -> tuple[Grid, Layout, PETSc.Mat]:
+        dofs = Layout.of_space(self.V)
+        return p1_grid(self.system.A, dofs, self._owned_dirichlet, self._below)
+
+    @property
+    def _below(self) -> Below | None:
+        if self.coarser is None or self.parent_cell is None:
+            return None
+        return (*self.coarser.conforming, self.parent_cell)
+
+    @property
+    def _owned_dirichlet(self) -> npt.NDArray[np.int32]:
+        dofs = self.system.dirichlet
+        return dofs[dofs < self.V.dofmap.index_map.size_local]
+
+
+class System:
+    """The variational inequality (1.8) as matrix, vector and bounds.
+
+    Attributes:
+        A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
+        b: Vector of χ less the Dirichlet values' share, the values themselves in their rows.
+        chi: Vector of χ alone, ghosts up to date.
+        lower: Bounds, α on Γ1 and `PETSc.NINFINITY` elsewhere, ghosts up to date, shape (dofs,).
+        dirichlet: Local dofs on Γ0, ghosts included.
+        u_D: Function with the Dirichlet values, 0 elsewhere.
+        obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
+        load: Norm of the residual at the most trivial start, which all residuals are measured
+            against: zero, raised to α on Γ1 where that is positive, u_D on Γ0.
+    """
+
+    def __init__(self, level: Level):
+        forms, domain, V = level.forms, level.domain, level.V
+        comm = domain.mesh.comm
+        on_dirichlet, self.u_D, _ = _boundary_values(level, DIRICHLET)
+        on_contact, lower, self.obstacle_at_vertices = _boundary_values(level, CONTACT)
+        for key, values in (("dirichlet", self.u_D), ("obstacle", lower)):
+            _require_finite(comm, key, values.x.array)
+        # Where the two parts meet in a P1 vertex the Dirichlet value holds
+        bounded = on_contact & ~on_dirichlet
+        self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
+        self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
+        bc = fem.dirichletbc(self.u_D, self.dirichlet)
+        a = forms.a.on(domain, [V, V])
+        self.A = assemble_matrix(a, [bc])
+        self.A.assemble()
+        self.A.setOption(PETSc.Mat.Option.SPD, True)
+        self.chi = fem.Function(V)
+        if forms.chi is not None:
+            if forms.element == "CR":
+                self.chi.x.array[:] = chi(level.load, level.edge, level.cells)
+            else:
+                fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
+        self.b = fem.Function(V)
+        self.b.x.array[:] = self.chi.x.array
+        fem.apply_lifting(self.b.x.array, [a], [[bc]])
+        for vector in (self.chi, self.b):
+            vector.x.scatter_reverse(InsertMode.add)
+            vector.x.scatter_forward()
+        self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
+        _require_finite(comm, "f, g or coefficient", self.b.x.array)
+        start, residual = self.start(), fem.Function(V)
+        start.x.array[bounded] = np.maximum(self.lower[bounded], 0.0)
+        self.load = self.residual(start, residual)
+
+    def start(self) -> fem.Function:
+        """The function that is u_D on Γ0 and 0 elsewhere."""
+        u = fem.Function(self.u_D.function_space)
+        u.x.array[:] = self.u_D.x.array
+        return u
+
+    def residual(self, u: fem.Function, r: fem.Function) -> float:
+        """Compute r = A u − b, ghosts included, and its norm."""
+        V = u.function_space
+        x, y, b = (ghosted_vector(V, w.x.array) for w in (u, r, self.b))
+        self.A.mult(x, y)
+        y.axpy(-1.0, b)
+        norm = y.norm()
+        for vector in (x, y, b):
+            vector.destroy()
+        r.x.scatter_forward()
+        return norm
+
+
+def _boundary_values(
+    level: Level, part: int
+) -> tuple[npt.NDArray[np.bool_], fem.Function, FloatArray]:
+    """Data on one boundary part as the element takes them.
+
+    Returns:
+        Which dofs lie on the part, a Function with the values there, and the values at the
+        facets' vertices, shape (n, d).
+    """
+    V, domain = level.V, level.domain
+    facets = domain.facets(part)
+    means, at_vertices = level.forms.boundary_data[part].at(domain, facets)
+    dofs = closure_dofs(V, facets)
+    values, on_part = fem.Function(V), np.zeros(len(fem.Function(V).x.array))
+    values.x.array[:] = PETSc.NINFINITY
+    values.x.array[dofs] = means[:, None] if dofs.shape[1] == 1 else at_vertices
+    on_part[dofs] = 1.0
+    # A rank may own a dof of the part without owning any of its facets
+    for array in (values.x.array, on_part):
+        shared_maximum(V, array)
+    values.x.array[on_part == 0.0] = 0.0
+    return on_part > 0.0, values, at_vertices
+
+
+def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
+    raise_together(
+        comm, None if np.isfinite(values).all() else f"{key} is not finite everywhere on the mesh"
+    )

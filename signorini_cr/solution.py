@@ -1,0 +1,96 @@
+"""What a solve returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from .assembly import Level
+from .certificate import Certificate, certify
+from .contact import Contact
+from .domain import Domain
+from .problem import Problem
+from .solver import Iterations
+
+
+@dataclass
+class Solution:
+    """u_h on one mesh, and what is known about it.
+
+    Attributes:
+        level: Mesh, space and assembled system.
+        u: u_h.
+        residual: r = A u_h − b; on Γ1 the contact forces, elsewhere what the solver left.
+        contact: The state of Γ1.
+        energy: J(u_h) = ½ a_h(u_h, u_h) − χ(u_h).
+        iterations: Newton steps and linear iterations.
+        seconds: Wall time of the phases mesh, assemble, solve, estimate.
+        before: The solution on the mesh below that it was started from, if it was.
+    """
+
+    level: Level
+    u: fem.Function
+    residual: fem.Function
+    contact: Contact
+    energy: float
+    iterations: Iterations
+    seconds: dict[str, float] = field(default_factory=dict)
+    before: fem.Function | None = None
+
+    @property
+    def domain(self) -> Domain:
+        """Mesh and boundary parts."""
+        return self.level.domain
+
+    @property
+    def problem(self) -> Problem:
+        """The data."""
+        return self.level.forms.problem
+
+    @property
+    def element(self) -> str:
+        """The element's name: "CR" or "P1"."""
+        return self.level.forms.element
+
+    @property
+    def cells(self) -> int:
+        """Number of cells, over all ranks."""
+        topology = self.domain.mesh.topology
+        return topology.index_map(topology.dim).size_global
+
+    @property
+    def dofs(self) -> int:
+        """Number of degrees of freedom, over all ranks."""
+        return self.u.function_space.dofmap.index_map.size_global
+
+    @cached_property
+    def h(self) -> float:
+        """Largest cell diameter, over all ranks."""
+        mesh = self.domain.mesh
+        number = mesh.topology.index_map(mesh.topology.dim).size_local
+        h = mesh.h(mesh.topology.dim, np.arange(number, dtype=np.int32))
+        return float(mesh.comm.allreduce(float(h.max(initial=0.0)), op=MPI.MAX))
+
+    @cached_property
+    def errors(self) -> tuple[float, float] | None:
+        """‖u − u_h‖_h (1.6) and ‖u − u_h‖ in L2; None where u is not known."""
+        forms = self.level.forms
+        if forms.exact is None:
+            return None
+        h1, l2 = (
+            np.sqrt(self._integrate(kernel.on(self.domain, (), [self.u])))
+            for kernel in forms.squared_errors
+        )
+        return float(h1), float(l2)
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """What is certain about the error; made when first asked for, collectively."""
+        return certify(self)
+
+    def _integrate(self, form: fem.Form) -> float:
+        return float(self.domain.mesh.comm.allreduce(fem.assemble_scalar(form)))
