@@ -150,7 +150,7 @@ def integrate_edge(
     sums.neumann = float(np.sum(sizes**2 / low))
     if kappa.values is not None or d != 2:
         return sums.neumann
-    of_f = np.zeros(len(at))
+    of_f: npt.NDArray[np.float64] = np.zeros(len(at))
     if load.variance is not None:
         square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
         of_f = poincare(d) * np.sqrt(square)

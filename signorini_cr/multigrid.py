@@ -69,7 +69,7 @@ class Grid:
         self.masked = matrix.duplicate(copy=True)
         self._transfer = transfer
         self._dirichlet = dirichlet
-        self._fixed = np.empty(0, dtype=np.int32)
+        self._fixed: npt.NDArray[np.int32] = np.empty(0, dtype=np.int32)
         self._silent = dirichlet
         self._changed = True
         self._deep = False

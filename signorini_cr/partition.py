@@ -23,7 +23,7 @@ def bisect(points: npt.NDArray[np.float64], parts: int) -> npt.NDArray[np.int32]
         The part of every point, shape (n,).
     """
     part = np.zeros(len(points), dtype=np.int32)
-    todo = [(np.arange(len(points)), 0, parts)]
+    todo: list[tuple[npt.NDArray[np.intp], int, int]] = [(np.arange(len(points)), 0, parts)]
     while todo:
         these, first, number = todo.pop()
         if number == 1 or not len(these):

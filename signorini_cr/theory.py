@@ -210,7 +210,8 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
     integrals.append(float(solution.residual.x.array[:owned] @ w.x.array[:owned]))
     total = np.array(integrals)
     mesh.comm.Allreduce(MPI.IN_PLACE, total)
-    error, best, interior, dirichlet, bound, mixed, consistency, slack = total.tolist()
+    sums: list[float] = [float(value) for value in total]
+    error, best, interior, dirichlet, bound, mixed, consistency, slack = sums
     return Estimate(
         error, best, interior, dirichlet, bound + mixed, bound, mixed, slack, consistency
     )
