@@ -6,15 +6,26 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import DiagonalType, create_rectangle, locate_entities_boundary, meshtags
+from dolfinx.mesh import (
+    DiagonalType,
+    compute_midpoints,
+    create_box,
+    create_rectangle,
+    exterior_facet_indices,
+    locate_entities_boundary,
+    meshtags,
+)
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
+from signorini_cr.assembly import Level
 from signorini_cr.cells import Cells
 from signorini_cr.certificate import certify
+from signorini_cr.compat import cell_nodes
 from signorini_cr.flux import unbalanced
 from signorini_cr.force import force_bounds
+from signorini_cr.problem import Forms
 from signorini_cr.ranges import range_of
 
 WORLD = MPI.COMM_WORLD
@@ -81,7 +92,7 @@ def _distance(u, companion, fine):
     from dolfinx import geometry
 
     tree = geometry.bb_tree(coarse, 2)
-    middle = mesh.geometry.x[mesh.geometry.dofmap].mean(axis=1)
+    middle = mesh.geometry.x[cell_nodes(mesh)].mean(axis=1)
     found = geometry.compute_colliding_cells(
         coarse, geometry.compute_collisions_points(tree, middle), middle
     )
@@ -308,7 +319,7 @@ def test_residual_functional_is_bounded():
     fixed = fem.locate_dofs_topological(V, 1, level.domain.tags.find(2))
     rng = np.random.default_rng(3)
     alone = SimpleNamespace(domain=level.domain, V=level.V, coarser=None, parent_cell=None)
-    x = mesh.geometry.x[mesh.geometry.dofmap[: cells.number]].mean(axis=1)
+    x = mesh.geometry.x[cell_nodes(mesh)[: cells.number]].mean(axis=1)
     for left in (cells.volume * np.sin(3 * x[:, 0]), rng.standard_normal(cells.number)):
         bounds = [unbalanced(which, cells, left, np.array(1.0)) for which in (level, alone)]
         for shape in (lambda x: 1 - x[0] ** 2 + x[1], lambda x: np.sin(9 * x[0] + 5 * x[1])):
@@ -395,6 +406,34 @@ def test_meshes_with_ghost_cells():
     solution = solve(exact.S1.problem, domain)
     certificate = certify(solution)
     assert 1.0 <= certificate.bound_h1 / solution.errors[0] <= GOAL
+
+
+@pytest.mark.serial
+def test_three_dimensions():
+    """The same bound on tetrahedra, with a companion without bumps."""
+    mesh = create_box(MPI.COMM_SELF, [(-1, -1, 0), (1, 1, 1)], (4, 4, 2))
+    mesh.topology.create_connectivity(2, 3)
+    facets = exterior_facet_indices(mesh.topology)
+    values = np.where(compute_midpoints(mesh, 2, facets)[:, 2] < 1e-12, 1, 2).astype(np.int32)
+    domain = Domain.from_tags(mesh, meshtags(mesh, 2, facets, values))
+    problem = Problem(
+        exact=lambda x: (1 - x[0] ** 2) * (1 - x[1] ** 2) * (1 - x[2] ** 2), dirichlet=0.0
+    )
+    level = Level(Forms(problem, mesh), domain)
+    u = fem.Function(level.V)
+    dense = level.system.A[:, :]  # nothing is in contact
+    u.x.array[:] = np.linalg.solve(dense, level.system.b.x.array)
+    certificate = certify(SimpleNamespace(level=level, u=u, element="CR", domain=domain))
+    x = ufl.SpatialCoordinate(mesh)
+    gradient = ufl.grad(problem.exact(x) - u)
+    error = np.sqrt(integral(ufl.inner(gradient, gradient), mesh))
+    assert error <= certificate.bound_h1 <= 2.2 * error
+    for difference, name in (
+        (certificate.flux - ufl.grad(u), "flux"),
+        (ufl.grad(certificate.companion - u), "companion"),
+    ):
+        norm = np.sqrt(integral(ufl.inner(difference, difference), mesh))
+        assert np.isclose(norm, certificate.parts[name], rtol=1e-9)
 
 
 def test_refusals():
