@@ -158,9 +158,10 @@ def prolongate(
         repeats = len(weights) < len(parent_cell) and _is_regular(below[0].function_space, below[1])
         # A rank without cells has no say, but a part in what follows
         if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
-            gain = u.x.array - prolongate(below[0], u.function_space, below[1])
+            gain = 0.25 * (u.x.array - prolongate(below[0], u.function_space, below[1]))
             if repeats:
-                values += 0.25 * gain[coarse.cells].reshape(-1, values.shape[1])[below[1]]
+                of_families = gain[coarse.cells].reshape(-1, 1, values.shape[1])
+                values.reshape(len(of_families), len(weights), -1)[:] += of_families
     values = values.ravel()
     total = shared_sum(fine, _sums(fine, values))
     values[:] = 1.0
