@@ -91,12 +91,12 @@ for name, (problem, mesh) in CASES.items():
 # %%
 for name, solution in finest.items():
     file = "adaptive-" + name.split()[0].strip(",").lower()
-    plot_error(solution, folder / f"{file}-error.png", name)
     plots.plot_solution(solution, folder / f"{file}-solution.png", name)
     # a mesh that can be seen
     problem, mesh = CASES[name]
     *_, small = solve_adaptive(problem, mesh(), max_dofs=min(4_000, max_dofs))
     plots.plot_mesh(small.domain, folder / f"{file}-mesh.png", name)
+    plot_error(small, folder / f"{file}-error.png", name)
 
 
 def draw():
