@@ -19,9 +19,10 @@ from .errors import raise_together
 from .loads import Edge, Load, chi
 from .moments import Data
 from .multigrid import Below, Grid, p1_grid
+from .parents import Layout
 from .problem import Forms
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
-from .transfer import Layout, prolongation
+from .transfer import prolongation
 
 FloatArray = npt.NDArray[np.float64]
 

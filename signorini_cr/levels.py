@@ -16,8 +16,9 @@ from .errors import InputError
 from .hierarchy import refine
 from .nested import Coarse, nested_start
 from .problem import Forms, Problem
+from .reduced import ContactRows
 from .solution import Solution
-from .solver import ContactRows, solve_vi
+from .solver import solve_vi
 from .space import ghosted_vector
 
 LevelMonitor = Callable[[int, int, float, int, int], None]

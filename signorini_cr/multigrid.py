@@ -1,14 +1,15 @@
-"""Multigrid in the active set: one V-cycle from CR to P1 on the same mesh, and down the P1 meshes.
+"""Multigrid in the active set: a V-cycle from CR to P1, and down the P1 spaces of all meshes.
 
-A chain of grids, finest first: CR, then P1 on the same mesh and on all coarser ones. P1 ⊂ CR and
-coarse P1 ⊂ fine P1, so the coarse matrices are Galerkin products; each is computed once, on its own
-mesh. Dofs on the obstacle are taken out on every grid: the matrix has the identity there, and a
-coarse function that does not vanish at a fixed dof of the finer grid is fixed too, which leaves
-subspaces of the reduced space. Smoothing is one symmetric Gauss-Seidel sweep before and one after
-the coarse correction, local to each rank as in every parallel algebraic multigrid.
+A chain of grids, finest first: CR, then P1 on the mesh below and on all coarser ones. P1 ⊂ CR and
+coarse P1 ⊂ fine P1 and therefore coarse P1 ⊂ fine CR, so that the coarse matrices are Galerkin
+products; each is computed once, on its own mesh, and the finest mesh needs none. Dofs on the
+obstacle are taken out on every grid: the matrix has the identity there, and a coarse function that
+does not vanish at a fixed dof of the finer grid is fixed too, which leaves subspaces of the reduced
+space. Smoothing is by symmetric Gauss-Seidel sweeps before and after the coarse correction, two on
+CR and one on P1, local to each rank as in every parallel algebraic multigrid.
 
-Where there is no coarser mesh, P1 on the finest one is left to BoomerAMG: the auxiliary space
-method. Small bottom grids are solved directly.
+Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG: the
+auxiliary space method. Small bottom grids are solved directly.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from .options import PREFIX, defaults
-from .transfer import Layout, inclusion, prolongation
+from .parents import Layout
+from .transfer import inclusion, prolongation
 
 DIRECT = 2000
 """Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""

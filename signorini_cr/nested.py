@@ -18,9 +18,10 @@ from mpi4py import MPI
 
 from . import compat
 from .domain import CONTACT, Domain
-from .solver import ContactRows
+from .parents import Layout, barycentric_coordinates
+from .reduced import ContactRows
 from .space import closure_dofs, facet_entities, facet_measures, ghosted_vector
-from .transfer import Layout, barycentric_coordinates, prolongate, shared_sum
+from .transfer import prolongate, shared_sum
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,12 @@ from signorini_cr.domain import CONTACT
 from signorini_cr.hierarchy import refine, refine_marked
 from signorini_cr.multigrid import Grid
 from signorini_cr.nested import Coarse, nested_start
+from signorini_cr.parents import Layout
 from signorini_cr.problem import Forms
-from signorini_cr.solver import ContactRows, solve_vi
+from signorini_cr.reduced import ContactRows
+from signorini_cr.solver import solve_vi
 from signorini_cr.space import function_space, ghosted_vector
-from signorini_cr.transfer import Layout, inclusion, prolongate, prolongation
+from signorini_cr.transfer import inclusion, prolongate, prolongation
 
 # Obtuse corners, a hole, and contact in three pieces that meet in a corner and at the hole
 CROOKED = Polygon(

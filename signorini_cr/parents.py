@@ -1,0 +1,134 @@
+"""Fine cells in their parents: the parents' shape functions at the fine dofs.
+
+All that is known of two nested meshes is the coarse cell that each fine cell lies in. On regular
+refinements the same pattern repeats in every parent, and one copy of it does for all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from petsc4py import PETSc
+
+from . import compat
+from .space import function_space
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the dofs of CR or P1 are.
+
+    Attributes:
+        mesh: The mesh.
+        cells: Local dofs of the local cells, shape (cells, d + 1); dof i of a cell belongs to its
+            vertex i (P1) or to the facet opposite (CR).
+        index_map: Their distribution over the ranks.
+        cr: Whether it is CR.
+    """
+
+    mesh: Mesh
+    cells: IntArray
+    index_map: Any
+    cr: bool
+
+    @classmethod
+    def of_space(cls, V: fem.FunctionSpace) -> Layout:
+        """The dofs of a CR or P1 space."""
+        cr = V.element.basix_element.family is basix.ElementFamily.CR
+        return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr)
+
+    @classmethod
+    def of_p1(cls, mesh: Mesh) -> Layout:
+        """P1 without building a space: the nodes of a straight-sided mesh are its vertices.
+
+        On refined meshes those of the coarse mesh come first, which also suits Gauss-Seidel better
+        than the order of a DOLFINx space.
+        """
+        if compat.coordinate_map(mesh).degree == 1:
+            return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False)
+        return cls.of_space(function_space(mesh, "P1"))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of owned dofs, and of all on all ranks, as PETSc takes them."""
+        return self.index_map.size_local, self.index_map.size_global
+
+    def numbers(self, dofs: IntArray) -> IntArray:
+        """Global numbers of local dofs."""
+        if self.mesh.comm.size == 1:
+            return dofs
+        numbers = self.index_map.local_to_global(dofs.ravel())
+        return numbers.astype(PETSc.IntType).reshape(dofs.shape)
+
+
+def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
+    """The parent's shape functions at the dofs of each fine cell.
+
+    Returns:
+        Shape (cells, d + 1, d + 1): dof of the fine cell, dof of its parent. Shorter where the
+        pattern repeats: with m rows, those of fine cell c are in row c % m.
+    """
+    barycentric = _barycentric(coarse, fine, parent_cell)
+    corners = barycentric.shape[-1]
+    d = corners - 1
+    if fine.cr:  # facet midpoints
+        barycentric = (barycentric.sum(axis=1, keepdims=True) - barycentric) / d
+    weights = 1.0 - d * barycentric if coarse.cr else barycentric
+    weights[np.abs(weights) < 1e-10] = 0.0
+    return weights
+
+
+def is_regular(coarse: Layout | fem.FunctionSpace, parent_cell: IntArray) -> bool:
+    """Whether every coarse cell has its 2^d children in a row, on this rank."""
+    topology = coarse.mesh.topology
+    cells = topology.index_map(topology.dim).size_local
+    children = 2**topology.dim
+    return len(parent_cell) == children * cells and np.array_equal(
+        parent_cell, np.arange(len(parent_cell)) // children
+    )
+
+
+def _barycentric(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
+    """The parent's barycentric coordinates of the fine cells' vertices, as in `parent_weights`."""
+    d = fine.mesh.topology.dim
+    children = 2**d
+    x, x_coarse = (mesh.geometry.x[:, : mesh.geometry.dim] for mesh in (fine.mesh, coarse.mesh))
+    nodes = compat.cell_nodes(fine.mesh)[: len(parent_cell)]
+    parents = compat.cell_nodes(coarse.mesh)
+    if len(parent_cell) > 0 and is_regular(coarse, parent_cell):
+        # does the pattern of the first cell repeat? one vertex of each child tells
+        first = x_coarse[parents[:1].repeat(children, axis=0)]
+        pattern = barycentric_coordinates(first, x[nodes[:children]])
+        inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
+        deviation = [
+            np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
+            for theirs, own in zip(x_coarse.T.copy(), x.T.copy(), strict=True)
+        ]
+        if max(deviation) <= 1e-10 * np.abs(x_coarse).max():
+            return pattern
+    return barycentric_coordinates(x_coarse[parents[parent_cell]], x[nodes])
+
+
+def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:
+    """Barycentric coordinates of points in simplices.
+
+    Args:
+        simplices: Vertices, shape (n, d + 1, 3).
+        points: Shape (n, m, 3).
+
+    Returns:
+        Shape (n, m, d + 1).
+    """
+    edges = simplices[:, 1:] - simplices[:, :1]
+    inverse = np.linalg.pinv(edges)
+    rest = np.einsum("nmx,nxd->nmd", points - simplices[:, :1], inverse)
+    return np.concatenate([1.0 - rest.sum(axis=2, keepdims=True), rest], axis=2)
