@@ -13,13 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.la import InsertMode
-from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from .compat import cell_nodes
 from .domain import CONTACT, Domain
 from .space import closure_dofs, facet_entities, facet_measures, vertex_values
+from .walk import along_boundary
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -161,7 +160,7 @@ def contact_facts(
         "active": is_active,
         "gap_at_vertices": local - obstacle_at_vertices,
     }
-    table, transitions = _along_boundary(mesh, facets, fields)
+    table, transitions = along_boundary(mesh, facets, fields)
     return Contact(
         comm=comm,
         facets=facets,
@@ -195,91 +194,3 @@ def _cells_values(u: fem.Function, facets: npt.NDArray[np.int32]) -> FloatArray:
     cells, local = facet_entities(mesh, facets).T
     corners = np.array(basix.topology(mesh.basix_cell())[-2])
     return np.take_along_axis(vertex_values(u, cells), corners[local], axis=1)
-
-
-def _along_boundary(
-    mesh: Mesh, facets: npt.NDArray[np.int32], fields: dict[str, npt.NDArray]
-) -> tuple[dict[str, npt.NDArray] | None, FloatArray]:
-    """Sort the contact facets along the boundary and find the transition points.
-
-    Returns:
-        The table on rank 0 (None elsewhere), and the transition points on all ranks.
-    """
-    columns = dict(fields) | {"reverse": _clockwise(mesh, facets, fields["vertices"])}
-    gathered = mesh.comm.gather(columns, root=0)
-    table = None
-    transitions: FloatArray = np.zeros((0, 3))
-    if gathered is not None:
-        rows = {name: np.concatenate([part[name] for part in gathered]) for name in columns}
-        table, transitions = _ordered(rows)
-    return table, mesh.comm.bcast(transitions, root=0)
-
-
-def _clockwise(mesh: Mesh, facets: npt.NDArray[np.int32], vertices: FloatArray) -> npt.NDArray:
-    """Whether Ω lies to the right when a facet is walked from its first vertex to its second."""
-    cells, local = facet_entities(mesh, facets).T
-    apex = mesh.geometry.x[cell_nodes(mesh)[cells, local]]
-    along, inward = vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]
-    return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
-
-
-def _ordered(rows: dict[str, npt.NDArray]) -> tuple[dict[str, npt.NDArray], FloatArray]:
-    """Put facets in the order in which the boundary passes through them, Ω to the left."""
-    flip = rows["reverse"]
-    ends, gaps = rows["vertices"], rows["gap_at_vertices"]
-    ends = np.where(flip[:, None, None], ends[:, ::-1], ends)
-    gaps = np.where(flip[:, None], gaps[:, ::-1], gaps)
-    number = len(ends)
-    midpoints = ends.mean(axis=1)
-    # The same order whatever the ranks held: by coordinates first
-    start = np.lexsort(midpoints.T[::-1])
-    rank = np.empty(number, dtype=np.int64)
-    rank[start] = np.arange(number)
-    _, vertex = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
-    tail, head = vertex.reshape(-1, 2).T
-    arriving = np.full(vertex.max(initial=-1) + 1, -1)
-    arriving[head] = np.arange(number)
-    before = np.where(arriving[tail] >= 0, arriving[tail], np.arange(number))
-    # Closed curves have no first facet: cut them at the one of lowest rank
-    lowest, jump = rank.copy(), before.copy()
-    for _ in range(max(number, 1).bit_length()):
-        lowest, jump = np.minimum(lowest, lowest[jump]), jump[jump]
-    closed = before[jump] != jump
-    cut = closed & (lowest == rank)
-    before = np.where(cut, np.arange(number), before)
-    # Distance to the first facet of the part, by doubling the stride
-    length = rows["measure"]
-    is_first = before == np.arange(number)
-    distance = np.where(is_first, 0.0, 0.5 * (length + length[before]))
-    steps, jump = (~is_first).astype(np.int64), before
-    for _ in range(max(number, 1).bit_length()):
-        distance, steps, jump = distance + distance[jump], steps + steps[jump], jump[jump]
-    order = np.lexsort([steps, rank[jump]])
-    part = np.unique(rank[jump], return_inverse=True)[1]
-    table = {
-        "part": part,
-        "arc_length": distance + 0.5 * length[jump],
-        "x": midpoints[:, 0],
-        "y": midpoints[:, 1],
-        "length": length,
-        "obstacle": rows["obstacle"],
-        "u": rows["u"],
-        "pressure": rows["pressure"],
-        "active": rows["active"],
-    }
-    # A transition lies between a facet and the one after it when just one of them is active;
-    # inside the free one if its trace changes sign there, at the vertex between them if not
-    later = np.flatnonzero(arriving[tail] >= 0)
-    earlier = arriving[tail[later]]
-    differ = rows["active"][later] != rows["active"][earlier]
-    later, earlier = later[differ], earlier[differ]
-    free_is_later = rows["active"][earlier]
-    free = np.where(free_is_later, later, earlier)
-    vertex_gap = gaps[free, np.where(free_is_later, 0, 1)]
-    middle_gap = rows["u"][free] - rows["obstacle"][free]
-    inside = (vertex_gap < 0) & (middle_gap > 0)
-    share = np.where(inside, middle_gap / np.where(inside, middle_gap - vertex_gap, 1.0), 1.0)
-    between = ends[later, 0]
-    points = midpoints[free] + share[:, None] * (between - midpoints[free])
-    along = np.lexsort([steps[earlier], part[earlier]])
-    return {name: column[order] for name, column in table.items()}, points[along]

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import ufl
+from dolfinx.mesh import GhostMode, create_unit_cube, locate_entities_boundary, meshtags
 from mpi4py import MPI
 
-from signorini_cr import Polygon, Problem, solve
+from signorini_cr import Domain, Polygon, Problem, solve
 
 RECTANGLE = [[-1.0, 0.0], [1.0, 0.0], [1.0, 1.0], [-1.0, 1.0]]
 
@@ -109,3 +110,26 @@ def test_no_contact_and_all_contact(obstacle):
     if obstacle < 0:
         assert contact.number_active == 0 and abs(contact.force) < 1e-8
     assert contact.length == pytest.approx(0.0 if obstacle < 0 else contact.number_active * 0.2)
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_three_dimensions(element):
+    """A problem of the plane, carried into space: u does not depend on the third coordinate."""
+    mesh = create_unit_cube(MPI.COMM_WORLD, 6, 6, 6, ghost_mode=GhostMode.none)
+    bottom = locate_entities_boundary(mesh, 2, lambda x: np.isclose(x[2], 0.0))
+    top = locate_entities_boundary(mesh, 2, lambda x: np.isclose(x[2], 1.0))
+    facets = np.concatenate([bottom, top]).astype(np.int32)
+    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(bottom), len(top)])
+    order = np.argsort(facets)
+    domain = Domain.from_tags(mesh, meshtags(mesh, 2, facets[order], values[order]))
+    contact = solve(
+        Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0])), domain, element
+    ).contact
+    assert contact.number == 72
+    assert contact.force == pytest.approx(0.2658, abs=0.01)
+    assert contact.kkt.residual < 1e-8
+    table = contact.table()
+    if MPI.COMM_WORLD.rank == 0:
+        assert table["length"].sum() == pytest.approx(1.0)
+        # f pulls up for x < 1/2: no contact there, but next to the middle
+        assert table["x"][table["active"]].min() > 0.5
