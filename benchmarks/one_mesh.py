@@ -1,0 +1,95 @@
+"""The linear solver where there is no hierarchy below a mesh, as with one from a file.
+
+    container/run python3 benchmarks/one_mesh.py
+
+gmsh meshes of the rectangle of S1 and of a polygon with obtuse corners and a hole, as they are. One
+linear system with the matrix of the Crouzeix-Raviart element, no dof on the obstacle, is solved by
+CG to rtol 1e-8, PETSc's way of counting, with the program's two-level method (P1 auxiliary space,
+BoomerAMG below) and with BoomerAMG on the matrix itself, PETSc's defaults. Set-up is included, both
+take turns, medians of the quotients.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from statistics import median
+
+from one_solve import CROOKED, PUSHED, linear_solve, timed
+from petsc4py import PETSc
+
+from signorini_cr import exact
+from signorini_cr.assembly import Level
+from signorini_cr.domain import Domain
+from signorini_cr.problem import Forms, Problem
+from signorini_cr.space import ghosted_vector
+
+
+def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
+    """Time and steps of the program's method, set-up included."""
+    for name in ("grid", "_p1"):
+        level.__dict__.pop(name, None)
+    A, x, steps = level.system.A, b.duplicate(), 0
+
+    def action() -> None:
+        nonlocal steps
+        grid = level.grid
+        grid.fix(level.system.dirichlet[:0])
+        ksp = PETSc.KSP().create(A.getComm())
+        ksp.setOperators(grid.masked)
+        ksp.setType("cg")
+        ksp.setTolerances(rtol=1e-8)
+        ksp.getPC().setType("python")
+        ksp.getPC().setPythonContext(grid)
+        ksp.solve(b, x)
+        steps = ksp.getIterationNumber()
+        ksp.destroy()
+
+    seconds = timed(action)
+    level.grid.free()
+    x.destroy()
+    return seconds, steps
+
+
+def row(name: str, problem: Problem, domain: Domain, repeats: int) -> str:
+    """One line of the table."""
+    level = Level(Forms(problem, domain.mesh, "CR"), domain)
+    b = ghosted_vector(level.V, level.system.b.x.array)
+    ours, theirs = [], []
+    for _ in range(repeats):
+        theirs.append(linear_solve(level.system.A, b))
+        ours.append(two_levels(level, b))
+    dofs = b.getSize()
+    ratio = median(mine[0] / other[0] for mine, other in zip(ours, theirs, strict=True))
+    mine, other = (1e6 * median(t for t, _ in runs) / dofs for runs in (ours, theirs))
+    return (
+        f"| {name} | {dofs / 1e6:.2f} M | {ours[0][1]} | {theirs[0][1]} | {mine:.2f} "
+        f"| {other:.2f} | **{ratio:.2f}** |"
+    )
+
+
+def main() -> None:
+    """Print and keep the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sizes", type=float, nargs="*", default=[0.01, 0.005, 0.0025])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    arguments = parser.parse_args()
+    lines = [
+        "| mesh | dofs | CG, two levels | CG, BoomerAMG | two levels, µs a dof "
+        "| BoomerAMG, µs a dof | quotient |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for size in arguments.sizes:
+        for name, problem, polygon in (
+            ("rectangle", exact.S1.problem, exact.S1.polygon),
+            ("polygon", PUSHED, CROOKED),
+        ):
+            lines.append(row(name, problem, polygon.mesh(size), arguments.repeats))
+            print(lines[-1], flush=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "one_mesh.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
