@@ -4,7 +4,7 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies test lint types clean purge
+.PHONY: demo studies test ranks lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -16,6 +16,13 @@ studies:
 test:
 	$(run) $(limit) python3 -m pytest
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
+
+# What depends on how a mesh is shared out, on more ranks than that.
+shared = $(addprefix tests/test_,contact.py hierarchy.py multigrid.py output.py solver.py studies.py)
+
+ranks:
+	$(run) $(limit) mpirun -n 3 python3 -m pytest $(shared) -k 'not rates'
+	$(run) $(limit) mpirun -n 4 python3 -m pytest $(shared) -k 'not rates'
 
 lint:
 	$(run) container/tool ruff check
