@@ -206,5 +206,9 @@ def _boundary_values(
 
 def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
     raise_together(
-        comm, None if np.isfinite(values).all() else f"{key} is not finite everywhere on the mesh"
+        comm,
+        None
+        if np.isfinite(values).all()
+        else f"data: {key} is not finite at some quadrature point of the mesh; "
+        "where(condition, a, b), or ufl.conditional, can set a value apart",
     )

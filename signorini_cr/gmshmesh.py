@@ -96,7 +96,7 @@ def triangulate(
     """
     lengths = [np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1) for loop in loops]
     counts = [np.maximum(1, np.ceil(length / size - 1e-9)) for length in lengths]
-    triangles = _area(loops[0]) / (0.43 * size**2)  # equilateral: √3/4
+    triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
     if sum(map(np.sum, counts)) > _MOST_FACETS or triangles > _MOST_TRIANGLES:
         raise InputError(
             f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"

@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 from signorini_cr.errors import InputError
 
+FARTHEST = 1e100
+"""Largest coordinate: areas, and products of them, stay finite."""
+
 
 def coordinates(vertices: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Vertices as a read-only array, shape (n, 2), if they are that and finite."""
@@ -23,6 +26,12 @@ def coordinates(vertices: npt.ArrayLike) -> npt.NDArray[np.float64]:
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(f"vertex {bad[0]} is {_point(points[bad[0]])}: not a finite point")
+    far = np.flatnonzero(np.abs(points).max(axis=1) > FARTHEST)
+    if len(far):
+        raise InputError(
+            f"vertex {far[0]} is {_point(points[far[0]])}: "
+            f"coordinates up to {FARTHEST:g} are allowed"
+        )
     points.flags.writeable = False
     return points
 

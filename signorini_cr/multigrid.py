@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from .options import PREFIX, defaults
+from .options import PREFIX, defaults, read
 from .parents import Layout
 from .transfer import inclusion, prolongation
 
@@ -167,7 +167,7 @@ class Grid:
         else:
             pc.setType(PETSc.PC.Type.REDUNDANT)
         with defaults(_AMG if not self.bottom_is_direct else {}, PREFIX + "bottom_"):
-            pc.setFromOptions()
+            read(pc)
         return pc
 
 

@@ -7,8 +7,25 @@ from contextlib import contextmanager
 
 from petsc4py import PETSc
 
+from .errors import InputError
+
 PREFIX = "signorini_"
 """Prefix of the PETSc options that reach the solver, as in ``-signorini_ksp_rtol 1e-10``."""
+
+
+def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:
+    """Let a solver read its options; collective.
+
+    Raises:
+        InputError: PETSc does not know a type that was asked for, or cannot read a value.
+    """
+    try:
+        thing.setFromOptions()
+    except PETSc.Error as error:
+        words = str(error).splitlines()[-1].split("] ", 1)[-1]
+        raise InputError(
+            f"PETSc refuses an option that begins with -{thing.getOptionsPrefix()}: {words}"
+        ) from error
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from .multigrid import Grid
-from .options import PREFIX
+from .options import PREFIX, read
 
 LINEAR_SHARE = 0.3
 """What the linear solver leaves at the end, in parts of what the residual may be."""
@@ -82,7 +82,7 @@ class MaskedSolver:
         ksp.setTolerances(rtol=0.0, atol=atol, max_it=1000)
         ksp.getPC().setType(PETSc.PC.Type.PYTHON)
         ksp.getPC().setPythonContext(grid)
-        ksp.setFromOptions()
+        read(ksp)
         if ksp.getType() == PETSc.KSP.Type.CG:
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
             ksp.setConvergenceTest(self._test)

@@ -19,7 +19,7 @@ from petsc4py import PETSc
 
 from .errors import NotConverged
 from .multigrid import Grid
-from .options import PREFIX, defaults
+from .options import PREFIX, defaults, read
 from .reduced import LINEAR_SHARE, ContactRows, MaskedSolver
 
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
@@ -104,7 +104,7 @@ def solve_vi(
 
     snes.setMonitor(report)
     with defaults(DEFAULTS):
-        snes.setFromOptions()
+        read(snes)
     snes.solve(None, x)
     reason = snes.getConvergedReason()
     iterations = Iterations(

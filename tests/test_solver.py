@@ -6,7 +6,7 @@ import ufl
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import NotConverged, Polygon, Problem, solve, solve_levels
+from signorini_cr import InputError, NotConverged, Polygon, Problem, solve, solve_levels
 from signorini_cr.domain import CONTACT
 from signorini_cr.space import closure_dofs
 
@@ -53,6 +53,18 @@ def test_linear_failure_is_named(options):
     options("pc_type", "none")
     with pytest.raises(NotConverged, match=r"DIVERGED_LINEAR_SOLVE \(KSP DIVERGED_(MAX_IT|ITS)\)"):
         solve(PROBLEM, SQUARE.mesh(0.05))
+
+
+@pytest.mark.parametrize("name", ["ksp_type", "pc_type", "snes_type"])
+def test_unknown_types_are_the_users_mistake(options, name):
+    options(name, "nonsense")
+    with pytest.raises(InputError, match="begins with -signorini_: Unable to find .* nonsense"):
+        solve(PROBLEM, SQUARE.mesh(0.25))
+
+
+def test_coordinates_whose_squares_overflow_are_refused():
+    with pytest.raises(InputError, match=r"vertex 1 .*: coordinates up to 1e\+100"):
+        Polygon([[0, 0], [1e200, 0], [1, 1]], ["contact", "dirichlet", "neumann"])
 
 
 def test_options_choose_another_solver(options):
