@@ -58,7 +58,7 @@ def test_linear_failure_is_named(options):
 @pytest.mark.parametrize("name", ["ksp_type", "pc_type", "snes_type"])
 def test_unknown_types_are_the_users_mistake(options, name):
     options(name, "nonsense")
-    with pytest.raises(InputError, match="begins with -signorini_: Unable to find .* nonsense"):
+    with pytest.raises(InputError, match=r"begins with -signorini_: Unable to find .* nonsense"):
         solve(PROBLEM, SQUARE.mesh(0.25))
 
 
