@@ -144,11 +144,10 @@ class System:
         self.A.assemble()
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
-        if forms.chi is not None:
-            if forms.element == "CR":
-                self.chi.x.array[:] = chi(level.load, level.edge, level.cells)
-            else:
-                fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
+        if forms.element == "CR" and forms.loaded:
+            self.chi.x.array[:] = chi(level.load, level.edge, level.cells)
+        elif forms.chi is not None:
+            fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
         self.b = fem.Function(V)
         self.b.x.array[:] = self.chi.x.array
         fem.apply_lifting(self.b.x.array, [a], [[bc]])
@@ -193,7 +192,8 @@ def _boundary_values(
     facets = domain.facets(part)
     means, at_vertices = level.forms.boundary_data[part].at(domain, facets)
     dofs = closure_dofs(V, facets)
-    values, on_part = fem.Function(V), np.zeros(len(fem.Function(V).x.array))
+    values = fem.Function(V)
+    on_part = np.zeros_like(values.x.array)
     values.x.array[:] = PETSc.NINFINITY
     values.x.array[dofs] = means[:, None] if dofs.shape[1] == 1 else at_vertices
     on_part[dofs] = 1.0

@@ -155,6 +155,11 @@ class Forms:
         u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         return Kernel(ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx, self.mesh)
 
+    @property
+    def loaded(self) -> bool:
+        """Whether f or g is more than the number 0."""
+        return not (_is_zero(self.f) and _is_zero(self.g))
+
     @cached_property
     def chi(self) -> Kernel | None:
         """χ(v) = ∫_Ω f v + ∫_Γg g v, (1.10); None where f and g vanish."""
