@@ -130,6 +130,7 @@ class System:
     def __init__(self, level: Level):
         forms, domain, V = level.forms, level.domain, level.V
         comm = domain.mesh.comm
+        forms.insist_on_mesh(domain.mesh)
         on_dirichlet, self.u_D, _ = _boundary_values(level, DIRICHLET)
         on_contact, lower, self.obstacle_at_vertices = _boundary_values(level, CONTACT)
         for key, values in (("dirichlet", self.u_D), ("obstacle", lower)):

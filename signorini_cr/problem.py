@@ -89,16 +89,7 @@ class Kernel:
         spaces: Sequence[fem.FunctionSpace] = (),
         functions: Sequence[fem.Function] = (),
     ) -> fem.Form:
-        """Bind to a mesh, argument spaces and one function per stand-in.
-
-        Raises:
-            InputError: The data hold a Function on another mesh.
-        """
-        if self._own and domain.mesh is not self._mesh:
-            raise InputError(
-                "data given as a dolfinx Function live on one mesh only; give a function of x "
-                "to solve on a sequence of meshes"
-            )
+        """Bind to a mesh, argument spaces and one function per stand-in."""
         subdomains: dict[Any, list[tuple[int, npt.NDArray[np.int32]]]] = {}
         if "exterior_facet" in self._types:
             subdomains[fem.IntegralType.exterior_facet] = [
@@ -154,6 +145,20 @@ class Forms:
         """a_h(u, v) = Σ_T ∫_T κ∇u·∇v, (1.9)."""
         u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         return Kernel(ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx, self.mesh)
+
+    def insist_on_mesh(self, mesh: Mesh) -> None:
+        """Refuse a mesh on which the data are not to be had.
+
+        Raises:
+            InputError: The data hold a Function on another mesh.
+        """
+        data = (self.kappa, self.f, self.g, self.dirichlet, self.obstacle, self.exact)
+        held = (ufl.algorithms.extract_coefficients(each) for each in data if each is not None)
+        if mesh is not self.mesh and any(held):
+            raise InputError(
+                "data given as a dolfinx Function live on one mesh only; give a function of x "
+                "to solve on a sequence of meshes"
+            )
 
     @property
     def loaded(self) -> bool:

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import ufl
+from dolfinx.fem import Function
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import InputError, NotConverged, Polygon, Problem, solve, solve_levels
 from signorini_cr.domain import CONTACT
-from signorini_cr.space import closure_dofs
+from signorini_cr.space import closure_dofs, function_space
 
 SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 PROBLEM = Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0]))
@@ -75,6 +76,19 @@ def test_options_choose_another_solver(options):
     assert other.iterations.preconditioner.startswith("jacobi")
     assert other.iterations.linear > reference.iterations.linear
     assert np.allclose(other.u.x.array, reference.u.x.array, atol=1e-7)
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("key", ["f", "obstacle", "coefficient"])
+def test_a_function_of_one_mesh_is_not_taken_to_another(key, element):
+    domain = SQUARE.mesh(0.25)
+    function = Function(function_space(domain.mesh, "P1"))
+    function.x.array[:] = 1.0
+    data = {"f": -1.0, "dirichlet": 2.0} | {key: function}
+    solutions = solve_levels(Problem(**data), domain, 2, element)
+    assert next(solutions).level.number == 0
+    with pytest.raises(InputError, match="live on one mesh only"):
+        next(solutions)
 
 
 def test_no_option_is_left_behind():
