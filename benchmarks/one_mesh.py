@@ -36,7 +36,7 @@ def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
         grid = level.grid
         grid.fix(level.system.dirichlet[:0])
         ksp = PETSc.KSP().create(A.getComm())
-        ksp.setOperators(grid.masked)
+        ksp.setOperators(grid.matrix)
         ksp.setType("cg")
         ksp.setTolerances(rtol=1e-8)
         ksp.getPC().setType("python")

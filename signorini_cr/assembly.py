@@ -18,7 +18,7 @@ from .domain import CONTACT, DIRICHLET, Domain
 from .errors import raise_together
 from .loads import Edge, Load, chi
 from .moments import Data
-from .multigrid import Below, Grid, p1_grid
+from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
 from .parents import Layout
 from .problem import Forms
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
@@ -78,15 +78,16 @@ class Level:
     @cached_property
     def grid(self) -> Grid:
         """The multigrid that starts with the discrete space."""
-        A, dofs, dirichlet = self.system.A, Layout.of_space(self.V), self._owned_dirichlet
+        system, dofs = self.system, Layout.of_space(self.V)
+        own = system.A, self._owned_dirichlet, system.bounded
         if self._below is not None:
             grid, coarse_dofs, parent_cell = self._below
             transfer = prolongation(coarse_dofs, dofs, parent_cell)
-            return Grid(A, dirichlet, transfer, grid, sweeps=2 if dofs.cr else 1)
+            return Grid(*own, transfer, grid, LONG_SWEEPS if dofs.cr else SWEEPS)
         if dofs.cr:
             p1, _, into_cr = self._p1
-            return Grid(A, dirichlet, into_cr, p1, on_same_mesh=True)
-        return Grid(A, dirichlet)
+            return Grid(*own, into_cr, p1, on_same_mesh=True)
+        return Grid(*own)
 
     @cached_property
     def conforming(self) -> tuple[Grid, Layout]:
@@ -97,8 +98,8 @@ class Level:
 
     @cached_property
     def _p1(self) -> tuple[Grid, Layout, PETSc.Mat]:
-        dofs = Layout.of_space(self.V)
-        return p1_grid(self.system.A, dofs, self._owned_dirichlet, self._below)
+        system, dofs = self.system, Layout.of_space(self.V)
+        return p1_grid(system.A, dofs, self._owned_dirichlet, system.bounded, self._below)
 
     @property
     def _below(self) -> Below | None:
@@ -121,6 +122,7 @@ class System:
         chi: Vector of χ alone, ghosts up to date.
         lower: Bounds, α on Γ1 and `PETSc.NINFINITY` elsewhere, ghosts up to date, shape (dofs,).
         dirichlet: Local dofs on Γ0, ghosts included.
+        bounded: Owned local dofs with a bound, ascending.
         u_D: Function with the Dirichlet values, 0 elsewhere.
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: Norm of the residual at the most trivial start, which all residuals are measured
@@ -139,6 +141,8 @@ class System:
         bounded = on_contact & ~on_dirichlet
         self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
+        owned = V.dofmap.index_map.size_local
+        self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
         bc = fem.dirichletbc(self.u_D, self.dirichlet)
         a = forms.a.on(domain, [V, V])
         self.A = assemble_matrix(a, [bc])

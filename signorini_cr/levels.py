@@ -16,7 +16,6 @@ from .errors import InputError
 from .hierarchy import refine
 from .nested import Coarse, nested_start
 from .problem import Forms, Problem
-from .reduced import ContactRows
 from .solution import Solution
 from .solver import solve_vi
 from .space import ghosted_vector
@@ -129,17 +128,14 @@ def _solve(
     u, residual = system.start(), fem.Function(level.V)
     arrays = system.b.x.array, system.lower, u.x.array, residual.x.array
     vectors = [ghosted_vector(level.V, array) for array in arrays]
-    rows = ContactRows(system.A, vectors[1])
     if coarser is not None and level.parent_cell is not None:
         parents = coarser.level.parent_cell
         before = None if coarser.before is None or parents is None else (coarser.before, parents)
         lower = coarser.level.system.lower
         below = Coarse(coarser.domain, coarser.u, coarser.residual, lower, before)
-        b, dirichlet = system.b.x.array, system.dirichlet
-        nested_start(below, level.domain, level.parent_cell, u, rows, b, dirichlet)
+        nested_start(below, level.domain, level.parent_cell, u, level.grid.operator, system)
     iterations = solve_vi(
         level.grid,
-        rows,
         *vectors,
         load=system.load,
         monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
@@ -148,8 +144,8 @@ def _solve(
     if level.forms.element != "P1":
         level.grid.free()  # the next level needs P1 alone
         del level.grid
-    for thing in (rows, *vectors):
-        thing.destroy()
+    for vector in vectors:
+        vector.destroy()
     for function in (u, residual):
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock

@@ -5,8 +5,8 @@ coarse P1 ⊂ fine P1 and therefore coarse P1 ⊂ fine CR, so that the coarse ma
 products; each is computed once, on its own mesh, and the finest mesh needs none. Dofs on the
 obstacle are taken out on every grid: the matrix has the identity there, and a coarse function that
 does not vanish at a fixed dof of the finer grid is fixed too, which leaves subspaces of the reduced
-space. Smoothing is by symmetric Gauss-Seidel sweeps before and after the coarse correction, two on
-CR and one on P1, local to each rank as in every parallel algebraic multigrid.
+space. Smoothing is by Gauss-Seidel sweeps, forward before and backward after the coarse correction,
+over-relaxed on one rank and local to each on several, as in every parallel algebraic multigrid.
 
 Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG: the
 auxiliary space method. Small bottom grids are solved directly.
@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from .masking import MaskedMatrix
 from .options import PREFIX, defaults, read
 from .parents import Layout
 from .transfer import inclusion, prolongation
@@ -32,16 +33,30 @@ _AMG = {
     "pc_hypre_boomeramg_relax_type_up": "backward-SOR/Jacobi",
 }
 
-_SWEEP = PETSc.Mat.SORType.LOCAL_SYMMETRIC_SWEEP
-_FIRST_SWEEP = _SWEEP | PETSc.Mat.SORType.ZERO_INITIAL_GUESS
+SWEEPS = 2
+"""Gauss-Seidel sweeps before and after the coarse correction."""
+
+LONG_SWEEPS = 3
+"""The same between CR and P1 of the mesh below, where there is more to smooth."""
+
+OVER_RELAXATION = 1.3
+"""On one rank, where any factor below 2 leaves the cycle positive definite.
+
+Sweeps that are local to the ranks leave the couplings between them out, and of A = M + Mᵀ −
+(2/ω − 1) D + O, with O those couplings, the last two terms have to be safe together: ω = 1 is.
+"""
+
+_FORWARD = PETSc.Mat.SORType.LOCAL_FORWARD_SWEEP
+_BACKWARD = PETSc.Mat.SORType.LOCAL_BACKWARD_SWEEP
+_FROM_ZERO = PETSc.Mat.SORType.ZERO_INITIAL_GUESS
 
 
 class Grid:
     """One space of the chain, and everything below it.
 
     Attributes:
-        matrix: Its matrix, the identity in the rows and columns of the dofs on Γ0.
-        masked: The same, with the identity for the fixed dofs as well; `fix` keeps it so.
+        operator: Its matrix, with the identity in the rows and columns of the dofs on Γ0 and of
+            those that `fix` takes out.
         coarser: The next space, None at the bottom.
         meshes: Number of meshes in the chain.
     """
@@ -50,35 +65,41 @@ class Grid:
         self,
         matrix: PETSc.Mat,
         dirichlet: npt.NDArray[np.int32],
+        bounded: npt.NDArray[np.int32],
         transfer: PETSc.Mat | None = None,
         coarser: Grid | None = None,
-        sweeps: int = 1,
+        sweeps: int = SWEEPS,
         on_same_mesh: bool = False,
     ):
         """Join a space to the chain.
 
         Args:
-            matrix: Its matrix.
+            matrix: Its matrix, the identity in the rows and columns of the dofs on Γ0.
             dirichlet: Its owned dofs on Γ0, local numbers.
+            bounded: Its owned dofs that may be taken out, local numbers, ascending.
             transfer: The matrix that writes functions of the coarser space in this one.
             coarser: The next space.
-            sweeps: Number of symmetric Gauss-Seidel sweeps before and after.
+            sweeps: Number of Gauss-Seidel sweeps before and after.
             on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
         """
         self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
+        self.operator, self.coarser = MaskedMatrix(matrix, bounded), coarser
         self._sweeps = sweeps
-        self.matrix, self.coarser = matrix, coarser
-        self.masked = matrix.duplicate(copy=True)
+        self._relaxation = OVER_RELAXATION if matrix.getComm().getSize() == 1 else 1.0
         self._transfer = transfer
         self._dirichlet = dirichlet
-        self._fixed: npt.NDArray[np.int32] = np.empty(0, dtype=np.int32)
         self._silent = dirichlet
         self._changed = True
         self._deep = False
         self._bottom: PETSc.PC | None = None
-        self._r = matrix.createVecRight()
         if coarser is not None:
+            self._r = matrix.createVecRight()
             self._b, self._x = (coarser.matrix.createVecRight() for _ in range(2))
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """The matrix as it is now, without what `fix` has taken out."""
+        return self.operator.masked
 
     def fix(self, dofs: npt.NDArray[np.int32], deep: bool = True) -> None:
         """Take dofs out of the space, and what does not vanish there out of the coarser ones.
@@ -87,14 +108,7 @@ class Grid:
             dofs: Owned dofs, local numbers; replaces those of the call before.
             deep: Go on to the coarser spaces; without that the cycle may not be used.
         """
-        comm = self.matrix.getComm().tompi4py()
-        if comm.allreduce(not np.array_equal(dofs, self._fixed)):
-            if comm.allreduce(len(self._fixed)):
-                self.matrix.copy(self.masked, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-            first = self.matrix.getOwnershipRange()[0]
-            self.masked.zeroRowsColumns((dofs + first).astype(PETSc.IntType), 1.0)
-            self.masked.assemble()  # after a copy PETSc goes on with the old inverted diagonal
-            self._fixed = dofs
+        if self.operator.fix(dofs):
             self._silent = np.concatenate([self._dirichlet, dofs])
             self._changed = True
         elif self._deep or not deep:
@@ -108,14 +122,15 @@ class Grid:
         if self.coarser is None or self._transfer is None:
             self._solve_bottom(b, x)
             return
-        self.masked.SOR(b, x, sortype=_FIRST_SWEEP, its=self._sweeps)
-        self.masked.mult(x, self._r)
+        matrix, relaxation, sweeps = self.matrix, self._relaxation, self._sweeps
+        matrix.SOR(b, x, relaxation, _FORWARD | _FROM_ZERO, its=sweeps)
+        matrix.mult(x, self._r)
         self._r.aypx(-1.0, b)
         self._transfer.multTranspose(self._r, self._b)
         self._b.array[self.coarser._silent] = 0.0
         self.coarser.cycle(self._b, self._x)
         self._transfer.multAdd(self._x, x, x)
-        self.masked.SOR(b, x, sortype=_SWEEP, its=self._sweeps)
+        matrix.SOR(b, x, relaxation, _BACKWARD, its=sweeps)
 
     def apply(self, _: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """The V-cycle as PETSc's preconditioner of type python."""
@@ -141,18 +156,19 @@ class Grid:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what belongs to this space alone, not the matrix it was made with."""
-        for thing in (self.masked, self._transfer, self._r, self._bottom):
+        self.operator.destroy()
+        for thing in (self._transfer, self._bottom):
             if thing is not None:
                 thing.destroy()
         if self.coarser is not None:
-            self._b.destroy()
-            self._x.destroy()
+            for vector in (self._r, self._b, self._x):
+                vector.destroy()
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:
             self._bottom = self._bottom_solver()
         if self._changed:
-            self._bottom.setOperators(self.masked)
+            self._bottom.setOperators(self.matrix)
             self._bottom.setUp()
             self._changed = False
         self._bottom.apply(b, x)
@@ -176,7 +192,11 @@ Below = tuple[Grid, Layout, npt.NDArray[np.int32]]
 
 
 def p1_grid(
-    A: PETSc.Mat, cr: Layout, dirichlet: npt.NDArray[np.int32], below: Below | None = None
+    A: PETSc.Mat,
+    cr: Layout,
+    dirichlet: npt.NDArray[np.int32],
+    bounded: npt.NDArray[np.int32],
+    below: Below | None = None,
 ) -> tuple[Grid, Layout, PETSc.Mat]:
     """P1 as a subspace of CR on the same mesh.
 
@@ -184,6 +204,7 @@ def p1_grid(
         A: Matrix of a_h in CR, with the identity in the rows and columns of Γ0's dofs.
         cr: The dofs of CR.
         dirichlet: Owned CR dofs on Γ0.
+        bounded: Owned CR dofs on Γ1.
         below: What comes next, if there is a coarser mesh.
 
     Returns:
@@ -195,10 +216,12 @@ def p1_grid(
     # On Γ0 the product holds rubbish, in rows and columns that become the identity's
     vertices = _touched(into_cr, dirichlet)
     K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
+    at_bounded = _touched(into_cr, bounded)
     if below is None:
-        return Grid(K, vertices), p1, into_cr
+        return Grid(K, vertices, at_bounded), p1, into_cr
     grid, dofs, parent_cell = below
-    return Grid(K, vertices, prolongation(dofs, p1, parent_cell), grid), p1, into_cr
+    transfer = prolongation(dofs, p1, parent_cell)
+    return Grid(K, vertices, at_bounded, transfer, grid), p1, into_cr
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

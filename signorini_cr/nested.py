@@ -17,9 +17,10 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from . import compat
+from .assembly import System
 from .domain import CONTACT, Domain
+from .masking import MaskedMatrix
 from .parents import Layout, barycentric_coordinates
-from .reduced import ContactRows
 from .space import closure_dofs, facet_entities, facet_measures, ghosted_vector
 from .transfer import prolongate, shared_sum
 
@@ -52,9 +53,8 @@ def nested_start(
     fine: Domain,
     parent_cell: npt.NDArray[np.int32],
     start: fem.Function,
-    contact: ContactRows,
-    b: npt.NDArray[np.float64],
-    dirichlet: npt.NDArray[np.int32],
+    operator: MaskedMatrix,
+    system: System,
 ) -> None:
     """Fill in the start on the fine mesh.
 
@@ -63,37 +63,38 @@ def nested_start(
         fine: The fine mesh and its boundary parts.
         parent_cell: For each local fine cell the local coarse cell that holds it.
         start: On entry with the Dirichlet values; on exit the start.
-        contact: The fine contact dofs and their rows of A.
-        b: The fine right-hand side.
-        dirichlet: Fine dofs on Γ0, ghosts included.
+        operator: The fine matrix and its rows at the contact dofs.
+        system: What it belongs to.
     """
     V = start.function_space
     x = start.x.array
-    values = x[dirichlet].copy()
+    values = x[system.dirichlet].copy()
     x[:] = prolongate(coarse.u, V, parent_cell, coarse.below)
-    x[dirichlet] = values
+    x[system.dirichlet] = values
     facets = fine.facets(CONTACT)
     dofs = closure_dofs(V, facets)
     if dofs.shape[1] > 1:  # a P1 dof has many cells, and no one to change its residual through
         return
-    order = np.argsort(dofs[:, 0])  # that of the contact rows
+    order = np.argsort(dofs[:, 0])  # that of the operator's bounded dofs
     facets = facets[order]
     active, force = _from_parents(coarse, fine, parent_cell, facets)
     comm = V.mesh.comm
     scale = comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
-    above = contact.lower + 4.0 * np.spacing(np.maximum(np.abs(contact.lower), scale))
-    x[contact.dofs] = np.where(active, contact.lower, np.maximum(x[contact.dofs], above))
+    bounded = operator.dofs
+    lower = system.lower[bounded]
+    above = lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
+    x[bounded] = np.where(active, lower, np.maximum(x[bounded], above))
 
     cells, _ = facet_entities(fine.mesh, facets).T
     others = V.dofmap.list[cells]
     free = np.ones(len(x), dtype=bool)
-    free[dirichlet] = free[contact.dofs] = False
+    free[system.dirichlet] = free[bounded] = False
     movable = free[others] & active[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
     vector, layout = ghosted_vector(V, x), Layout.of_space(V)
     for _ in range(ROUNDS):
-        surplus = contact.times(vector) - b[contact.dofs] - force
-        shift = surplus / contact.diagonal * (others.shape[1] - 1) / number
+        surplus = operator.times(vector) - system.b.x.array[bounded] - force
+        shift = surplus / operator.diagonal * (others.shape[1] - 1) / number
         moves = np.zeros(len(x))
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
         x += shared_sum(layout, moves)

@@ -19,46 +19,11 @@ from petsc4py import PETSc
 from .multigrid import Grid
 from .options import PREFIX, read
 
-LINEAR_SHARE = 0.3
+LINEAR_SHARE = 0.9
 """What the linear solver leaves at the end, in parts of what the residual may be."""
 
 SET_SHARE = 0.1
 """What it leaves while the active set is wrong, in parts of what that adds to the residual."""
-
-
-class ContactRows:
-    """The rows of A that belong to contact dofs, to be had without a product with all of A.
-
-    Attributes:
-        dofs: Owned dofs with a bound, local numbers, ascending, shape (n,).
-        lower: Their bounds α, shape (n,).
-        diagonal: Their diagonal entries of A, shape (n,).
-    """
-
-    def __init__(self, A: PETSc.Mat, lower: PETSc.Vec):
-        """Copy the rows of the dofs with a finite bound."""
-        self.dofs = np.flatnonzero(lower.array_r > PETSc.NINFINITY).astype(np.int32)
-        self.lower = lower.array_r[self.dofs].copy()
-        diagonal = A.getDiagonal()
-        self.diagonal = diagonal.array_r[self.dofs].copy()
-        diagonal.destroy()
-        first = A.getOwnershipRange()[0]
-        rows = PETSc.IS().createGeneral((self.dofs + first).astype(PETSc.IntType), comm=A.comm)
-        columns = PETSc.IS().createStride(A.getLocalSize()[1], first, 1, comm=A.comm)
-        self._rows = A.createSubMatrix(rows, columns)
-        self._product = self._rows.createVecLeft()
-        for thing in (rows, columns):
-            thing.destroy()
-
-    def times(self, x: PETSc.Vec) -> npt.NDArray[np.float64]:
-        """A x in the contact dofs, shape (n,)."""
-        self._rows.mult(x, self._product)
-        return self._product.array_r.copy()
-
-    def destroy(self) -> None:
-        """Free the copy."""
-        self._rows.destroy()
-        self._product.destroy()
 
 
 class MaskedSolver:
@@ -69,15 +34,29 @@ class MaskedSolver:
     """
 
     def __init__(
-        self, grid: Grid, contact: ContactRows, x: PETSc.Vec, residual: PETSc.Vec, atol: float
+        self,
+        grid: Grid,
+        lower: npt.NDArray[np.float64],
+        x: PETSc.Vec,
+        residual: PETSc.Vec,
+        atol: float,
     ):
-        self._grid, self._contact, self._x, self._residual = grid, contact, x, residual
+        """Set the inner solver up.
+
+        Args:
+            grid: The matrix and its multigrid.
+            lower: Bounds of the grid's bounded dofs, shape (n,).
+            x: Where SNES keeps the iterate.
+            residual: Where it keeps the residual.
+            atol: What the linear solver may leave at the end.
+        """
+        self._grid, self._lower, self._x, self._residual = grid, lower, x, residual
         self._first = grid.matrix.getOwnershipRange()[0]
-        self._is_active = np.zeros(len(contact.dofs), dtype=bool)
-        self._rhs, self._step = x.duplicate(), x.duplicate()
+        self._is_active = np.zeros(len(lower), dtype=bool)
+        self._step = x.duplicate()
         self.ksp = ksp = PETSc.KSP().create(grid.matrix.getComm())
         ksp.setOptionsPrefix(PREFIX)
-        ksp.setOperators(grid.masked)
+        ksp.setOperators(grid.matrix)
         ksp.setType(PETSc.KSP.Type.CG)
         ksp.setTolerances(rtol=0.0, atol=atol, max_it=1000)
         ksp.getPC().setType(PETSc.PC.Type.PYTHON)
@@ -98,21 +77,21 @@ class MaskedSolver:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the grid."""
-        for thing in (self.ksp, self._rhs, self._step):
+        for thing in (self.ksp, self._step):
             thing.destroy()
 
     # as the context of the Jacobian
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The Jacobian is A."""
-        self._grid.matrix.mult(x, y)
+        self._grid.operator.mult(x, y)
 
     def createSubMatrix(
         self, matrix: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, _: PETSc.Mat | None
     ) -> PETSc.Mat:
         """Note which dofs are inactive, and return a matrix of the right size."""
-        contact, inactive = self._contact, rows.array
-        numbers = contact.dofs + self._first
+        inactive = rows.array
+        numbers = self._grid.operator.dofs + self._first
         place = np.searchsorted(inactive, numbers)
         if len(inactive):
             self._is_active = inactive.take(place, mode="clip") != numbers
@@ -129,15 +108,14 @@ class MaskedSolver:
 
     def solve(self, outer: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Solve the reduced system, given what SNES knows: its right-hand side is the residual."""
-        contact = self._contact
-        active = contact.dofs[self._is_active]
+        dofs = self._grid.operator.dofs
+        active = dofs[self._is_active]
         self._grid.fix(active, deep=self._uses_grid)
-        self._at_start = self._x.array_r[contact.dofs], self._residual.array_r[contact.dofs]
-        self._residual.copy(self._rhs)
-        self._rhs.array[active] = 0.0
-        self._step.set(0.0)
-        self.ksp.setOperators(self._grid.masked)
-        self.ksp.solve(self._rhs, self._step)
+        self._at_start = self._x.array_r[dofs], self._residual.array_r[dofs]
+        self._residual.array[active] = 0.0
+        self.ksp.setOperators(self._grid.matrix)
+        self.ksp.solve(self._residual, self._step)
+        self._residual.array[dofs] = self._at_start[1]
         x.array[:] = np.delete(self._step.array_r, active)
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
@@ -160,11 +138,10 @@ class MaskedSolver:
 
     def _set_residual(self, step: PETSc.Vec) -> float:
         """What the next residual owes to the active set: forces that pull, and penetration."""
-        contact, active = self._contact, self._is_active
-        x, force = self._at_start
-        gap = x - step.array_r[contact.dofs] - contact.lower
-        force = force - contact.times(step)
-        wrong = np.where(active, force, contact.diagonal * gap)
+        operator, (x, force) = self._grid.operator, self._at_start
+        gap = x - step.array_r[operator.dofs] - self._lower
+        force = force - operator.times(step)
+        wrong = np.where(self._is_active, force, operator.diagonal * gap)
         local = float(np.sum(np.minimum(wrong, 0.0) ** 2))
         return float(np.sqrt(step.getComm().tompi4py().allreduce(local)))
 

@@ -20,7 +20,7 @@ from petsc4py import PETSc
 from .errors import NotConverged
 from .multigrid import Grid
 from .options import PREFIX, defaults, read
-from .reduced import LINEAR_SHARE, ContactRows, MaskedSolver
+from .reduced import LINEAR_SHARE, MaskedSolver
 
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
 # usual line search tests a norm that may rightly rise. A contact dof counts as active within the
@@ -42,7 +42,6 @@ class Iterations:
 
 def solve_vi(
     grid: Grid,
-    contact: ContactRows,
     b: PETSc.Vec,
     lower: PETSc.Vec,
     x: PETSc.Vec,
@@ -58,9 +57,8 @@ def solve_vi(
     Args:
         grid: The matrix A, symmetric positive definite, Dirichlet rows and columns those of the
             identity, and the multigrid that goes with it.
-        contact: The rows of A of the dofs with a bound.
         b: Right-hand side, with the Dirichlet values in their rows.
-        lower: Bound of each dof, `PETSc.NINFINITY` where there is none.
+        lower: Bound of each dof, `PETSc.NINFINITY` for all but the grid's bounded ones.
         x: On entry the start, with the Dirichlet values in place; on exit the solution.
         residual: On exit A x − b.
         load: Norm that the residual is measured against, `System.load`; the same for all starts.
@@ -71,19 +69,20 @@ def solve_vi(
     Raises:
         NotConverged: With the name PETSc gives to the reason.
     """
-    A, comm = grid.matrix, grid.matrix.getComm()
+    operator, comm = grid.operator, grid.matrix.getComm()
+    bounds = lower.array_r[operator.dofs]
     target = tolerance * load or 1e-300
     snes = PETSc.SNES().create(comm)
     snes.setOptionsPrefix(PREFIX)
     snes.setType(PETSc.SNES.Type.VINEWTONRSLS)
 
     def function(_: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        A.mult(x, f)
+        operator.mult(x, f)
         f.axpy(-1.0, b)
 
     snes.setFunction(function, residual)
-    linear = MaskedSolver(grid, contact, x, residual, LINEAR_SHARE * target)
-    jacobian = PETSc.Mat().createPython(A.getSizes(), linear, comm=comm)
+    linear = MaskedSolver(grid, bounds, x, residual, LINEAR_SHARE * target)
+    jacobian = PETSc.Mat().createPython(grid.matrix.getSizes(), linear, comm=comm)
     jacobian.setUp()
     snes.setJacobian(lambda *_: None, jacobian)
     upper = b.duplicate()
@@ -99,13 +98,18 @@ def solve_vi(
 
     def report(snes: PETSc.SNES, step: int, norm: float) -> None:
         if monitor is not None:
-            number = _active_dofs(snes.getSolution(), residual, contact)
+            x = snes.getSolution().array_r[operator.dofs]
+            active = (x <= bounds) & (residual.array_r[operator.dofs] > 0)
+            number = comm.tompi4py().allreduce(int(active.sum()))
             monitor(step, norm, number, snes.getLinearSolveIterations())
 
     snes.setMonitor(report)
     with defaults(DEFAULTS):
         read(snes)
-    snes.solve(None, x)
+    try:
+        snes.solve(None, x)
+    finally:
+        operator.fix(operator.dofs[:0])
     reason = snes.getConvergedReason()
     iterations = Iterations(
         snes.getIterationNumber(), snes.getLinearSolveIterations(), linear.describe()
@@ -124,13 +128,6 @@ def solve_vi(
             level,
         )
     return iterations
-
-
-def _active_dofs(x: PETSc.Vec, residual: PETSc.Vec, contact: ContactRows) -> int:
-    """Number of dofs on their bound with a residual pushing them there, over all ranks."""
-    on_bound = x.array_r[contact.dofs] <= contact.lower
-    active = on_bound & (residual.array_r[contact.dofs] > 0)
-    return int(x.getComm().tompi4py().allreduce(int(active.sum())))
 
 
 def _name(reasons: type, value: int) -> str:

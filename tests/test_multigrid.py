@@ -16,7 +16,6 @@ from signorini_cr.multigrid import Grid
 from signorini_cr.nested import Coarse, nested_start
 from signorini_cr.parents import Layout
 from signorini_cr.problem import Forms
-from signorini_cr.reduced import ContactRows
 from signorini_cr.solver import solve_vi
 from signorini_cr.space import function_space, ghosted_vector
 from signorini_cr.transfer import inclusion, prolongate, prolongation
@@ -120,14 +119,13 @@ def test_the_same_solution_as_a_direct_solver():
     b, lower, x, residual = (
         ghosted_vector(V, a) for a in (system.b.x.array, system.lower, u.x.array, r.x.array)
     )
-    rows = ContactRows(system.A, lower)
     database = PETSc.Options("signorini_")
     options = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
     for name, value in options.items():
         database.setValue(name, value)
     try:
         cold = solve_vi(
-            Grid(system.A, system.dirichlet), rows, b, lower, x, residual,
+            Grid(system.A, system.dirichlet, system.bounded), b, lower, x, residual,
             load=system.load, tolerance=1e-12,
         )  # fmt: skip
     finally:
@@ -138,12 +136,15 @@ def test_the_same_solution_as_a_direct_solver():
     residual.ghostUpdate()
     assert difference(u.x.array, solution.u.x.array) < 1e-7
 
+    bounded = system.bounded
+
     def active(u, residual):
-        return (u.x.array[rows.dofs] <= rows.lower) & (residual.x.array[rows.dofs] > 0)
+        at_bound = u.x.array[bounded] <= system.lower[bounded]
+        return at_bound & (residual.x.array[bounded] > 0)
 
     assert np.array_equal(active(u, r), active(solution.u, solution.residual))
     free = solution.residual.x.array[: V.dofmap.index_map.size_local].copy()
-    free[rows.dofs[active(u, r)]] = 0.0
+    free[bounded[active(u, r)]] = 0.0
     norm = np.sqrt(MPI.COMM_WORLD.allreduce(float(free @ free)))
     assert norm <= 1e-8 * system.load
 
@@ -175,20 +176,20 @@ def test_the_first_active_set_is_the_prediction(example):
     level = Level(Forms(example.problem, fine.mesh), fine, 2, coarse.level, parent_cell)
     system, V = level.system, level.V
     start, residual = system.start(), fem.Function(V)
-    rows = ContactRows(system.A, ghosted_vector(V, system.lower))
+    bounded = system.bounded
     below = Coarse(coarse.domain, coarse.u, coarse.residual, coarse.level.system.lower)
-    nested_start(below, fine, parent_cell, start, rows, system.b.x.array, system.dirichlet)
+    nested_start(below, fine, parent_cell, start, level.grid.operator, system)
     start.x.scatter_forward()
     system.residual(start, residual)
-    on_bound = start.x.array[rows.dofs] <= rows.lower
-    force = residual.x.array[rows.dofs]
-    assert np.all(start.x.array[rows.dofs] >= rows.lower)
+    on_bound = start.x.array[bounded] <= system.lower[bounded]
+    force = residual.x.array[bounded]
+    assert np.all(start.x.array[bounded] >= system.lower[bounded])
     comm = MPI.COMM_WORLD
     assert comm.allreduce(int(on_bound.sum())) == 2 * coarse.contact.number_active > 0
     assert np.all(force[on_bound] > 0)
     total = comm.allreduce(float(force[on_bound].sum()))
     assert total == pytest.approx(coarse.contact.force, rel=1e-3)
-    assert len(fine.facets(CONTACT)) == len(rows.dofs)
+    assert len(fine.facets(CONTACT)) == len(bounded)
 
 
 def test_extrapolation_comes_nearer():
@@ -238,9 +239,8 @@ def test_the_cycle_is_symmetric_and_keeps_fixed_dofs_out():
     level = Level(solution.level.forms, solution.domain, 2, solution.level.coarser)
     level.parent_cell = solution.level.parent_cell
     grid = level.grid
-    V = level.V
-    rows = ContactRows(level.system.A, ghosted_vector(V, level.system.lower))
-    for fixed in (rows.dofs[::2], rows.dofs[:0], rows.dofs):
+    bounded = level.system.bounded
+    for fixed in (bounded[::2], bounded[:0], bounded):
         grid.fix(fixed)
         vectors = [grid.matrix.createVecRight() for _ in range(4)]
         for i, v in enumerate(vectors[:2]):

@@ -1,0 +1,93 @@
+"""A matrix that dofs can be taken out of, in place.
+
+The reduced systems of the active set method leave dofs out. Extracting them costs as much as a
+dozen products with the matrix, a copy that wears the identity in their rows and columns costs its
+memory. Only dofs with a bound can ever be taken out, and they are few: their rows are kept here,
+and the matrix itself is changed and changed back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+class MaskedMatrix:
+    """A symmetric matrix A with the identity in the rows and columns of some dofs.
+
+    Attributes:
+        masked: The PETSc matrix; it is A itself while no dof is taken out.
+        dofs: Owned dofs that can be taken out, local numbers, ascending, shape (n,).
+        diagonal: Their diagonal entries of A, shape (n,).
+        fixed: Which of them are out, shape (n,).
+    """
+
+    def __init__(self, A: PETSc.Mat, dofs: IntArray):
+        """Note the rows of the dofs, all that may ever have to be taken out."""
+        self.masked, self.dofs = A, dofs
+        self.fixed: npt.NDArray[np.bool_] = np.zeros(len(dofs), dtype=bool)
+        diagonal = A.getDiagonal()
+        self.diagonal: FloatArray = diagonal.array_r[dofs].copy()
+        diagonal.destroy()
+        first = A.getOwnershipRange()[0]
+        numbers = (dofs + first).astype(PETSc.IntType)
+        rows = PETSc.IS().createGeneral(numbers, comm=A.comm)
+        columns = PETSc.IS().createStride(A.getLocalSize()[1], first, 1, comm=A.comm)
+        self._rows = A.createSubMatrix(rows, columns)
+        for thing in (rows, columns):
+            thing.destroy()
+        start, self._column, self._value = self._rows.getValuesCSR()
+        self._entry = np.repeat(np.arange(len(dofs)), np.diff(start))
+        self._row = numbers[self._entry]
+        self._part = self._rows.createVecLeft()
+
+    def fix(self, dofs: IntArray) -> bool:
+        """Take dofs out, and put the others back.
+
+        Args:
+            dofs: Owned dofs, local numbers. Others than `dofs` are left alone: a space may meet Γ0
+                where the finer one's bounds end, and the identity is there already.
+
+        Returns:
+            Whether that changed anything, on any rank.
+        """
+        fixed = np.isin(self.dofs, dofs)
+        comm = self.masked.getComm().tompi4py()
+        changed = bool(comm.allreduce(not np.array_equal(fixed, self.fixed)))
+        if changed:
+            if comm.allreduce(bool(self.fixed.any())):
+                self._set(self.fixed, self._value)
+            self._set(fixed, np.where(self._column == self._row, 1.0, 0.0))
+            self.fixed = fixed
+        return changed
+
+    def times(self, x: PETSc.Vec) -> FloatArray:
+        """A x in the dofs that can be taken out, shape (n,)."""
+        self._rows.mult(x, self._part)
+        return self._part.array_r.copy()
+
+    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Compute y = A x, whatever is taken out."""
+        self.masked.mult(x, y)
+        there = self.dofs[self.fixed]
+        self._part.array[:] = np.where(self.fixed, x.array_r[self.dofs], 0.0)
+        self._rows.multTransposeAdd(self._part, y, y)
+        y.array[there] = self.times(x)[self.fixed]
+
+    def destroy(self) -> None:
+        """Free the rows; the matrix should be whole by then."""
+        self._rows.destroy()
+        self._part.destroy()
+
+    def _set(self, which: npt.NDArray[np.bool_], values: FloatArray) -> None:
+        """Write the rows and the columns of some dofs."""
+        chosen = which[self._entry]
+        rows, columns = self._row[chosen], self._column[chosen]
+        start = np.arange(len(rows) + 1, dtype=PETSc.IntType)
+        for i, j in ((rows, columns), (columns, rows)):
+            self.masked.setValuesIJV(start, j, values[chosen], rowmap=i)
+        self.masked.assemble()
