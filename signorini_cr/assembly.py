@@ -19,7 +19,7 @@ from .errors import raise_together
 from .loads import Edge, Load, chi
 from .moments import Data
 from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
-from .parents import Layout
+from .parents import Layout, Parents
 from .problem import Forms
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
 from .transfer import prolongation
@@ -44,6 +44,13 @@ class Level:
     number: int = 0
     coarser: Level | None = None
     parent_cell: npt.NDArray[np.int32] | None = None
+
+    @cached_property
+    def parents(self) -> Parents | None:
+        """The coarser mesh's cells that hold this one's."""
+        if self.coarser is None or self.parent_cell is None:
+            return None
+        return Parents(self.coarser.domain.mesh, self.domain.mesh, self.parent_cell)
 
     @cached_property
     def V(self) -> fem.FunctionSpace:
@@ -81,8 +88,8 @@ class Level:
         system, dofs = self.system, Layout.of_space(self.V)
         own = system.A, self._owned_dirichlet, system.bounded
         if self._below is not None:
-            grid, coarse_dofs, parent_cell = self._below
-            transfer = prolongation(coarse_dofs, dofs, parent_cell)
+            grid, coarse_dofs, parents = self._below
+            transfer = prolongation(coarse_dofs, dofs, parents)
             return Grid(*own, transfer, grid, LONG_SWEEPS if dofs.cr else SWEEPS)
         if dofs.cr:
             p1, _, into_cr = self._p1
@@ -103,9 +110,9 @@ class Level:
 
     @property
     def _below(self) -> Below | None:
-        if self.coarser is None or self.parent_cell is None:
+        if self.coarser is None or self.parents is None:
             return None
-        return (*self.coarser.conforming, self.parent_cell)
+        return (*self.coarser.conforming, self.parents)
 
     @property
     def _owned_dirichlet(self) -> npt.NDArray[np.int32]:

@@ -14,7 +14,7 @@ from .contact import contact_facts
 from .domain import Domain
 from .errors import InputError
 from .hierarchy import refine
-from .nested import Coarse, nested_start
+from .nested import nested_start
 from .problem import Forms, Problem
 from .solution import Solution
 from .solver import solve_vi
@@ -128,12 +128,8 @@ def _solve(
     u, residual = system.start(), fem.Function(level.V)
     arrays = system.b.x.array, system.lower, u.x.array, residual.x.array
     vectors = [ghosted_vector(level.V, array) for array in arrays]
-    if coarser is not None and level.parent_cell is not None:
-        parents = coarser.level.parent_cell
-        before = None if coarser.before is None or parents is None else (coarser.before, parents)
-        lower = coarser.level.system.lower
-        below = Coarse(coarser.domain, coarser.u, coarser.residual, lower, before)
-        nested_start(below, level.domain, level.parent_cell, u, level.grid.operator, system)
+    if coarser is not None:
+        nested_start(coarser, level, u)
     iterations = solve_vi(
         level.grid,
         *vectors,

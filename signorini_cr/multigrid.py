@@ -20,7 +20,7 @@ from petsc4py import PETSc
 
 from .masking import MaskedMatrix
 from .options import PREFIX, defaults, read
-from .parents import Layout
+from .parents import Layout, Parents
 from .transfer import inclusion, prolongation
 
 DIRECT = 2000
@@ -187,8 +187,8 @@ class Grid:
         return pc
 
 
-Below = tuple[Grid, Layout, npt.NDArray[np.int32]]
-"""P1 on the coarser mesh, its dofs, and for each local cell the coarse one that holds it."""
+Below = tuple[Grid, Layout, Parents]
+"""P1 on the coarser mesh, its dofs, and the cells there that hold this mesh's."""
 
 
 def p1_grid(
@@ -219,8 +219,8 @@ def p1_grid(
     at_bounded = _touched(into_cr, bounded)
     if below is None:
         return Grid(K, vertices, at_bounded), p1, into_cr
-    grid, dofs, parent_cell = below
-    transfer = prolongation(dofs, p1, parent_cell)
+    grid, dofs, parents = below
+    transfer = prolongation(dofs, p1, parents)
     return Grid(K, vertices, at_bounded, transfer, grid), p1, into_cr
 
 

@@ -7,6 +7,7 @@ refinements the same pattern repeats in every parent, and one copy of it does fo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import basix
@@ -70,52 +71,67 @@ class Layout:
         return numbers.astype(PETSc.IntType).reshape(dofs.shape)
 
 
-def parent_weights(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
-    """The parent's shape functions at the dofs of each fine cell.
+class Parents:
+    """Which coarse cell each fine cell lies in, and where.
 
-    Returns:
-        Shape (cells, d + 1, d + 1): dof of the fine cell, dof of its parent. Shorter where the
-        pattern repeats: with m rows, those of fine cell c are in row c % m.
+    Attributes:
+        cell: For each local fine cell the local coarse cell that holds it.
     """
-    barycentric = _barycentric(coarse, fine, parent_cell)
-    corners = barycentric.shape[-1]
-    d = corners - 1
-    if fine.cr:  # facet midpoints
-        barycentric = (barycentric.sum(axis=1, keepdims=True) - barycentric) / d
-    weights = 1.0 - d * barycentric if coarse.cr else barycentric
-    weights[np.abs(weights) < 1e-10] = 0.0
-    return weights
 
+    def __init__(self, coarse: Mesh, fine: Mesh, cell: IntArray):
+        """Relate two nested meshes."""
+        self.cell = cell
+        self._coarse, self._fine = coarse, fine
 
-def is_regular(coarse: Layout | fem.FunctionSpace, parent_cell: IntArray) -> bool:
-    """Whether every coarse cell has its 2^d children in a row, on this rank."""
-    topology = coarse.mesh.topology
-    cells = topology.index_map(topology.dim).size_local
-    children = 2**topology.dim
-    return len(parent_cell) == children * cells and np.array_equal(
-        parent_cell, np.arange(len(parent_cell)) // children
-    )
+    @cached_property
+    def regular(self) -> bool:
+        """Whether every coarse cell has its 2^d children in a row, on this rank."""
+        topology = self._coarse.topology
+        cells = topology.index_map(topology.dim).size_local
+        children = 2**topology.dim
+        return len(self.cell) == children * cells and np.array_equal(
+            self.cell, np.arange(len(self.cell)) // children
+        )
 
+    @cached_property
+    def barycentric(self) -> FloatArray:
+        """The parent's barycentric coordinates of the vertices of each fine cell.
 
-def _barycentric(coarse: Layout, fine: Layout, parent_cell: IntArray) -> FloatArray:
-    """The parent's barycentric coordinates of the fine cells' vertices, as in `parent_weights`."""
-    d = fine.mesh.topology.dim
-    children = 2**d
-    x, x_coarse = (mesh.geometry.x[:, : mesh.geometry.dim] for mesh in (fine.mesh, coarse.mesh))
-    nodes = compat.cell_nodes(fine.mesh)[: len(parent_cell)]
-    parents = compat.cell_nodes(coarse.mesh)
-    if len(parent_cell) > 0 and is_regular(coarse, parent_cell):
-        # does the pattern of the first cell repeat? one vertex of each child tells
-        first = x_coarse[parents[:1].repeat(children, axis=0)]
-        pattern = barycentric_coordinates(first, x[nodes[:children]])
-        inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
-        deviation = [
-            np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
-            for theirs, own in zip(x_coarse.T.copy(), x.T.copy(), strict=True)
-        ]
-        if max(deviation) <= 1e-10 * np.abs(x_coarse).max():
-            return pattern
-    return barycentric_coordinates(x_coarse[parents[parent_cell]], x[nodes])
+        Shape (cells, d + 1, d + 1): vertex, coordinate. Shorter where the pattern repeats: with m
+        rows, those of fine cell c are in row c % m.
+        """
+        coarse, fine, d = self._coarse, self._fine, self._fine.topology.dim
+        children = 2**d
+        x, x_coarse = (mesh.geometry.x[:, : mesh.geometry.dim] for mesh in (fine, coarse))
+        nodes = compat.cell_nodes(fine)[: len(self.cell)]
+        parents = compat.cell_nodes(coarse)
+        if len(self.cell) > 0 and self.regular:
+            # does the pattern of the first cell repeat? one vertex of each child tells
+            first = x_coarse[parents[:1].repeat(children, axis=0)]
+            pattern = barycentric_coordinates(first, x[nodes[:children]])
+            inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
+            deviation = [
+                np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
+                for theirs, own in zip(x_coarse.T.copy(), x.T.copy(), strict=True)
+            ]
+            if max(deviation) <= 1e-10 * np.abs(x_coarse).max():
+                return pattern
+        return barycentric_coordinates(x_coarse[parents[self.cell]], x[nodes])
+
+    def weights(self, coarse: Layout, fine: Layout) -> FloatArray:
+        """The parent's shape functions at the dofs of each fine cell.
+
+        Returns:
+            Shape (cells, d + 1, d + 1): dof of the fine cell, dof of its parent; as many rows as
+            `barycentric`.
+        """
+        at = self.barycentric
+        d = at.shape[-1] - 1
+        if fine.cr:  # facet midpoints
+            at = (at.sum(axis=1, keepdims=True) - at) / d
+        weights = 1.0 - d * at if coarse.cr else at.copy()
+        weights[np.abs(weights) < 1e-10] = 0.0
+        return weights
 
 
 def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from .parents import FloatArray, IntArray, Layout, is_regular, parent_weights
+from .parents import FloatArray, IntArray, Layout, Parents
 
 
 def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
@@ -31,15 +31,15 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
     return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d), ordered=True)
 
 
-def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.Mat:
+def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
     """The matrix of the prolongation between two nested meshes, from CR to CR or from P1 to either.
 
     Args:
         coarse: The coarse dofs.
         fine: The fine dofs.
-        parent_cell: For each local fine cell the local coarse cell that holds it.
+        parents: The coarse cells that hold the fine ones.
     """
-    weights = parent_weights(coarse, fine, parent_cell)
+    weights, parent_cell = parents.weights(coarse, fine), parents.cell
     corners = fine.cells.shape[1]
     if not coarse.cr:  # continuous: one cell tells all
         slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
@@ -70,8 +70,8 @@ def prolongation(coarse: Layout, fine: Layout, parent_cell: IntArray) -> PETSc.M
 def prolongate(
     u: fem.Function,
     V: fem.FunctionSpace,
-    parent_cell: IntArray,
-    below: tuple[fem.Function, IntArray] | None = None,
+    parents: Parents,
+    below: tuple[fem.Function, Parents] | None = None,
 ) -> FloatArray:
     """Apply the prolongation once, without its matrix, and extrapolate if there is what it takes.
 
@@ -82,15 +82,15 @@ def prolongate(
     Args:
         u: A CR or P1 function on the coarse mesh, ghosts up to date.
         V: The same kind of space on the fine mesh.
-        parent_cell: For each local fine cell the local coarse cell that holds it.
-        below: u's predecessor on the mesh below, and the parent there of each coarse cell. Not
-            used where either of the meshes is not a regular refinement.
+        parents: The coarse cells that hold the fine ones.
+        below: u's predecessor on the mesh below, and the cells there that hold the coarse ones.
+            Not used where either of the meshes is not a regular refinement.
 
     Returns:
         Values of all local dofs, ghosts included.
     """
     coarse, fine = Layout.of_space(u.function_space), Layout.of_space(V)
-    weights = parent_weights(coarse, fine, parent_cell)
+    weights, parent_cell = parents.weights(coarse, fine), parents.cell
     corners = fine.cells.shape[1]
     local = u.x.array[coarse.cells]
     if len(weights) == len(parent_cell):
@@ -98,7 +98,7 @@ def prolongate(
     else:  # the same pattern in each parent
         values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
     if below is not None:
-        repeats = len(weights) < len(parent_cell) and is_regular(below[0].function_space, below[1])
+        repeats = len(weights) < len(parent_cell) and below[1].regular
         # A rank without cells has no say, but a part in what follows
         if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
             gain = 0.25 * (u.x.array - prolongate(below[0], u.function_space, below[1]))

@@ -13,8 +13,8 @@ from signorini_cr.assembly import Level
 from signorini_cr.domain import CONTACT
 from signorini_cr.hierarchy import refine, refine_marked
 from signorini_cr.multigrid import Grid
-from signorini_cr.nested import Coarse, nested_start
-from signorini_cr.parents import Layout
+from signorini_cr.nested import nested_start
+from signorini_cr.parents import Layout, Parents
 from signorini_cr.problem import Forms
 from signorini_cr.solver import solve_vi
 from signorini_cr.space import function_space, ghosted_vector
@@ -58,7 +58,8 @@ def test_affine_functions_are_prolonged_exactly(element, pattern):
     u, v = (fem.Function(function_space(d.mesh, element)) for d in (coarse, fine))
     for function in (u, v):
         function.interpolate(affine)
-    result = prolongate(u, v.function_space, parent_cell)
+    parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+    result = prolongate(u, v.function_space, parents)
     assert difference(result, v.x.array) < 1e-12
 
 
@@ -68,14 +69,15 @@ def test_prolongation_is_its_matrix(element, pattern):
     coarse = CROOKED.mesh(0.4)
     fine, parent_cell = refined(coarse, pattern)
     V, W = (function_space(d.mesh, element) for d in (coarse, fine))
-    matrix = prolongation(Layout.of_space(V), Layout.of_space(W), parent_cell)
+    parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+    matrix = prolongation(Layout.of_space(V), Layout.of_space(W), parents)
     u = fem.Function(V)
     u.x.array[:] = np.random.default_rng(MPI.COMM_WORLD.rank).standard_normal(len(u.x.array))
     u.x.scatter_forward()
     product = matrix.createVecLeft()
     matrix.mult(vector(V, u.x.array), product)
     owned = W.dofmap.index_map.size_local
-    assert difference(product.array_r, prolongate(u, W, parent_cell)[:owned]) < 1e-12
+    assert difference(product.array_r, prolongate(u, W, parents)[:owned]) < 1e-12
 
 
 def test_p1_in_cr_has_the_p1_stiffness_matrix():
@@ -177,8 +179,7 @@ def test_the_first_active_set_is_the_prediction(example):
     system, V = level.system, level.V
     start, residual = system.start(), fem.Function(V)
     bounded = system.bounded
-    below = Coarse(coarse.domain, coarse.u, coarse.residual, coarse.level.system.lower)
-    nested_start(below, fine, parent_cell, start, level.grid.operator, system)
+    nested_start(coarse, level, start)
     start.x.scatter_forward()
     system.residual(start, residual)
     on_bound = start.x.array[bounded] <= system.lower[bounded]
@@ -197,9 +198,9 @@ def test_extrapolation_comes_nearer():
     *_, middle, coarse = solve_levels(exact.A.problem, exact.A.mesh(0.2), 4)
     fine, parent_cell = refine(coarse.domain)
     level = Level(Forms(exact.A.problem, fine.mesh), fine, 4, coarse.level, parent_cell)
-    below = middle.u, coarse.level.parent_cell
+    below = middle.u, coarse.level.parents
     norms = []
-    for start in (prolongate(coarse.u, level.V, parent_cell, b) for b in (None, below)):
+    for start in (prolongate(coarse.u, level.V, level.parents, b) for b in (None, below)):
         u, residual = level.system.start(), fem.Function(level.V)
         boundary = u.x.array[level.system.dirichlet].copy()
         u.x.array[:] = start
