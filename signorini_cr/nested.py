@@ -6,12 +6,16 @@ if its parent was, and where the residual of the prolonged u is not near the par
 that force is made the residual. The residual of such a facet is changed through the other facets of
 its cell: in a cell the entries of a row sum to zero, so that adding δ to all of them takes a_ii δ
 away. Where the prolongation is good it knows the force better than the parent, and is left alone.
+
+Where contact begins or ends the parents know too little to tell whether a facet is active. There
+the prolonged u does, by the sign of the residual with the facet on its bound.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import basix
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -58,22 +62,22 @@ def nested_start(coarse: Solution, level: Level, start: fem.Function) -> None:
     dofs = closure_dofs(V, facets)
     if dofs.shape[1] > 1:  # a P1 dof has many cells, and no one to change its residual through
         return
-    order = np.argsort(dofs[:, 0])  # that of the operator's bounded dofs
-    facets = facets[order]
-    active, force = _from_parents(coarse, level.domain.mesh, parents.cell, facets)
-    comm = V.mesh.comm
-    scale = comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
-    bounded = operator.dofs
+    facets = facets[np.argsort(dofs[:, 0])]  # the order of the operator's bounded dofs
+    bounded, b = operator.dofs, system.b.x.array[operator.dofs]
     lower = system.lower[bounded]
+    vector, layout = ghosted_vector(V, x), Layout.of_space(V)
+    active, force, at_front = _from_parents(coarse, level.domain.mesh, parents.cell, facets)
+    on_bound = operator.times(vector) - b - operator.diagonal * (x[bounded] - lower)
+    active = np.where(at_front, on_bound > 0.0, active)
+    force = np.where(at_front, on_bound, force)
+    scale = V.mesh.comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
     above = lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
     x[bounded] = np.where(active, lower, np.maximum(x[bounded], above))
 
-    cells, _ = facet_entities(level.domain.mesh, facets).T
-    others = V.dofmap.list[cells]
+    others = V.dofmap.list[facet_entities(level.domain.mesh, facets)[:, 0]]
     free = np.ones(len(x), dtype=bool)
     free[system.dirichlet] = free[bounded] = False
-    vector, layout = ghosted_vector(V, x), Layout.of_space(V)
-    surplus = operator.times(vector) - system.b.x.array[bounded] - force
+    surplus = operator.times(vector) - b - force
     weak = active & (surplus < (ENOUGH - 1.0) * force)
     movable = free[others] & weak[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
@@ -83,7 +87,7 @@ def nested_start(coarse: Solution, level: Level, start: fem.Function) -> None:
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
         x += shared_sum(layout, moves)
         moves[:] = 0.0
-        surplus = operator.times(vector) - system.b.x.array[bounded] - force
+        surplus = operator.times(vector) - b - force
     vector.destroy()
 
 
@@ -92,8 +96,13 @@ def _from_parents(
     fine: Mesh,
     parent_cell: npt.NDArray[np.int32],
     facets: npt.NDArray[np.int32],
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
-    """Whether each fine contact facet's parent is active, and its share of the contact force."""
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """What the fine contact facets' parents say.
+
+    Returns:
+        Whether the parent is active, the facet's share of its contact force, and whether contact
+        begins or ends at one of the parent's vertices.
+    """
     mesh, V = coarse.domain.mesh, coarse.u.function_space
     x, measure = facet_measures(fine, facets)
     parents = parent_cell[facet_entities(fine, facets)[:, 0]]
@@ -108,4 +117,25 @@ def _from_parents(
     dof = V.dofmap.list[parents, local]
     force = coarse.residual.x.array[dof]
     active = (coarse.u.x.array[dof] <= coarse.level.system.lower[dof]) & (force > 0.0)
-    return active, force * measure / parent_measure
+    ends = Layout.of_p1(mesh).cells[parents[:, None], _corners(mesh)[local]]
+    at_front = _front(coarse)[ends].any(axis=1)
+    return active, force * measure / parent_measure, at_front
+
+
+def _front(solution: Solution) -> npt.NDArray[np.bool_]:
+    """Whether contact begins or ends at a vertex, for all local ones."""
+    mesh, contact = solution.domain.mesh, solution.contact
+    p1 = Layout.of_p1(mesh)
+    cells, local = facet_entities(mesh, contact.facets).T
+    ends = p1.cells[cells[:, None], _corners(mesh)[local]]
+    there = np.ones(p1.size[0] + p1.index_map.num_ghosts, dtype=bool)
+    for which in (contact.active, ~contact.active):
+        count = np.zeros(len(there))
+        np.add.at(count, ends[which], 1.0)
+        there &= shared_sum(p1, count) > 0.0
+    return there
+
+
+def _corners(mesh: Mesh) -> npt.NDArray[np.intp]:
+    """The vertices of a cell's facets, shape (d + 1, d)."""
+    return np.array(basix.topology(mesh.basix_cell())[-2])

@@ -19,11 +19,18 @@ from petsc4py import PETSc
 from .multigrid import Grid
 from .options import PREFIX, read
 
-LINEAR_SHARE = 0.9
+LINEAR_SHARE = 0.7
 """What the linear solver leaves at the end, in parts of what the residual may be."""
 
-SET_SHARE = 0.1
+SET_SHARE = 0.3
 """What it leaves while the active set is wrong, in parts of what that adds to the residual."""
+
+
+SETTLED = 1.0
+"""Part of its last change by which a contact dof's sign must be certain before the end."""
+
+SETTLING_LIMIT = 1e-3
+"""Where signs stay open the linear solver goes on to this part of what it may leave."""
 
 
 class MaskedSolver:
@@ -62,11 +69,12 @@ class MaskedSolver:
         ksp.getPC().setType(PETSc.PC.Type.PYTHON)
         ksp.getPC().setPythonContext(grid)
         read(ksp)
-        if ksp.getType() == PETSc.KSP.Type.CG:
+        ksp.setConvergenceTest(self._test)
+        self._is_cg = ksp.getType() == PETSc.KSP.Type.CG
+        if self._is_cg:
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-            ksp.setConvergenceTest(self._test)
-        elif ksp.getTolerances()[0] == 0.0:  # their norms are not ours, so atol alone won't do
-            ksp.setTolerances(rtol=1e-10)
+        elif ksp.getTolerances()[1] == atol:  # preconditioned norms may be much smaller
+            ksp.setTolerances(atol=SETTLING_LIMIT * atol)
         self._uses_grid = ksp.getPC().getType() == PETSc.PC.Type.PYTHON
 
     def describe(self) -> str:
@@ -120,30 +128,60 @@ class MaskedSolver:
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 
+    def disputed(self) -> float:
+        """Norm of the residual in the dofs that the last system had in the wrong set."""
+        dofs = self._grid.operator.dofs
+        force = self._residual.array_r[dofs]
+        active = (self._x.array_r[dofs] <= self._lower) & (force > 0.0)
+        local = float(np.sum(force[active != self._is_active] ** 2))
+        return float(np.sqrt(self._x.getComm().tompi4py().allreduce(local)))
+
     def _test(self, ksp: PETSc.KSP, iteration: int, norm: float) -> int:
-        """Whether CG may stop; its norm is that of the residual of the reduced system."""
+        """Whether the linear solver may stop; CG's norm is that of the reduced residual."""
         Reason = PETSc.KSP.ConvergedReason
         if not np.isfinite(norm):
             return Reason.DIVERGED_NANORINF
         rtol, atol, _, _ = ksp.getTolerances()
         if iteration == 0:
-            self._norm = norm
-        if norm <= atol:
+            self._norm, self._before = norm, self._indicator(None)
+            # where the set alone is left to be found the residual is below atol from the start
+            self._atol = atol if norm > atol else SET_SHARE * norm
+            return Reason.ITERATING if norm > 0.0 else Reason.CONVERGED_ATOL
+        # other methods than CG may not have an iterate to look at
+        wrong, unsettled = self._set_facts(ksp.getSolution()) if self._is_cg else (0.0, False)
+        share = SETTLING_LIMIT if unsettled else 1.0
+        if norm <= share * self._atol:
             return Reason.CONVERGED_ATOL
-        if norm <= rtol * self._norm:
-            return Reason.CONVERGED_RTOL
-        if iteration > 1 and norm <= SET_SHARE * self._set_residual(ksp.getSolution()):
+        if norm <= rtol * self._norm or (iteration > 1 and norm <= share * SET_SHARE * wrong):
             return Reason.CONVERGED_RTOL
         return Reason.ITERATING
 
-    def _set_residual(self, step: PETSc.Vec) -> float:
-        """What the next residual owes to the active set: forces that pull, and penetration."""
+    def _indicator(self, step: PETSc.Vec | None) -> npt.NDArray[np.float64]:
+        """Forces on active dofs, minus gaps times the diagonal on the others; positive is active.
+
+        Args:
+            step: What is subtracted from the iterate; None for nothing.
+        """
         operator, (x, force) = self._grid.operator, self._at_start
-        gap = x - step.array_r[operator.dofs] - self._lower
-        force = force - operator.times(step)
-        wrong = np.where(self._is_active, force, operator.diagonal * gap)
-        local = float(np.sum(np.minimum(wrong, 0.0) ** 2))
-        return float(np.sqrt(step.getComm().tompi4py().allreduce(local)))
+        if step is not None:
+            x = x - step.array_r[operator.dofs]
+            force = force - operator.times(step)
+        return np.where(self._is_active, force, operator.diagonal * (self._lower - x))
+
+    def _set_facts(self, step: PETSc.Vec) -> tuple[float, bool]:
+        """What the active set will have to do with the next residual, and with the next set.
+
+        Returns:
+            The part of the residual that forces that pull and penetration will make, and whether
+            any dof's sign could still change: by no more than half of what it changed by last.
+        """
+        now = self._indicator(step)
+        wrong = np.where(self._is_active == (now > 0.0), 0.0, now)
+        unsettled = np.abs(now) < SETTLED * np.abs(now - self._before)
+        self._before = now
+        facts = np.array([wrong @ wrong, unsettled.any()])
+        squared, unsettled = step.getComm().tompi4py().allreduce(facts)
+        return float(np.sqrt(squared)), bool(unsettled)
 
 
 class _Nominal:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 from petsc4py import PETSc
 
 from .errors import NotConverged
@@ -26,6 +27,15 @@ from .reduced import LINEAR_SHARE, MaskedSolver
 # usual line search tests a norm that may rightly rise. A contact dof counts as active within the
 # zero tolerance of its bound; PETSc's is absolute and would freeze data of small magnitude.
 DEFAULTS = {"snes_linesearch_type": "basic", "snes_vi_zero_tolerance": 1e-30}
+
+SET_TOLERANCE = 0.01
+"""What dofs in the wrong set may have for a residual, in parts of what all may have together."""
+
+SET_STEPS = 2
+"""Newton steps to that end alone, when the residual as a whole is small enough already."""
+
+DIVERGED_NAN = -4
+"""PETSc's number; its name depends on the version."""
 
 Monitor = Callable[[int, float, int, int], None]
 """Called on all ranks after each step: step, residual norm, active dofs, linear iterations."""
@@ -62,7 +72,8 @@ def solve_vi(
         x: On entry the start, with the Dirichlet values in place; on exit the solution.
         residual: On exit A x − b.
         load: Norm that the residual is measured against, `System.load`; the same for all starts.
-        tolerance: The solve ends when the residual's norm is below ``tolerance * load``.
+        tolerance: The solve ends when the residual's norm is below ``tolerance * load``, and what
+            is due to the choice of the active set far below.
         monitor: Called after each step.
         level: Named in the error.
 
@@ -103,6 +114,25 @@ def solve_vi(
             number = comm.tompi4py().allreduce(int(active.sum()))
             monitor(step, norm, number, snes.getLinearSolveIterations())
 
+    start, for_the_set = 0.0, 0
+
+    def converged(snes: PETSc.SNES, step: int, norms: tuple[float, float, float]) -> int:
+        nonlocal start, for_the_set
+        rtol, atol, _, _ = snes.getTolerances()
+        norm, Reason = norms[2], PETSc.SNES.ConvergedReason
+        if step == 0:
+            start = norm
+        if not np.isfinite(norm):
+            return DIVERGED_NAN
+        small = max(atol, rtol * start)
+        if norm > small:
+            return Reason.ITERATING
+        if step > 0 and for_the_set < SET_STEPS and linear.disputed() > SET_TOLERANCE * small:
+            for_the_set += 1
+            return Reason.ITERATING
+        return Reason.CONVERGED_FNORM_ABS
+
+    snes.setConvergenceTest(converged)
     snes.setMonitor(report)
     with defaults(DEFAULTS):
         read(snes)

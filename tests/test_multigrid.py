@@ -116,7 +116,7 @@ def test_few_steps_on_every_level(example, shift):
 def test_the_same_solution_as_a_direct_solver():
     """The active set as well, and the residual the report promises."""
     solution = last(exact.A.problem, exact.A.structured(4), 5)
-    system, V = solution.level.system, solution.u.function_space
+    system, V, comm = solution.level.system, solution.u.function_space, MPI.COMM_WORLD
     u, r = system.start(), fem.Function(V)
     b, lower, x, residual = (
         ghosted_vector(V, a) for a in (system.b.x.array, system.lower, u.x.array, r.x.array)
@@ -136,7 +136,13 @@ def test_the_same_solution_as_a_direct_solver():
     assert cold.newton > 8
     x.ghostUpdate()
     residual.ghostUpdate()
-    assert difference(u.x.array, solution.u.x.array) < 1e-7
+    # in the energy norm, far below the error of the discretisation
+    error, image = fem.Function(V), fem.Function(V)
+    error.x.array[:] = u.x.array - solution.u.x.array
+    system.A.mult(ghosted_vector(V, error.x.array), ghosted_vector(V, image.x.array))
+    owned = V.dofmap.index_map.size_local
+    energy = comm.allreduce(float(error.x.array[:owned] @ image.x.array[:owned]))
+    assert np.sqrt(energy) < 1e-4 * solution.errors[0]
 
     bounded = system.bounded
 
@@ -145,9 +151,9 @@ def test_the_same_solution_as_a_direct_solver():
         return at_bound & (residual.x.array[bounded] > 0)
 
     assert np.array_equal(active(u, r), active(solution.u, solution.residual))
-    free = solution.residual.x.array[: V.dofmap.index_map.size_local].copy()
+    free = solution.residual.x.array[:owned].copy()
     free[bounded[active(u, r)]] = 0.0
-    norm = np.sqrt(MPI.COMM_WORLD.allreduce(float(free @ free)))
+    norm = np.sqrt(comm.allreduce(float(free @ free)))
     assert norm <= 1e-8 * system.load
 
 
@@ -171,26 +177,25 @@ def test_contact_in_several_pieces_and_corners(element):
 
 
 @pytest.mark.parametrize("example", [exact.S1, exact.A], ids=lambda e: e.name)
-def test_the_first_active_set_is_the_prediction(example):
-    """Children of active facets, each with its share of the force; no other contact facet."""
-    coarse = last(example.problem, example.mesh(0.2), 2)
-    fine, parent_cell = refine(coarse.domain)
-    level = Level(Forms(example.problem, fine.mesh), fine, 2, coarse.level, parent_cell)
-    system, V = level.system, level.V
-    start, residual = system.start(), fem.Function(V)
-    bounded = system.bounded
+def test_the_first_active_set_is_nearly_the_last(example):
+    """At most one facet off where contact ends, and with forces that hold it there."""
+    *_, coarse, fine = solve_levels(example.problem, example.mesh(0.2), 4)
+    system, level = fine.level.system, fine.level
+    start, residual = system.start(), fem.Function(level.V)
     nested_start(coarse, level, start)
     start.x.scatter_forward()
     system.residual(start, residual)
-    on_bound = start.x.array[bounded] <= system.lower[bounded]
+    bounded, comm = system.bounded, MPI.COMM_WORLD
+    gap = start.x.array[bounded] - system.lower[bounded]
     force = residual.x.array[bounded]
-    assert np.all(start.x.array[bounded] >= system.lower[bounded])
-    comm = MPI.COMM_WORLD
-    assert comm.allreduce(int(on_bound.sum())) == 2 * coarse.contact.number_active > 0
-    assert np.all(force[on_bound] > 0)
-    total = comm.allreduce(float(force[on_bound].sum()))
-    assert total == pytest.approx(coarse.contact.force, rel=1e-3)
-    assert len(fine.facets(CONTACT)) == len(bounded)
+    assert np.all(gap >= 0)
+    first = gap == 0
+    assert np.all(force[first] > 0)
+    last = fine.u.x.array[bounded] <= system.lower[bounded]
+    assert comm.allreduce(int(np.sum(first != last))) <= 1
+    assert comm.allreduce(int(first.sum())) > 20
+    assert comm.allreduce(float(force[first].sum())) == pytest.approx(fine.contact.force, rel=0.01)
+    assert len(level.domain.facets(CONTACT)) == len(bounded)
 
 
 def test_extrapolation_comes_nearer():
