@@ -17,6 +17,7 @@ from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import raise_together
 from .loads import Edge, Load, chi
+from .masking import release
 from .moments import Data
 from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
 from .parents import Layout, Parents
@@ -104,7 +105,7 @@ class Level:
         return self._p1[:2]
 
     @cached_property
-    def _p1(self) -> tuple[Grid, Layout, PETSc.Mat]:
+    def _p1(self) -> tuple[Grid, Layout, PETSc.Mat | None]:
         system, dofs = self.system, Layout.of_space(self.V)
         return p1_grid(system.A, dofs, self._owned_dirichlet, system.bounded, self._below)
 
@@ -171,6 +172,9 @@ class System:
         start, residual = self.start(), fem.Function(V)
         start.x.array[bounded] = np.maximum(self.lower[bounded], 0.0)
         self.load = self.residual(start, residual)
+
+    def __del__(self) -> None:  # noqa: D105
+        release(getattr(self, "A", None))
 
     def start(self) -> fem.Function:
         """The function that is u_D on Γ0 and 0 elsewhere."""

@@ -108,7 +108,7 @@ def contact_facts(
         domain: Mesh and boundary parts.
         u: u_h, ghosts up to date.
         residual: r = A u_h − b, ghosts up to date.
-        diagonal: Diagonal of A, owned dofs.
+        diagonal: Diagonal of A, owned dofs with a bound only.
         lower: Bound of each dof, `PETSc.NINFINITY` where there is none, ghosts included.
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: What the residual is measured against.
@@ -135,7 +135,7 @@ def contact_facts(
     gap = u.x.array[bounded] - lower[bounded]
     force = residual.x.array[bounded]
     pressure = force / weight
-    stiff_gap = diagonal[bounded] * gap
+    stiff_gap = diagonal * gap
     # The primal-dual criterion: it tells gap from pressure also where both are nearly zero
     state = on_facets(np.where(force > stiff_gap, 1.0, -1.0))
     is_active: npt.NDArray[np.bool_] = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)

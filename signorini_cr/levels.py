@@ -130,6 +130,7 @@ def _solve(
     vectors = [ghosted_vector(level.V, array) for array in arrays]
     if coarser is not None:
         nested_start(coarser, level, u)
+    diagonal = level.grid.operator.diagonal
     iterations = solve_vi(
         level.grid,
         *vectors,
@@ -149,7 +150,7 @@ def _solve(
         level.domain,
         u,
         residual,
-        diagonal=system.A.getDiagonal().array,
+        diagonal=diagonal,
         lower=system.lower,
         obstacle_at_vertices=system.obstacle_at_vertices,
         load=system.load,

@@ -16,6 +16,18 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 
+def release(*things: PETSc.Object | None) -> None:
+    """Free PETSc's objects at once.
+
+    What is left to Python's garbage collection is kept on several ranks until somebody calls
+    `PETSc.garbage_cleanup` for the very communicator, and each mesh has its own.
+    """
+    if not PETSc.Sys.isFinalized():
+        for thing in things:
+            if thing is not None:
+                thing.destroy()
+
+
 class MaskedMatrix:
     """A symmetric matrix A with the identity in the rows and columns of some dofs.
 
@@ -78,10 +90,9 @@ class MaskedMatrix:
         self._rows.multTransposeAdd(self._part, y, y)
         y.array[there] = self.times(x)[self.fixed]
 
-    def destroy(self) -> None:
+    def free(self) -> None:
         """Free the rows; the matrix should be whole by then."""
-        self._rows.destroy()
-        self._part.destroy()
+        release(self._rows, self._part)
 
     def _set(self, which: npt.NDArray[np.bool_], values: FloatArray) -> None:
         """Write the rows and the columns of some dofs."""

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from .masking import MaskedMatrix
+from .masking import MaskedMatrix, release
 from .options import PREFIX, defaults, read
 from .parents import Layout, Parents
 from .transfer import inclusion, prolongation
@@ -70,6 +70,7 @@ class Grid:
         coarser: Grid | None = None,
         sweeps: int = SWEEPS,
         on_same_mesh: bool = False,
+        owns_matrix: bool = False,
     ):
         """Join a space to the chain.
 
@@ -81,7 +82,9 @@ class Grid:
             coarser: The next space.
             sweeps: Number of Gauss-Seidel sweeps before and after.
             on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
+            owns_matrix: Whether the matrix is to end with this.
         """
+        self._owns_matrix = owns_matrix
         self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
         self.operator, self.coarser = MaskedMatrix(matrix, bounded), coarser
         self._sweeps = sweeps
@@ -92,9 +95,10 @@ class Grid:
         self._changed = True
         self._deep = False
         self._bottom: PETSc.PC | None = None
+        self._vectors: list[PETSc.Vec] = []  # residual, and the coarser space's b and x
         if coarser is not None:
-            self._r = matrix.createVecRight()
-            self._b, self._x = (coarser.matrix.createVecRight() for _ in range(2))
+            spaces = (matrix, coarser.matrix, coarser.matrix)
+            self._vectors = [space.createVecRight() for space in spaces]
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -123,13 +127,14 @@ class Grid:
             self._solve_bottom(b, x)
             return
         matrix, relaxation, sweeps = self.matrix, self._relaxation, self._sweeps
+        r, b_coarse, x_coarse = self._vectors
         matrix.SOR(b, x, relaxation, _FORWARD | _FROM_ZERO, its=sweeps)
-        matrix.mult(x, self._r)
-        self._r.aypx(-1.0, b)
-        self._transfer.multTranspose(self._r, self._b)
-        self._b.array[self.coarser._silent] = 0.0
-        self.coarser.cycle(self._b, self._x)
-        self._transfer.multAdd(self._x, x, x)
+        matrix.mult(x, r)
+        r.aypx(-1.0, b)
+        self._transfer.multTranspose(r, b_coarse)
+        b_coarse.array[self.coarser._silent] = 0.0
+        self.coarser.cycle(b_coarse, x_coarse)
+        self._transfer.multAdd(x_coarse, x, x)
         matrix.SOR(b, x, relaxation, _BACKWARD, its=sweeps)
 
     def apply(self, _: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -156,13 +161,13 @@ class Grid:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what belongs to this space alone, not the matrix it was made with."""
-        self.operator.destroy()
-        for thing in (self._transfer, self._bottom):
-            if thing is not None:
-                thing.destroy()
-        if self.coarser is not None:
-            for vector in (self._r, self._b, self._x):
-                vector.destroy()
+        release(self._transfer, self._bottom, *self._vectors)
+        self.operator.free()
+
+    def __del__(self) -> None:  # noqa: D105
+        self.free()
+        if self._owns_matrix:
+            release(self.matrix)
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:
@@ -197,7 +202,7 @@ def p1_grid(
     dirichlet: npt.NDArray[np.int32],
     bounded: npt.NDArray[np.int32],
     below: Below | None = None,
-) -> tuple[Grid, Layout, PETSc.Mat]:
+) -> tuple[Grid, Layout, PETSc.Mat | None]:
     """P1 as a subspace of CR on the same mesh.
 
     Args:
@@ -208,7 +213,7 @@ def p1_grid(
         below: What comes next, if there is a coarser mesh.
 
     Returns:
-        P1, its dofs, and the matrix that writes its functions in CR.
+        P1, its dofs, and, if there is no coarser mesh, the matrix that writes its functions in CR.
     """
     p1 = Layout.of_p1(cr.mesh)
     into_cr = inclusion(p1, cr)
@@ -218,10 +223,11 @@ def p1_grid(
     K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
     at_bounded = _touched(into_cr, bounded)
     if below is None:
-        return Grid(K, vertices, at_bounded), p1, into_cr
+        return Grid(K, vertices, at_bounded, owns_matrix=True), p1, into_cr
+    release(into_cr)
     grid, dofs, parents = below
     transfer = prolongation(dofs, p1, parents)
-    return Grid(K, vertices, at_bounded, transfer, grid), p1, into_cr
+    return Grid(K, vertices, at_bounded, transfer, grid, owns_matrix=True), p1, None
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from .masking import release
 from .multigrid import Grid
 from .options import PREFIX, read
 
@@ -85,8 +86,7 @@ class MaskedSolver:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the grid."""
-        for thing in (self.ksp, self._step):
-            thing.destroy()
+        release(self.ksp, self._step)
 
     # as the context of the Jacobian
 

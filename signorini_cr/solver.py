@@ -19,6 +19,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from .errors import NotConverged
+from .masking import release
 from .multigrid import Grid
 from .options import PREFIX, defaults, read
 from .reduced import LINEAR_SHARE, MaskedSolver
@@ -145,8 +146,7 @@ def solve_vi(
         snes.getIterationNumber(), snes.getLinearSolveIterations(), linear.describe()
     )
     linear_reason = linear.ksp.getConvergedReason()
-    for thing in (snes, jacobian, upper):
-        thing.destroy()
+    release(outer, snes, jacobian, upper)
     linear.free()
     if reason < 0:
         words = _name(PETSc.SNES.ConvergedReason, reason)

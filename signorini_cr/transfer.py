@@ -28,7 +28,8 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
         others = [j for j in range(d + 1) if j != i]
         for k, j in enumerate(others):
             columns[cr.cells[:, i], k] = p1.cells[:, j]
-    return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d), ordered=True)
+    ordered = np.sort(columns[:owned], axis=1)
+    return _matrix(cr, p1, d, ordered, np.full(owned * d, 1.0 / d))
 
 
 def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
@@ -128,35 +129,37 @@ def _sums(layout: Layout, values: FloatArray) -> FloatArray:
 
 
 def _matrix(
-    rows: Layout,
-    columns: Layout,
-    lengths: IntArray | int,
-    dofs: IntArray,
-    values: FloatArray,
-    ordered: bool = False,
+    rows: Layout, columns: Layout, lengths: IntArray | int, dofs: IntArray, values: FloatArray
 ) -> PETSc.Mat:
-    """A matrix from the owned rows' entries, one row after the other; columns as local dofs.
+    """A matrix from the owned rows' entries, one row after the other, which it takes as they are.
 
     Args:
         rows: Its rows.
         columns: Its columns.
         lengths: Number of entries of each row.
-        dofs: Their columns.
+        dofs: Their columns as local dofs, ascending in each row where products with other matrices
+            are wanted.
         values: The entries.
-        ordered: Whether columns have to ascend, as products with other matrices ask for.
     """
-    owned = rows.size[0]
+    owned, comm = rows.size[0], rows.mesh.comm
     if isinstance(lengths, int):
         start = np.arange(0, (owned + 1) * lengths, lengths, dtype=PETSc.IntType)
     else:
         start = np.zeros(owned + 1, dtype=PETSc.IntType)
         np.cumsum(lengths, out=start[1:])
-    csr = start, columns.numbers(dofs.ravel()).astype(PETSc.IntType, copy=False), values
-    size, comm = (rows.size, columns.size), rows.mesh.comm
-    if ordered or comm.size > 1:
-        matrix = PETSc.Mat().createAIJ(size, csr=csr, comm=comm)
-    else:  # enough for products with vectors, and takes the arrays as they are
-        matrix = PETSc.Mat().createAIJWithArrays(size, csr, comm=comm)
+    dofs = dofs.ravel().astype(PETSc.IntType, copy=False)
+    csr: tuple = start, dofs, values
+    if comm.size > 1:  # owned columns by local numbers, the few others by global ones
+        at = np.flatnonzero(dofs >= columns.size[0])
+        row = np.searchsorted(start, at, side="right") - 1
+        number = columns.numbers(dofs[at].astype(np.int32, copy=False))
+        at = at[np.lexsort((number, row))]
+        before = np.zeros(owned + 1, dtype=PETSc.IntType)
+        np.cumsum(np.bincount(row, minlength=owned), out=before[1:])
+        number = columns.numbers(dofs[at].astype(np.int32, copy=False))
+        inside = start - before, np.delete(dofs, at), np.delete(values, at)
+        csr = inside, (before, number.astype(PETSc.IntType, copy=False), values[at])
+    matrix = PETSc.Mat().createAIJWithArrays((rows.size, columns.size), csr, comm=comm)
     matrix.assemble()
     return matrix
 
