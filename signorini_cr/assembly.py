@@ -16,8 +16,8 @@ from petsc4py import PETSc
 from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import raise_together
+from .garbage import hold, sweep
 from .loads import Edge, Load, chi
-from .masking import release
 from .moments import Data
 from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
 from .parents import Layout, Parents
@@ -140,6 +140,8 @@ class System:
     def __init__(self, level: Level):
         forms, domain, V = level.forms, level.domain, level.V
         comm = domain.mesh.comm
+        sweep(comm)
+        hold(level, domain.mesh)
         forms.insist_on_mesh(domain.mesh)
         on_dirichlet, self.u_D, _ = _boundary_values(level, DIRICHLET)
         on_contact, lower, self.obstacle_at_vertices = _boundary_values(level, CONTACT)
@@ -172,9 +174,6 @@ class System:
         start, residual = self.start(), fem.Function(V)
         start.x.array[bounded] = np.maximum(self.lower[bounded], 0.0)
         self.load = self.residual(start, residual)
-
-    def __del__(self) -> None:  # noqa: D105
-        release(getattr(self, "A", None))
 
     def start(self) -> fem.Function:
         """The function that is u_D on Γ0 and 0 elsewhere."""

@@ -12,20 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from .garbage import release
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
-
-
-def release(*things: PETSc.Object | None) -> None:
-    """Free PETSc's objects at once.
-
-    What is left to Python's garbage collection is kept on several ranks until somebody calls
-    `PETSc.garbage_cleanup` for the very communicator, and each mesh has its own.
-    """
-    if not PETSc.Sys.isFinalized():
-        for thing in things:
-            if thing is not None:
-                thing.destroy()
 
 
 class MaskedMatrix:

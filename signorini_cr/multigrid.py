@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from .masking import MaskedMatrix, release
+from .garbage import release
+from .masking import MaskedMatrix
 from .options import PREFIX, defaults, read
 from .parents import Layout, Parents
 from .transfer import inclusion, prolongation
@@ -70,7 +71,6 @@ class Grid:
         coarser: Grid | None = None,
         sweeps: int = SWEEPS,
         on_same_mesh: bool = False,
-        owns_matrix: bool = False,
     ):
         """Join a space to the chain.
 
@@ -82,9 +82,7 @@ class Grid:
             coarser: The next space.
             sweeps: Number of Gauss-Seidel sweeps before and after.
             on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
-            owns_matrix: Whether the matrix is to end with this.
         """
-        self._owns_matrix = owns_matrix
         self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
         self.operator, self.coarser = MaskedMatrix(matrix, bounded), coarser
         self._sweeps = sweeps
@@ -164,11 +162,6 @@ class Grid:
         release(self._transfer, self._bottom, *self._vectors)
         self.operator.free()
 
-    def __del__(self) -> None:  # noqa: D105
-        self.free()
-        if self._owns_matrix:
-            release(self.matrix)
-
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:
             self._bottom = self._bottom_solver()
@@ -223,11 +216,11 @@ def p1_grid(
     K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
     at_bounded = _touched(into_cr, bounded)
     if below is None:
-        return Grid(K, vertices, at_bounded, owns_matrix=True), p1, into_cr
+        return Grid(K, vertices, at_bounded), p1, into_cr
     release(into_cr)
     grid, dofs, parents = below
     transfer = prolongation(dofs, p1, parents)
-    return Grid(K, vertices, at_bounded, transfer, grid, owns_matrix=True), p1, None
+    return Grid(K, vertices, at_bounded, transfer, grid), p1, None
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -7,7 +7,8 @@ columns of the active dofs. That is the reduced system exactly. What is behind t
 `signorini_ksp_` and `signorini_pc_` is this inner solver.
 
 It stops when its residual is a small part of what the active set's errors will leave anyway, so a
-Newton step with a wrong set ends early and one with the right set is the last.
+Newton step with a wrong set ends early and one with the right set is the last; but not before it is
+certain of each contact dof's sign, or what it left undone would decide on the next active set.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
-from .masking import release
+from .garbage import release
 from .multigrid import Grid
 from .options import PREFIX, read
 
@@ -25,7 +26,6 @@ LINEAR_SHARE = 0.7
 
 SET_SHARE = 0.3
 """What it leaves while the active set is wrong, in parts of what that adds to the residual."""
-
 
 SETTLED = 1.0
 """Part of its last change by which a contact dof's sign must be certain before the end."""
@@ -173,7 +173,7 @@ class MaskedSolver:
 
         Returns:
             The part of the residual that forces that pull and penetration will make, and whether
-            any dof's sign could still change: by no more than half of what it changed by last.
+            any dof could still change sides: its indicator is less than what it changed by last.
         """
         now = self._indicator(step)
         wrong = np.where(self._is_active == (now > 0.0), 0.0, now)

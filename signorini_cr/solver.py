@@ -19,7 +19,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from .errors import NotConverged
-from .masking import release
+from .garbage import release
 from .multigrid import Grid
 from .options import PREFIX, defaults, read
 from .reduced import LINEAR_SHARE, MaskedSolver
