@@ -41,10 +41,11 @@ LONG_SWEEPS = 3
 """The same between CR and P1 of the mesh below, where there is more to smooth."""
 
 OVER_RELAXATION = 1.3
-"""On one rank, where any factor below 2 leaves the cycle positive definite.
+"""ω on one rank; on several ω = 1.
 
-Sweeps that are local to the ranks leave the couplings between them out, and of A = M + Mᵀ −
-(2/ω − 1) D + O, with O those couplings, the last two terms have to be safe together: ω = 1 is.
+The cycle is positive definite where M + Mᵀ − A = (2/ω − 1) D − O is, D the diagonal of A and O its
+entries between ranks, which local sweeps leave out. On one rank O = 0, and any ω < 2 will do; on
+several a row may have as much in O as in D.
 """
 
 _FORWARD = PETSc.Mat.SORType.LOCAL_FORWARD_SWEEP

@@ -32,7 +32,6 @@ from .transfer import prolongate, shared_sum
 if TYPE_CHECKING:
     from .solution import Solution
 
-
 ENOUGH = 0.5
 """Part of the parent's force from which on the residual is left as the prolongation has it."""
 
