@@ -268,13 +268,16 @@ def picture(rows: list[Row], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
-    for i, name in enumerate(dict.fromkeys(r.case for r in rows)):
+    names = list(dict.fromkeys(r.case for r in rows))
+    colors = {name: f"C{i}" for i, name in enumerate(n for n in names if "mapped" not in n)}
+    for name in names:
         mine = [r for r in rows if r.case == name and r.ranks == 1 and r.dofs > 4e4]
         mine.sort(key=lambda r: r.dofs)
         if not mine:
             continue
         dofs = np.array([r.dofs for r in mine])
-        style = {"color": f"C{i // 2 % 10}", "marker": "o", "markersize": 3.5, "label": name}
+        color = colors.get(name.removesuffix(" mapped"), "black")
+        style = {"color": color, "marker": "o", "markersize": 3.5, "label": name}
         style["linestyle"] = "--" if "mapped" in name else "-"
         axes[0].semilogx(dofs, [r.all_ratio for r in mine], **style)
         axes[1].semilogx(dofs, [1e6 * r.all_levels / r.dofs for r in mine], **style)
@@ -291,8 +294,8 @@ def picture(rows: list[Row], path: Path) -> None:
 
 
 def read(folder: Path) -> list[Row]:
-    """All results in a folder."""
-    rows = []
+    """All results in a folder, by ranks, case and number of dofs."""
+    rows, order = [], list(cases())
     for path in sorted(folder.glob("*.csv")):
         with path.open(newline="") as file:
             for record in csv.DictReader(file):
@@ -300,6 +303,7 @@ def read(folder: Path) -> list[Row]:
                 rows.append(
                     Row(**{f.name: kinds[str(f.type)](record[f.name]) for f in fields(Row)})
                 )
+    rows.sort(key=lambda r: (r.ranks, order.index(r.case), r.dofs))
     return rows
 
 
