@@ -27,7 +27,7 @@ from signorini_cr.space import ghosted_vector
 
 def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
     """Time and steps of the program's method, set-up included."""
-    for name in ("grid", "_p1"):
+    for name in ("grid", "conforming"):
         level.__dict__.pop(name, None)
     A, x, steps = level.system.A, b.duplicate(), 0
 

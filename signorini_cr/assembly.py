@@ -23,7 +23,7 @@ from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
 from .parents import Layout, Parents
 from .problem import Forms
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
-from .transfer import prolongation
+from .transfer import inclusion, prolongation
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -93,8 +93,8 @@ class Level:
             transfer = prolongation(coarse_dofs, dofs, parents)
             return Grid(*own, transfer, grid, LONG_SWEEPS if dofs.cr else SWEEPS)
         if dofs.cr:
-            p1, _, into_cr = self._p1
-            return Grid(*own, into_cr, p1, on_same_mesh=True)
+            p1, vertices = self.conforming
+            return Grid(*own, inclusion(vertices, dofs), p1, on_same_mesh=True)
         return Grid(*own)
 
     @cached_property
@@ -102,10 +102,6 @@ class Level:
         """P1 on this mesh, for the next one, and its dofs."""
         if self.forms.element == "P1":
             return self.grid, Layout.of_space(self.V)
-        return self._p1[:2]
-
-    @cached_property
-    def _p1(self) -> tuple[Grid, Layout, PETSc.Mat | None]:
         system, dofs = self.system, Layout.of_space(self.V)
         return p1_grid(system.A, dofs, self._owned_dirichlet, system.bounded, self._below)
 
@@ -134,7 +130,8 @@ class System:
         u_D: Function with the Dirichlet values, 0 elsewhere.
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: Norm of the residual at the most trivial start, which all residuals are measured
-            against: zero, raised to α on Γ1 where that is positive, u_D on Γ0.
+            against: the number in the middle of the values u_D takes, raised to α on Γ1 where that
+            is larger, u_D on Γ0. A constant added to u_D and α makes no difference.
     """
 
     def __init__(self, level: Level):
@@ -172,7 +169,12 @@ class System:
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
         start, residual = self.start(), fem.Function(V)
-        start.x.array[bounded] = np.maximum(self.lower[bounded], 0.0)
+        on_dirichlet_values = self.u_D.x.array[self.dirichlet]
+        top = comm.allreduce(float(on_dirichlet_values.max(initial=-np.inf)), op=MPI.MAX)
+        bottom = comm.allreduce(float(on_dirichlet_values.min(initial=np.inf)), op=MPI.MIN)
+        middle = 0.5 * (bottom + top) if bottom <= top else 0.0
+        start.x.array[~on_dirichlet] = middle
+        start.x.array[bounded] = np.maximum(self.lower[bounded], middle)
         self.load = self.residual(start, residual)
 
     def start(self) -> fem.Function:

@@ -13,6 +13,7 @@ from .assembly import Level
 from .contact import contact_facts
 from .domain import Domain
 from .errors import InputError
+from .garbage import release
 from .hierarchy import refine
 from .nested import nested_start
 from .problem import Forms, Problem
@@ -131,18 +132,19 @@ def _solve(
     if coarser is not None:
         nested_start(coarser, level, u)
     diagonal = level.grid.operator.diagonal
-    iterations = solve_vi(
-        level.grid,
-        *vectors,
-        load=system.load,
-        monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
-        level=level.number,
-    )
-    if level.forms.element != "P1":
-        level.grid.free()  # the next level needs P1 alone
-        del level.grid
-    for vector in vectors:
-        vector.destroy()
+    try:
+        iterations = solve_vi(
+            level.grid,
+            *vectors,
+            load=system.load,
+            monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
+            level=level.number,
+        )
+    finally:
+        if level.forms.element != "P1":
+            level.grid.free()  # the next level needs P1 alone
+            del level.grid
+        release(*vectors)
     for function in (u, residual):
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock

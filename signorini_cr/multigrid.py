@@ -2,7 +2,8 @@
 
 A chain of grids, finest first: CR, then P1 on the mesh below and on all coarser ones. P1 ⊂ CR and
 coarse P1 ⊂ fine P1 and therefore coarse P1 ⊂ fine CR, so that the coarse matrices are Galerkin
-products; each is computed once, on its own mesh, and the finest mesh needs none. Dofs on the
+products (where the coefficient is constant on the coarse cells, and nearly so where it varies
+little on them); each is computed once, on its own mesh, and the finest mesh needs none. Dofs on the
 obstacle are taken out on every grid: the matrix has the identity there, and a coarse function that
 does not vanish at a fixed dof of the finer grid is fixed too, which leaves subspaces of the reduced
 space. Smoothing is by Gauss-Seidel sweeps, forward before and backward after the coarse correction,
@@ -196,7 +197,7 @@ def p1_grid(
     dirichlet: npt.NDArray[np.int32],
     bounded: npt.NDArray[np.int32],
     below: Below | None = None,
-) -> tuple[Grid, Layout, PETSc.Mat | None]:
+) -> tuple[Grid, Layout]:
     """P1 as a subspace of CR on the same mesh.
 
     Args:
@@ -207,7 +208,7 @@ def p1_grid(
         below: What comes next, if there is a coarser mesh.
 
     Returns:
-        P1, its dofs, and, if there is no coarser mesh, the matrix that writes its functions in CR.
+        P1 and its dofs.
     """
     p1 = Layout.of_p1(cr.mesh)
     into_cr = inclusion(p1, cr)
@@ -216,12 +217,12 @@ def p1_grid(
     vertices = _touched(into_cr, dirichlet)
     K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
     at_bounded = _touched(into_cr, bounded)
-    if below is None:
-        return Grid(K, vertices, at_bounded), p1, into_cr
     release(into_cr)
+    if below is None:
+        return Grid(K, vertices, at_bounded), p1
     grid, dofs, parents = below
     transfer = prolongation(dofs, p1, parents)
-    return Grid(K, vertices, at_bounded, transfer, grid), p1, None
+    return Grid(K, vertices, at_bounded, transfer, grid), p1
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

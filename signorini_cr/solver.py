@@ -33,7 +33,10 @@ SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""
 
 SET_STEPS = 2
-"""Newton steps to that end alone, when the residual as a whole is small enough already."""
+"""Newton steps to that end alone, when the residual as a whole is small enough already.
+
+One less after as many steps: what takes long has been looked at often.
+"""
 
 DIVERGED_NAN = -4
 """PETSc's number; its name depends on the version."""
@@ -126,9 +129,10 @@ def solve_vi(
         if not np.isfinite(norm):
             return DIVERGED_NAN
         small = max(atol, rtol * start)
-        if norm > small:
+        if norm > (small if step > 0 else SET_TOLERANCE * small):
             return Reason.ITERATING
-        if step > 0 and for_the_set < SET_STEPS and linear.disputed() > SET_TOLERANCE * small:
+        allowed = SET_STEPS if step <= SET_STEPS else 1
+        if step > 0 and for_the_set < allowed and linear.disputed() > SET_TOLERANCE * small:
             for_the_set += 1
             return Reason.ITERATING
         return Reason.CONVERGED_FNORM_ABS
@@ -139,15 +143,14 @@ def solve_vi(
         read(snes)
     try:
         snes.solve(None, x)
-    finally:
-        operator.fix(operator.dofs[:0])
-    reason = snes.getConvergedReason()
-    iterations = Iterations(
-        snes.getIterationNumber(), snes.getLinearSolveIterations(), linear.describe()
-    )
-    linear_reason = linear.ksp.getConvergedReason()
-    release(outer, snes, jacobian, upper)
-    linear.free()
+        reason, linear_reason = snes.getConvergedReason(), linear.ksp.getConvergedReason()
+        iterations = Iterations(
+            snes.getIterationNumber(), snes.getLinearSolveIterations(), linear.describe()
+        )
+    finally:  # a monitor may raise
+        grid.fix(operator.dofs[:0], deep=False)
+        release(outer, snes, jacobian, upper)
+        linear.free()
     if reason < 0:
         words = _name(PETSc.SNES.ConvergedReason, reason)
         if linear_reason < 0:

@@ -248,6 +248,36 @@ def test_the_first_active_set_is_nearly_the_last(example):
     assert len(level.domain.facets(CONTACT)) == len(bounded)
 
 
+def test_a_constant_added_to_the_data_changes_nothing():
+    """Neither the set nor, up to what is left of the residual, the force."""
+
+    def shifted(c):
+        problem = Problem(
+            f=lambda x: 5 * ufl.sin(9 * x[0] + 5 * x[1]),
+            obstacle=lambda x: c + 0.02 * x[1],
+            dirichlet=c,
+        )
+        square = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact"] * 3 + ["dirichlet"])
+        return last(problem, square.mesh(0.3), 4)
+
+    plain, lifted = shifted(0.0), shifted(1e5)
+    assert lifted.level.system.load == pytest.approx(plain.level.system.load, rel=1e-6)
+    assert lifted.contact.number_active == plain.contact.number_active > 0
+    assert lifted.contact.force == pytest.approx(plain.contact.force, rel=1e-6)
+
+
+def test_a_level_can_be_solved_again():
+    """The multigrid is made anew, on the coarsest mesh too."""
+    solution = last(exact.S1.problem, exact.S1.structured(4), 1)
+    grid, system = solution.level.grid, solution.level.system
+    u, r = system.start(), fem.Function(solution.level.V)
+    arrays = system.b.x.array, system.lower, u.x.array, r.x.array
+    again = solve_vi(grid, *(ghosted_vector(solution.level.V, a) for a in arrays), load=system.load)
+    assert again.newton == solution.iterations.newton
+    owned = solution.level.V.dofmap.index_map.size_local
+    assert difference(u.x.array[:owned], solution.u.x.array[:owned]) < 1e-12
+
+
 def test_extrapolation_comes_nearer():
     """By an order of magnitude where the solution is smooth."""
     *_, middle, coarse = solve_levels(exact.A.problem, exact.A.mesh(0.2), 4)
