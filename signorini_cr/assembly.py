@@ -27,6 +27,9 @@ from .transfer import inclusion, prolongation
 
 FloatArray = npt.NDArray[np.float64]
 
+ROUNDING = 1e-5
+"""Least load, in parts of what it would be from zero: A u is not known to all digits of u."""
+
 
 @dataclass
 class Level:
@@ -131,7 +134,8 @@ class System:
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: Norm of the residual at the most trivial start, which all residuals are measured
             against: the number in the middle of the values u_D takes, raised to α on Γ1 where that
-            is larger, u_D on Γ0. A constant added to u_D and α makes no difference.
+            is larger, u_D on Γ0. A constant added to u_D and α makes no difference unless it is
+            so large that differences drown in it.
     """
 
     def __init__(self, level: Level):
@@ -168,14 +172,22 @@ class System:
             vector.x.scatter_forward()
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
-        start, residual = self.start(), fem.Function(V)
-        on_dirichlet_values = self.u_D.x.array[self.dirichlet]
-        top = comm.allreduce(float(on_dirichlet_values.max(initial=-np.inf)), op=MPI.MAX)
-        bottom = comm.allreduce(float(on_dirichlet_values.min(initial=np.inf)), op=MPI.MIN)
-        middle = 0.5 * (bottom + top) if bottom <= top else 0.0
-        start.x.array[~on_dirichlet] = middle
-        start.x.array[bounded] = np.maximum(self.lower[bounded], middle)
-        self.load = self.residual(start, residual)
+        self.load = self._load(bounded)
+
+    def _load(self, bounded: npt.NDArray[np.bool_]) -> float:
+        """The load; ``bounded`` tells for all local dofs whether they have a bound."""
+        comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
+        top = comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
+        bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
+        norms = []
+        for number in (0.5 * (bottom + top) if bottom <= top else 0.0, 0.0):
+            start, residual = self.start(), fem.Function(self.u_D.function_space)
+            free = np.ones(len(start.x.array), dtype=bool)
+            free[self.dirichlet] = False
+            start.x.array[free] = number
+            start.x.array[bounded] = np.maximum(self.lower[bounded], number)
+            norms.append(self.residual(start, residual))
+        return max(norms[0], ROUNDING * norms[1])
 
     def start(self) -> fem.Function:
         """The function that is u_D on Γ0 and 0 elsewhere."""

@@ -129,7 +129,7 @@ def solve_vi(
         if not np.isfinite(norm):
             return DIVERGED_NAN
         small = max(atol, rtol * start)
-        if norm > (small if step > 0 else SET_TOLERANCE * small):
+        if norm > small:
             return Reason.ITERATING
         allowed = SET_STEPS if step <= SET_STEPS else 1
         if step > 0 and for_the_set < allowed and linear.disputed() > SET_TOLERANCE * small:
