@@ -201,7 +201,6 @@ def measure(name: str, dofs: float, repeats: int) -> Iterator[Row]:
                 break
         del solution
         gc.collect()
-        PETSc.garbage_cleanup(comm)
         runs.append(run)
     for level in range(len(runs[0])):
         sums = [sum(row["vi"] for row in run[: level + 1]) for run in runs]
@@ -299,9 +298,8 @@ def read(folder: Path) -> list[Row]:
     for path in sorted(folder.glob("*.csv")):
         with path.open(newline="") as file:
             for record in csv.DictReader(file):
-                kinds = {"str": str, "int": int, "float": float}
                 rows.append(
-                    Row(**{f.name: kinds[str(f.type)](record[f.name]) for f in fields(Row)})
+                    Row(**{f.name: KINDS[str(f.type)](record[f.name]) for f in fields(Row)})
                 )
     rows.sort(key=lambda r: (r.ranks, order.index(r.case), r.dofs))
     return rows

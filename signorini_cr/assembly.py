@@ -179,15 +179,16 @@ class System:
         comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
         top = comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
         bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
+        middle = 0.5 * (bottom + top) if bottom <= top else 0.0
         norms = []
-        for number in (0.5 * (bottom + top) if bottom <= top else 0.0, 0.0):
+        for number in dict.fromkeys((middle, 0.0)):
             start, residual = self.start(), fem.Function(self.u_D.function_space)
             free = np.ones(len(start.x.array), dtype=bool)
             free[self.dirichlet] = False
             start.x.array[free] = number
             start.x.array[bounded] = np.maximum(self.lower[bounded], number)
             norms.append(self.residual(start, residual))
-        return max(norms[0], ROUNDING * norms[1])
+        return max(norms[0], ROUNDING * norms[-1])
 
     def start(self) -> fem.Function:
         """The function that is u_D on Γ0 and 0 elsewhere."""

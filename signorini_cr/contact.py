@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import basix
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -17,7 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .domain import CONTACT, Domain
-from .space import closure_dofs, facet_entities, facet_measures, vertex_values
+from .space import closure_dofs, facet_corners, facet_entities, facet_measures, vertex_values
 from .walk import along_boundary
 
 FloatArray = npt.NDArray[np.float64]
@@ -192,5 +191,5 @@ def _cells_values(u: fem.Function, facets: npt.NDArray[np.int32]) -> FloatArray:
     """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
     mesh = u.function_space.mesh
     cells, local = facet_entities(mesh, facets).T
-    corners = np.array(basix.topology(mesh.basix_cell())[-2])
+    corners = facet_corners(mesh)
     return np.take_along_axis(vertex_values(u, cells), corners[local], axis=1)

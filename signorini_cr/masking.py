@@ -40,8 +40,7 @@ class MaskedMatrix:
         rows = PETSc.IS().createGeneral(numbers, comm=A.comm)
         columns = PETSc.IS().createStride(A.getLocalSize()[1], first, 1, comm=A.comm)
         self._rows = A.createSubMatrix(rows, columns)
-        for thing in (rows, columns):
-            thing.destroy()
+        release(rows, columns)
         start, self._column, self._value = self._rows.getValuesCSR()
         self._entry = np.repeat(np.arange(len(dofs)), np.diff(start))
         self._row = numbers[self._entry]

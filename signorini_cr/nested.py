@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import basix
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
@@ -26,7 +25,13 @@ from . import compat
 from .assembly import Level
 from .domain import CONTACT
 from .parents import Layout, barycentric_coordinates
-from .space import closure_dofs, facet_entities, facet_measures, ghosted_vector
+from .space import (
+    closure_dofs,
+    facet_corners,
+    facet_entities,
+    facet_measures,
+    ghosted_vector,
+)
 from .transfer import prolongate, shared_sum
 
 if TYPE_CHECKING:
@@ -116,7 +121,7 @@ def _from_parents(
     dof = V.dofmap.list[parents, local]
     force = coarse.residual.x.array[dof]
     active = (coarse.u.x.array[dof] <= coarse.level.system.lower[dof]) & (force > 0.0)
-    ends = Layout.of_p1(mesh).cells[parents[:, None], _corners(mesh)[local]]
+    ends = Layout.of_p1(mesh).cells[parents[:, None], facet_corners(mesh)[local]]
     at_front = _front(coarse)[ends].any(axis=1)
     return active, force * measure / parent_measure, at_front
 
@@ -126,15 +131,10 @@ def _front(solution: Solution) -> npt.NDArray[np.bool_]:
     mesh, contact = solution.domain.mesh, solution.contact
     p1 = Layout.of_p1(mesh)
     cells, local = facet_entities(mesh, contact.facets).T
-    ends = p1.cells[cells[:, None], _corners(mesh)[local]]
+    ends = p1.cells[cells[:, None], facet_corners(mesh)[local]]
     there = np.ones(p1.size[0] + p1.index_map.num_ghosts, dtype=bool)
     for which in (contact.active, ~contact.active):
         count = np.zeros(len(there))
         np.add.at(count, ends[which], 1.0)
         there &= shared_sum(p1, count) > 0.0
     return there
-
-
-def _corners(mesh: Mesh) -> npt.NDArray[np.intp]:
-    """The vertices of a cell's facets, shape (d + 1, d)."""
-    return np.array(basix.topology(mesh.basix_cell())[-2])

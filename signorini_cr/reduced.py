@@ -128,12 +128,15 @@ class MaskedSolver:
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 
+    def active(self) -> npt.NDArray[np.bool_]:
+        """Which bounded dofs are on their bound with a residual pushing them there, shape (n,)."""
+        dofs = self._grid.operator.dofs
+        return (self._x.array_r[dofs] <= self._lower) & (self._residual.array_r[dofs] > 0.0)
+
     def disputed(self) -> float:
         """Norm of the residual in the dofs that the last system had in the wrong set."""
-        dofs = self._grid.operator.dofs
-        force = self._residual.array_r[dofs]
-        active = (self._x.array_r[dofs] <= self._lower) & (force > 0.0)
-        local = float(np.sum(force[active != self._is_active] ** 2))
+        force = self._residual.array_r[self._grid.operator.dofs]
+        local = float(np.sum(force[self.active() != self._is_active] ** 2))
         return float(np.sqrt(self._x.getComm().tompi4py().allreduce(local)))
 
     def _test(self, ksp: PETSc.KSP, iteration: int, norm: float) -> int:

@@ -113,9 +113,7 @@ def solve_vi(
 
     def report(snes: PETSc.SNES, step: int, norm: float) -> None:
         if monitor is not None:
-            x = snes.getSolution().array_r[operator.dofs]
-            active = (x <= bounds) & (residual.array_r[operator.dofs] > 0)
-            number = comm.tompi4py().allreduce(int(active.sum()))
+            number = comm.tompi4py().allreduce(int(linear.active().sum()))
             monitor(step, norm, number, snes.getLinearSolveIterations())
 
     start, for_the_set = 0.0, 0

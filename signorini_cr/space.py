@@ -62,6 +62,11 @@ def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
     )
 
 
+def facet_corners(mesh: Mesh) -> npt.NDArray[np.intp]:
+    """The vertices of a cell's facets by local number, shape (d + 1, d)."""
+    return np.array(basix.topology(mesh.basix_cell())[-2])
+
+
 def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
     """The dofs that fix a function on boundary facets.
 
@@ -99,7 +104,7 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
     """
     tdim = mesh.topology.dim
     cells, local = facet_entities(mesh, facets).T
-    corners = np.array(basix.topology(mesh.basix_cell())[-2])
+    corners = facet_corners(mesh)
     x = mesh.geometry.x[np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)]
     edges = x[:, 1:] - x[:, :1]
     gram = np.einsum("nid,njd->nij", edges, edges)

@@ -153,10 +153,10 @@ def _matrix(
         at = np.flatnonzero(dofs >= columns.size[0])
         row = np.searchsorted(start, at, side="right") - 1
         number = columns.numbers(dofs[at].astype(np.int32, copy=False))
-        at = at[np.lexsort((number, row))]
+        order = np.lexsort((number, row))
+        at, number = at[order], number[order]
         before = np.zeros(owned + 1, dtype=PETSc.IntType)
         np.cumsum(np.bincount(row, minlength=owned), out=before[1:])
-        number = columns.numbers(dofs[at].astype(np.int32, copy=False))
         inside = start - before, np.delete(dofs, at), np.delete(values, at)
         csr = inside, (before, number.astype(PETSc.IntType, copy=False), values[at])
     matrix = PETSc.Mat().createAIJWithArrays((rows.size, columns.size), csr, comm=comm)
