@@ -90,7 +90,7 @@ class Level:
     def grid(self) -> Grid:
         """The multigrid that starts with the discrete space."""
         system, dofs = self.system, Layout.of_space(self.V)
-        own = system.A, self._owned_dirichlet, system.bounded
+        own = system.A, dofs, self._owned_dirichlet, system.bounded
         if self._below is not None:
             grid, coarse_dofs, parents = self._below
             transfer = prolongation(coarse_dofs, dofs, parents)

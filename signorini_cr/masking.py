@@ -32,9 +32,6 @@ class MaskedMatrix:
         """Note the rows of the dofs, all that may ever have to be taken out."""
         self.masked, self.dofs = A, dofs
         self.fixed: npt.NDArray[np.bool_] = np.zeros(len(dofs), dtype=bool)
-        diagonal = A.getDiagonal()
-        self.diagonal: FloatArray = diagonal.array_r[dofs].copy()
-        diagonal.destroy()
         first = A.getOwnershipRange()[0]
         numbers = (dofs + first).astype(PETSc.IntType)
         rows = PETSc.IS().createGeneral(numbers, comm=A.comm)
@@ -44,6 +41,7 @@ class MaskedMatrix:
         start, self._column, self._value = self._rows.getValuesCSR()
         self._entry = np.repeat(np.arange(len(dofs)), np.diff(start))
         self._row = numbers[self._entry]
+        self.diagonal: FloatArray = self._value[self._column == self._row]
         self._part = self._rows.createVecLeft()
 
     def fix(self, dofs: IntArray) -> bool:

@@ -6,8 +6,8 @@ products (where the coefficient is constant on the coarse cells, and nearly so w
 little on them); each is computed once, on its own mesh, and the finest mesh needs none. Dofs on the
 obstacle are taken out on every grid: the matrix has the identity there, and a coarse function that
 does not vanish at a fixed dof of the finer grid is fixed too, which leaves subspaces of the reduced
-space. Smoothing is by Gauss-Seidel sweeps, forward before and backward after the coarse correction,
-over-relaxed on one rank and local to each on several, as in every parallel algebraic multigrid.
+space. Smoothing is by over-relaxed Gauss-Seidel sweeps, forward before and backward after the
+coarse correction.
 
 Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG: the
 auxiliary space method. Small bottom grids are solved directly.
@@ -23,6 +23,7 @@ from .garbage import release
 from .masking import MaskedMatrix
 from .options import PREFIX, defaults, read
 from .parents import Layout, Parents
+from .smoothing import GaussSeidel
 from .transfer import inclusion, prolongation
 
 DIRECT = 2000
@@ -41,18 +42,6 @@ SWEEPS = 2
 LONG_SWEEPS = 3
 """The same between CR and P1 of the mesh below, where there is more to smooth."""
 
-OVER_RELAXATION = 1.3
-"""ω on one rank; on several ω = 1.
-
-The cycle is positive definite where M + Mᵀ − A = (2/ω − 1) D − O is, D the diagonal of A and O its
-entries between ranks, which local sweeps leave out. On one rank O = 0, and any ω < 2 will do; on
-several a row may have as much in O as in D.
-"""
-
-_FORWARD = PETSc.Mat.SORType.LOCAL_FORWARD_SWEEP
-_BACKWARD = PETSc.Mat.SORType.LOCAL_BACKWARD_SWEEP
-_FROM_ZERO = PETSc.Mat.SORType.ZERO_INITIAL_GUESS
-
 
 class Grid:
     """One space of the chain, and everything below it.
@@ -67,6 +56,7 @@ class Grid:
     def __init__(
         self,
         matrix: PETSc.Mat,
+        dofs: Layout,
         dirichlet: npt.NDArray[np.int32],
         bounded: npt.NDArray[np.int32],
         transfer: PETSc.Mat | None = None,
@@ -78,6 +68,7 @@ class Grid:
 
         Args:
             matrix: Its matrix, the identity in the rows and columns of the dofs on Γ0.
+            dofs: Its dofs.
             dirichlet: Its owned dofs on Γ0, local numbers.
             bounded: Its owned dofs that may be taken out, local numbers, ascending.
             transfer: The matrix that writes functions of the coarser space in this one.
@@ -87,8 +78,6 @@ class Grid:
         """
         self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
         self.operator, self.coarser = MaskedMatrix(matrix, bounded), coarser
-        self._sweeps = sweeps
-        self._relaxation = OVER_RELAXATION if matrix.getComm().getSize() == 1 else 1.0
         self._transfer = transfer
         self._dirichlet = dirichlet
         self._silent = dirichlet
@@ -96,7 +85,9 @@ class Grid:
         self._deep = False
         self._bottom: PETSc.PC | None = None
         self._vectors: list[PETSc.Vec] = []  # residual, and the coarser space's b and x
+        self._smoother: GaussSeidel | None = None
         if coarser is not None:
+            self._smoother = GaussSeidel(matrix, dofs, sweeps)
             spaces = (matrix, coarser.matrix, coarser.matrix)
             self._vectors = [space.createVecRight() for space in spaces]
 
@@ -114,6 +105,8 @@ class Grid:
         """
         if self.operator.fix(dofs):
             self._silent = np.concatenate([self._dirichlet, dofs])
+            if self._smoother is not None:
+                self._smoother.take_out(dofs)
             self._changed = True
         elif self._deep or not deep:
             return
@@ -123,19 +116,18 @@ class Grid:
 
     def cycle(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """One V-cycle for masked x = b, from x = 0; b is 0 in the fixed dofs."""
-        if self.coarser is None or self._transfer is None:
+        if self.coarser is None or self._transfer is None or self._smoother is None:
             self._solve_bottom(b, x)
             return
-        matrix, relaxation, sweeps = self.matrix, self._relaxation, self._sweeps
         r, b_coarse, x_coarse = self._vectors
-        matrix.SOR(b, x, relaxation, _FORWARD | _FROM_ZERO, its=sweeps)
-        matrix.mult(x, r)
+        self._smoother.forward(b, x)
+        self.matrix.mult(x, r)
         r.aypx(-1.0, b)
         self._transfer.multTranspose(r, b_coarse)
         b_coarse.array[self.coarser._silent] = 0.0
         self.coarser.cycle(b_coarse, x_coarse)
         self._transfer.multAdd(x_coarse, x, x)
-        matrix.SOR(b, x, relaxation, _BACKWARD, its=sweeps)
+        self._smoother.backward(b, x)
 
     def apply(self, _: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """The V-cycle as PETSc's preconditioner of type python."""
@@ -162,6 +154,8 @@ class Grid:
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what belongs to this space alone, not the matrix it was made with."""
         release(self._transfer, self._bottom, *self._vectors)
+        if self._smoother is not None:
+            self._smoother.free()
         self.operator.free()
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -219,10 +213,10 @@ def p1_grid(
     at_bounded = _touched(into_cr, bounded)
     release(into_cr)
     if below is None:
-        return Grid(K, vertices, at_bounded), p1
+        return Grid(K, p1, vertices, at_bounded), p1
     grid, dofs, parents = below
     transfer = prolongation(dofs, p1, parents)
-    return Grid(K, vertices, at_bounded, transfer, grid), p1
+    return Grid(K, p1, vertices, at_bounded, transfer, grid), p1
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -21,7 +21,7 @@ from .garbage import release
 from .multigrid import Grid
 from .options import PREFIX, read
 
-LINEAR_SHARE = 0.7
+LINEAR_SHARE = 0.9
 """What the linear solver leaves at the end, in parts of what the residual may be."""
 
 SET_SHARE = 0.3

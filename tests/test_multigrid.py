@@ -156,7 +156,7 @@ def test_the_same_solution_as_a_direct_solver(example, shift, request):
         ghosted_vector(V, a) for a in (system.b.x.array, system.lower, u.x.array, r.x.array)
     )
     request.getfixturevalue("direct")
-    grid = Grid(system.A, system.dirichlet, system.bounded)
+    grid = Grid(system.A, Layout.of_space(V), system.dirichlet, system.bounded)
     cold = solve_vi(grid, b, lower, x, residual, load=system.load, tolerance=1e-10)
     assert cold.newton > 1
     x.ghostUpdate()

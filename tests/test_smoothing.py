@@ -1,0 +1,74 @@
+"""Gauss-Seidel sweeps, against PETSc's own, and what goes on between the ranks."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from signorini_cr import Polygon, Problem, exact
+from signorini_cr.assembly import Level
+from signorini_cr.parents import Layout
+from signorini_cr.problem import Forms
+from signorini_cr.smoothing import OVER_RELAXATION, GaussSeidel
+
+# Corners of five degrees: large entries, many of them positive
+FLAT = Polygon([[0, 0], [5, 0], [5, 0.4]], ["contact", "dirichlet", "neumann"])
+
+
+def system(domain, element):
+    level = Level(Forms(Problem(), domain.mesh, element), domain)
+    return level.system, Layout.of_space(level.V)
+
+
+def random(matrix, seed):
+    vector = matrix.createVecRight()
+    rng = np.random.default_rng(seed + 10 * MPI.COMM_WORLD.rank)
+    vector.array[:] = rng.standard_normal(vector.local_size)
+    return vector
+
+
+def dense(matrix):
+    """The whole matrix on every rank, and the rank that owns each row."""
+    rows = matrix.getSize()[0]
+    first, end = matrix.getOwnershipRange()
+    start, columns, values = matrix.getValuesCSR()
+    mine = np.zeros((rows, rows))
+    mine[np.repeat(np.arange(first, end), np.diff(start)), columns] = values
+    owner = np.zeros(rows, dtype=np.int64)
+    owner[first:end] = MPI.COMM_WORLD.rank
+    comm = MPI.COMM_WORLD
+    return comm.allreduce(mine), comm.allreduce(owner)
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("sweeps", [1, 3])
+def test_sweeps_are_petscs(element, sweeps):
+    own, dofs = system(exact.S1.mesh(0.1), element)
+    smoother = GaussSeidel(own.A, dofs, sweeps)
+    b, start = random(own.A, 1), random(own.A, 2)
+    for name, way in (
+        ("forward", PETSc.Mat.SORType.LOCAL_FORWARD_SWEEP | PETSc.Mat.SORType.ZERO_INITIAL_GUESS),
+        ("backward", PETSc.Mat.SORType.LOCAL_BACKWARD_SWEEP),
+    ):
+        x, theirs = start.copy(), start.copy()
+        getattr(smoother, name)(b, x)
+        own.A.SOR(b, theirs, smoother.relaxation, way, its=sweeps)
+        scale = theirs.norm()
+        theirs.axpy(-1.0, x)
+        assert theirs.norm() < 1e-13 * scale
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("domain", [exact.S1.mesh(0.1), FLAT.mesh(0.1)], ids=["square", "flat"])
+def test_the_relaxation_leaves_a_cycle_positive_definite(element, domain):
+    """(2/ω − 1) D − O has positive eigenvalues, and ω is not much smaller than need be."""
+    own, dofs = system(domain, element)
+    relaxation = GaussSeidel(own.A, dofs, 2).relaxation
+    A, owner = dense(own.A)
+    scale = np.sqrt(A.diagonal())
+    between = np.where(owner[:, None] == owner, 0.0, A) / scale / scale[:, None]
+    eigenvalues = np.linalg.eigvalsh(between)
+    assert 2.0 / relaxation - 1.0 > eigenvalues[-1]
+    assert relaxation >= min(OVER_RELAXATION, 0.85 * 2.0 / (1.0 + np.abs(eigenvalues).max()))
+    if MPI.COMM_WORLD.size == 1:
+        assert relaxation == OVER_RELAXATION
