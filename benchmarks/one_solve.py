@@ -59,7 +59,7 @@ CROOKED = Polygon(
     holes=[Polygon([[1, 0.5], [1.7, 0.4], [1.3, 0.9]], ["contact", "neumann", "dirichlet"])],
 )
 PUSHED = Problem(
-    f=lambda x: 3 * ufl.sin(5 * x[0]), g=lambda x: x[1], dirichlet=lambda x: 0.5 + x[1]
+    f=lambda x: 12 * ufl.sin(5 * x[0]) - 5, g=lambda x: x[1] - 1, dirichlet=lambda x: 0.2 + x[1]
 )
 
 

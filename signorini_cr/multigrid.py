@@ -36,6 +36,8 @@ _AMG = {
     "pc_hypre_boomeramg_relax_type_up": "backward-SOR/Jacobi",
 }
 
+_BOTTOM = PREFIX + "bottom_"
+
 SWEEPS = 2
 """Gauss-Seidel sweeps before and after the coarse correction."""
 
@@ -144,9 +146,14 @@ class Grid:
 
     def describe(self) -> str:
         """What the cycle is, in words."""
-        bottom = "a direct solver" if self.bottom_is_direct else "BoomerAMG"
         if self.coarser is None:
-            return bottom
+            kind = self._bottom_type if self._bottom is None else self._bottom.getType()
+            usual = "a direct solver" if self.bottom_is_direct else "BoomerAMG"
+            return usual if kind == self._bottom_type else f"{kind} (option -{_BOTTOM}pc_type)"
+        grid = self
+        while grid.coarser is not None:
+            grid = grid.coarser
+        bottom = grid.describe()
         if self.meshes == 1:
             return f"P1 auxiliary space with {bottom} (there is no coarser mesh)"
         return f"geometric multigrid on {self.meshes} meshes with {bottom} on the coarsest"
@@ -167,16 +174,19 @@ class Grid:
             self._changed = False
         self._bottom.apply(b, x)
 
+    @property
+    def _bottom_type(self) -> str:
+        """What solves this space at the bottom unless options say otherwise."""
+        if not self.bottom_is_direct:
+            return PETSc.PC.Type.HYPRE
+        alone = self.matrix.getComm().getSize() == 1
+        return PETSc.PC.Type.CHOLESKY if alone else PETSc.PC.Type.REDUNDANT
+
     def _bottom_solver(self) -> PETSc.PC:
         pc = PETSc.PC().create(self.matrix.getComm())
-        pc.setOptionsPrefix(PREFIX + "bottom_")
-        if not self.bottom_is_direct:
-            pc.setType(PETSc.PC.Type.HYPRE)
-        elif self.matrix.getComm().getSize() == 1:
-            pc.setType(PETSc.PC.Type.CHOLESKY)
-        else:
-            pc.setType(PETSc.PC.Type.REDUNDANT)
-        with defaults(_AMG if not self.bottom_is_direct else {}, PREFIX + "bottom_"):
+        pc.setOptionsPrefix(_BOTTOM)
+        pc.setType(self._bottom_type)
+        with defaults(_AMG if not self.bottom_is_direct else {}, _BOTTOM):
             read(pc)
         return pc
 

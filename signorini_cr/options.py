@@ -22,10 +22,33 @@ def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:
     try:
         thing.setFromOptions()
     except PETSc.Error as error:
-        words = str(error).splitlines()[-1].split("] ", 1)[-1]
         raise InputError(
-            f"PETSc refuses an option that begins with -{thing.getOptionsPrefix()}: {words}"
+            f"PETSc refuses an option that begins with -{thing.getOptionsPrefix()}: {_words(error)}"
         ) from error
+
+
+@contextmanager
+def explained() -> Iterator[None]:
+    """Say what is behind errors of PETSc in a block.
+
+    What Python code raises that PETSc calls, a monitor for one, comes out as it was raised.
+
+    Raises:
+        InputError: PETSc stopped, and options have been set.
+    """
+    try:
+        yield
+    except PETSc.Error as error:
+        origin: BaseException = error
+        while isinstance(origin, PETSc.Error) and origin.__cause__ is not None:
+            origin = origin.__cause__
+        if not isinstance(origin, PETSc.Error):
+            raise origin from origin.__cause__
+        options = PETSc.Options(PREFIX).getAll()
+        if not options:
+            raise
+        given = ", ".join(f"-{PREFIX}{name} {value}".rstrip() for name, value in options.items())
+        raise InputError(f"PETSc can't solve with {given}: {_words(origin)}") from error
 
 
 @contextmanager
@@ -40,3 +63,8 @@ def defaults(options: Mapping[str, object], prefix: str = PREFIX) -> Iterator[No
     finally:
         for name in ours:
             database.delValue(name)
+
+
+def _words(error: BaseException) -> str:
+    """The last line of an error of PETSc, which says what went wrong; those before say where."""
+    return str(error).splitlines()[-1].split("] ", 1)[-1]

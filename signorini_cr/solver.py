@@ -21,7 +21,7 @@ from petsc4py import PETSc
 from .errors import NotConverged
 from .garbage import release
 from .multigrid import Grid
-from .options import PREFIX, defaults, read
+from .options import PREFIX, defaults, explained, read
 from .reduced import LINEAR_SHARE, MaskedSolver
 
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
@@ -83,6 +83,7 @@ def solve_vi(
 
     Raises:
         NotConverged: With the name PETSc gives to the reason.
+        InputError: PETSc can't solve with the options that are set.
     """
     operator, comm = grid.operator, grid.matrix.getComm()
     bounds = lower.array_r[operator.dofs]
@@ -140,7 +141,8 @@ def solve_vi(
     with defaults(DEFAULTS):
         read(snes)
     try:
-        snes.solve(None, x)
+        with explained():
+            snes.solve(None, x)
         reason, linear_reason = snes.getConvergedReason(), linear.ksp.getConvergedReason()
         iterations = Iterations(
             snes.getIterationNumber(), snes.getLinearSolveIterations(), linear.describe()

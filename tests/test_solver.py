@@ -63,6 +63,40 @@ def test_unknown_types_are_the_users_mistake(options, name):
         solve(PROBLEM, SQUARE.mesh(0.25))
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("snes_type", "newtonls", "does not support bounds"),
+        ("snes_type", "vinewtonssls", "method diagonalScale"),
+        ("reduced_ksp_type", "cg", "method mult"),
+    ],
+)
+def test_solvers_that_do_not_suit_are_the_users_mistake(options, name, value, words):
+    options(name, value)
+    said = f"PETSc can't solve with -signorini_{name} {value}: .*{words}"
+    with pytest.raises(InputError, match=said):
+        solve(PROBLEM, SQUARE.mesh(0.25))
+
+
+def test_what_a_monitor_raises_reaches_the_caller():
+    class Enough(Exception):
+        """Ours, and nobody else's."""
+
+    def monitor(*_):
+        raise Enough("of that")
+
+    with pytest.raises(Enough, match=r"^of that$"):
+        solve(PROBLEM, SQUARE.mesh(0.25), monitor=monitor)
+
+
+def test_the_bottom_solver_is_named(options):
+    named = [solve(PROBLEM, SQUARE.mesh(0.25)).iterations.preconditioner]
+    options("bottom_pc_type", "jacobi")
+    named.append(solve(PROBLEM, SQUARE.mesh(0.25)).iterations.preconditioner)
+    assert "a direct solver" in named[0]
+    assert "jacobi (option -signorini_bottom_pc_type)" in named[1]
+
+
 def test_coordinates_whose_squares_overflow_are_refused():
     with pytest.raises(InputError, match=r"vertex 1 .*: coordinates up to 1e\+100"):
         Polygon([[0, 0], [1e200, 0], [1, 1]], ["contact", "dirichlet", "neumann"])
