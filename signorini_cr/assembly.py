@@ -92,9 +92,12 @@ class Level:
         system, dofs = self.system, Layout.of_space(self.V)
         own = system.A, dofs, self._owned_dirichlet, system.bounded
         if self._below is not None:
-            grid, coarse_dofs, parents = self._below
+            coarse, coarse_dofs, parents = self._below
             transfer = prolongation(coarse_dofs, dofs, parents)
-            return Grid(*own, transfer, grid, LONG_SWEEPS if dofs.cr else SWEEPS)
+            if not (self.forms.uniform or coarse.is_product(system.A, transfer)):
+                coarse = coarse.projected(system.A, transfer)
+                self._below = coarse, coarse_dofs, parents  # P1 on this mesh shall have them, too
+            return Grid(*own, transfer, coarse, LONG_SWEEPS if dofs.cr else SWEEPS)
         if dofs.cr:
             p1, vertices = self.conforming
             return Grid(*own, inclusion(vertices, dofs), p1, on_same_mesh=True)
@@ -108,7 +111,7 @@ class Level:
         system, dofs = self.system, Layout.of_space(self.V)
         return p1_grid(system.A, dofs, self._owned_dirichlet, system.bounded, self._below)
 
-    @property
+    @cached_property
     def _below(self) -> Below | None:
         if self.coarser is None or self.parents is None:
             return None

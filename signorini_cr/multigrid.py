@@ -2,12 +2,14 @@
 
 A chain of grids, finest first: CR, then P1 on the mesh below and on all coarser ones. P1 ⊂ CR and
 coarse P1 ⊂ fine P1 and therefore coarse P1 ⊂ fine CR, so that the coarse matrices are Galerkin
-products (where the coefficient is constant on the coarse cells, and nearly so where it varies
-little on them); each is computed once, on its own mesh, and the finest mesh needs none. Dofs on the
-obstacle are taken out on every grid: the matrix has the identity there, and a coarse function that
-does not vanish at a fixed dof of the finer grid is fixed too, which leaves subspaces of the reduced
-space. Smoothing is by over-relaxed Gauss-Seidel sweeps, forward before and backward after the
-coarse correction.
+products where the coefficient is constant on the coarse cells, and nearly so where it varies little
+on them; each is computed once, on its own mesh, and the finest mesh needs none. Where it varies
+much, as if it jumped inside coarse cells, they are computed anew from the finest matrix.
+
+Dofs on the obstacle are taken out on every grid: the matrix has the identity there, and a coarse
+function that does not vanish at a fixed dof of the finer grid is fixed too, which leaves subspaces
+of the reduced space. Smoothing is by over-relaxed Gauss-Seidel sweeps, forward before and backward
+after the coarse correction.
 
 Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG: the
 auxiliary space method. Small bottom grids are solved directly.
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from .garbage import release
@@ -37,6 +40,9 @@ _AMG = {
 }
 
 _BOTTOM = PREFIX + "bottom_"
+
+NEARLY = 0.2
+"""Part of the diagonal by which a coarse matrix may differ from the Galerkin product."""
 
 SWEEPS = 2
 """Gauss-Seidel sweeps before and after the coarse correction."""
@@ -80,7 +86,7 @@ class Grid:
         """
         self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
         self.operator, self.coarser = MaskedMatrix(matrix, bounded), coarser
-        self._transfer = transfer
+        self._transfer, self._dofs, self._sweeps = transfer, dofs, sweeps
         self._dirichlet = dirichlet
         self._silent = dirichlet
         self._changed = True
@@ -97,6 +103,55 @@ class Grid:
     def matrix(self) -> PETSc.Mat:
         """The matrix as it is now, without what `fix` has taken out."""
         return self.operator.masked
+
+    def is_product(self, finer: PETSc.Mat, transfer: PETSc.Mat) -> bool:
+        """Whether the whole matrix is, nearly, the Galerkin product of a finer space's.
+
+        It is not where a mesh does not see what the coefficient does between its quadrature points.
+
+        Args:
+            finer: The finer space's matrix.
+            transfer: The matrix that writes functions of this space there.
+        """
+        self.fix(self.operator.dofs[:0], deep=False)
+        v, product, own = (self.matrix.createVecRight() for _ in range(3))
+        u, image = finer.createVecs()
+        v.array[:] = np.random.default_rng(0).choice([-1.0, 1.0], v.local_size)
+        v.array[self._dirichlet] = 0.0
+        transfer.mult(v, u)
+        finer.mult(u, image)
+        transfer.multTranspose(image, product)
+        self.matrix.mult(v, own)
+        difference = np.abs(product.array_r - own.array_r)
+        difference[self._dirichlet] = 0.0
+        diagonal = self.matrix.getDiagonal()
+        largest = float((difference / diagonal.array_r).max(initial=0.0))
+        release(v, product, own, u, image, diagonal)
+        return self.matrix.getComm().tompi4py().allreduce(largest, op=MPI.MAX) <= NEARLY
+
+    def projected(self, finer: PETSc.Mat, transfer: PETSc.Mat) -> Grid:
+        """The same chain with Galerkin products of a finer space's matrix.
+
+        Args:
+            finer: The finer space's matrix.
+            transfer: The matrix that writes functions of this space there.
+        """
+        transposed = transfer.transpose(PETSc.Mat())
+        ordered = transposed.transpose(PETSc.Mat())  # products need rows in ascending order
+        matrix = _product(finer, ordered, self._dirichlet)
+        release(transposed, ordered)
+        coarser = self.coarser
+        if coarser is not None and self._transfer is not None:
+            coarser = coarser.projected(matrix, self._transfer)
+        return Grid(
+            matrix,
+            self._dofs,
+            self._dirichlet,
+            self.operator.dofs,
+            self._transfer,
+            coarser,
+            self._sweeps,
+        )
 
     def fix(self, dofs: npt.NDArray[np.int32], deep: bool = True) -> None:
         """Take dofs out of the space, and what does not vanish there out of the coarser ones.
@@ -216,10 +271,8 @@ def p1_grid(
     """
     p1 = Layout.of_p1(cr.mesh)
     into_cr = inclusion(p1, cr)
-    K = A.ptap(into_cr)
-    # On Γ0 the product holds rubbish, in rows and columns that become the identity's
     vertices = _touched(into_cr, dirichlet)
-    K.zeroRowsColumns((vertices + K.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
+    K = _product(A, into_cr, vertices)
     at_bounded = _touched(into_cr, bounded)
     release(into_cr)
     if below is None:
@@ -227,6 +280,14 @@ def p1_grid(
     grid, dofs, parents = below
     transfer = prolongation(dofs, p1, parents)
     return Grid(K, p1, vertices, at_bounded, transfer, grid), p1
+
+
+def _product(finer: PETSc.Mat, transfer: PETSc.Mat, dirichlet: npt.NDArray[np.int32]) -> PETSc.Mat:
+    """The Galerkin product, the identity in the rows and columns of owned dofs on Γ0."""
+    product = finer.ptap(transfer)
+    # there it holds rubbish, as the finer matrix has the identity
+    product.zeroRowsColumns((dirichlet + product.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
+    return product
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

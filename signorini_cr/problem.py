@@ -161,6 +161,11 @@ class Forms:
             )
 
     @property
+    def uniform(self) -> bool:
+        """Whether κ is a number."""
+        return _is_constant(self.kappa)
+
+    @property
     def loaded(self) -> bool:
         """Whether f or g is more than the number 0."""
         return not (_is_zero(self.f) and _is_zero(self.g))

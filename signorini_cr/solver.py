@@ -38,6 +38,9 @@ SET_STEPS = 2
 One less after as many steps: what takes long has been looked at often.
 """
 
+NOISE = 4.0 * 2.0**-53
+"""A residual below this times the diagonal times x is rounding; measured are 1 to 2 of these 4."""
+
 DIVERGED_NAN = -4
 """PETSc's number; its name depends on the version."""
 
@@ -77,7 +80,8 @@ def solve_vi(
         residual: On exit A x − b.
         load: Norm that the residual is measured against, `System.load`; the same for all starts.
         tolerance: The solve ends when the residual's norm is below ``tolerance * load``, and what
-            is due to the choice of the active set far below.
+            is due to the choice of the active set far below; or when it is lost in rounding, as it
+            can be where the coefficient varies by many orders of magnitude.
         monitor: Called after each step.
         level: Named in the error.
 
@@ -117,6 +121,13 @@ def solve_vi(
             number = comm.tompi4py().allreduce(int(linear.active().sum()))
             monitor(step, norm, number, snes.getLinearSolveIterations())
 
+    def noise(x: PETSc.Vec) -> float:
+        terms = operator.masked.getDiagonal()
+        terms.pointwiseMult(terms, x)
+        size = terms.norm()
+        release(terms)
+        return NOISE * size
+
     start, for_the_set = 0.0, 0
 
     def converged(snes: PETSc.SNES, step: int, norms: tuple[float, float, float]) -> int:
@@ -129,7 +140,8 @@ def solve_vi(
             return DIVERGED_NAN
         small = max(atol, rtol * start)
         if norm > small:
-            return Reason.ITERATING
+            lost = step > 1 and norm <= noise(snes.getSolution())
+            return Reason.CONVERGED_FNORM_ABS if lost else Reason.ITERATING
         allowed = SET_STEPS if step <= SET_STEPS else 1
         if step > 0 and for_the_set < allowed and linear.disputed() > SET_TOLERANCE * small:
             for_the_set += 1

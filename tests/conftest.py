@@ -2,11 +2,12 @@
 
 import faulthandler
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 
 SECONDS = float(os.environ.get("SIGNORINI_TEST_SECONDS", "300"))
 _stderr = 2
@@ -38,3 +39,18 @@ def time_limit() -> Iterator[None]:
 def shared_tmp_path(tmp_path: Path) -> Path:
     """Rank 0's `tmp_path`, on every rank."""
     return MPI.COMM_WORLD.bcast(tmp_path, root=0)
+
+
+@pytest.fixture
+def options() -> Iterator[Callable[[str, object], None]]:
+    """Set options under the prefix; they are gone after the test."""
+    database = PETSc.Options("signorini_")
+    names: list[str] = []
+
+    def set_option(name: str, value: object) -> None:
+        names.append(name)
+        database.setValue(name, value)
+
+    yield set_option
+    for name in names:
+        database.delValue(name)

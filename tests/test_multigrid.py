@@ -130,18 +130,6 @@ def test_few_steps_on_every_level(example, shift):
             assert solution.iterations.linear <= 17
 
 
-@pytest.fixture
-def direct():
-    """LU instead of CG, until the test is over."""
-    database = PETSc.Options("signorini_")
-    names = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
-    for name, value in names.items():
-        database.setValue(name, value)
-    yield
-    for name in names:
-        database.delValue(name)
-
-
 def active(system, u, residual):
     at_bound = u.x.array[system.bounded] <= system.lower[system.bounded]
     return at_bound & (residual.x.array[system.bounded] > 0)
@@ -149,7 +137,7 @@ def active(system, u, residual):
 
 @pytest.mark.parametrize("shift", [0.0, 0.31])
 @pytest.mark.parametrize("example", HARD, ids=lambda e: e.name)
-def test_the_same_solution_as_a_direct_solver(example, shift, request):
+def test_the_same_solution_as_a_direct_solver(example, shift, options):
     """The active set facet by facet, and the residual the report promises.
 
     Contact ends in C with a pressure that grows like the power 2.5 or 4.5 of the distance, so that
@@ -161,7 +149,9 @@ def test_the_same_solution_as_a_direct_solver(example, shift, request):
     b, lower, x, residual = (
         ghosted_vector(V, a) for a in (system.b.x.array, system.lower, u.x.array, r.x.array)
     )
-    request.getfixturevalue("direct")
+    options("ksp_type", "preonly")
+    options("pc_type", "lu")
+    options("pc_factor_mat_solver_type", "mumps")
     grid = Grid(system.A, Layout.of_space(V), system.dirichlet, system.bounded)
     cold = solve_vi(grid, b, lower, x, residual, load=system.load, tolerance=1e-10)
     assert cold.newton > 1
@@ -232,6 +222,47 @@ def test_contact_in_several_pieces_and_corners(element):
     if element == "CR":
         assert nested.iterations.newton <= 3
     assert nested.iterations.linear <= 40
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("jump", [1e3, 1e6])
+def test_a_coefficient_that_jumps_inside_coarse_cells(element, jump, options):
+    """Coarse matrices made on their own meshes needed 172 steps with CR and the larger jump."""
+    disc = Problem(
+        f=-5.0,
+        coefficient=lambda x: ufl.conditional(
+            (x[0] - 0.5) ** 2 + (x[1] - 0.2) ** 2 < 0.04, jump, 1.0
+        ),
+    )
+    domain = exact.S1.mesh(0.3)
+    solutions = list(solve_levels(disc, domain, 6, element))
+    assert max(s.iterations.linear for s in solutions) <= 25
+    level = solutions[-1].level
+    coarse, layout, parents = level._below
+    transfer = prolongation(layout, Layout.of_space(level.V), parents)
+    assert coarse.is_product(level.system.A, transfer)
+    assert not level.coarser.conforming[0].is_product(level.system.A, transfer)
+
+    options("pc_type", "hypre")
+    options("snes_atol", 1e-12 * level.system.load)
+    other = last(disc, domain, 6, element=element)
+    assert other.energy == pytest.approx(solutions[-1].energy, rel=1e-9)
+    assert other.contact.number_active == solutions[-1].contact.number_active
+
+
+def test_a_residual_lost_in_rounding_ends_the_solve():
+    """A strip a million times stiffer: A u is known to ten times what the tolerance asks for."""
+    strip = Problem(
+        f=-5.0,
+        coefficient=lambda x: ufl.conditional(abs(x[1] - 0.31) < 0.01, 1e6, 1.0),
+    )
+    for solution in solve_levels(strip, exact.S1.mesh(0.3), 5):
+        terms = solution.level.system.A.getDiagonal()
+        terms.pointwiseMult(terms, vector(solution.u.function_space, solution.u.x.array))
+        rounding = terms.norm() / 2**52
+        residual = solution.contact.kkt.residual * solution.level.system.load
+        assert residual < 1e-8 * solution.level.system.load or residual < 2.0 * rounding
+        assert solution.iterations.newton <= 3
 
 
 @pytest.mark.parametrize("example", [exact.S1, exact.A], ids=lambda e: e.name)

@@ -15,21 +15,6 @@ SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "diric
 PROBLEM = Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0]))
 
 
-@pytest.fixture
-def options():
-    """Set options under the prefix; they are gone after the test."""
-    database = PETSc.Options("signorini_")
-    names = []
-
-    def set_option(name, value):
-        names.append(name)
-        database.setValue(name, value)
-
-    yield set_option
-    for name in names:
-        database.delValue(name)
-
-
 def test_bounds_on_contact_facets_only():
     solution = solve(PROBLEM, SQUARE.mesh(0.1))
     lower = solution.level.system.lower
