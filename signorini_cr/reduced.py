@@ -39,6 +39,7 @@ class MaskedSolver:
 
     Attributes:
         ksp: The inner solver, CG with the grid's V-cycle unless options say otherwise.
+        iterations: Its steps so far.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class MaskedSolver:
         self._first = grid.matrix.getOwnershipRange()[0]
         self._is_active = np.zeros(len(lower), dtype=bool)
         self._step = x.duplicate()
+        self.iterations = 0
         self.ksp = ksp = PETSc.KSP().create(grid.matrix.getComm())
         ksp.setOptionsPrefix(PREFIX)
         ksp.setOperators(grid.matrix)
@@ -125,6 +127,7 @@ class MaskedSolver:
         self.ksp.solve(self._residual, self._step)
         self._residual.array[dofs] = self._at_start[1]
         x.array[:] = np.delete(self._step.array_r, active)
+        self.iterations += self.ksp.getIterationNumber()
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 

@@ -91,7 +91,8 @@ def solve_vi(
     """
     operator, comm = grid.operator, grid.matrix.getComm()
     bounds = lower.array_r[operator.dofs]
-    target = tolerance * load or 1e-300
+    # looked up here, as the linear solver has to know
+    target = PETSc.Options(PREFIX).getReal("snes_atol", tolerance * load or 1e-300)
     snes = PETSc.SNES().create(comm)
     snes.setOptionsPrefix(PREFIX)
     snes.setType(PETSc.SNES.Type.VINEWTONRSLS)
@@ -119,7 +120,7 @@ def solve_vi(
     def report(snes: PETSc.SNES, step: int, norm: float) -> None:
         if monitor is not None:
             number = comm.tompi4py().allreduce(int(linear.active().sum()))
-            monitor(step, norm, number, snes.getLinearSolveIterations())
+            monitor(step, norm, number, linear.iterations)
 
     def noise(x: PETSc.Vec) -> float:
         terms = operator.masked.getDiagonal()
@@ -156,9 +157,7 @@ def solve_vi(
         with explained():
             snes.solve(None, x)
         reason, linear_reason = snes.getConvergedReason(), linear.ksp.getConvergedReason()
-        iterations = Iterations(
-            snes.getIterationNumber(), snes.getLinearSolveIterations(), linear.describe()
-        )
+        iterations = Iterations(snes.getIterationNumber(), linear.iterations, linear.describe())
     finally:  # a monitor may raise
         grid.fix(operator.dofs[:0], deep=False)
         release(outer, snes, jacobian, upper)

@@ -37,7 +37,8 @@ def test_linear_failure_is_named(options):
     options("ksp_max_it", 1)
     options("ksp_rtol", 1e-12)
     options("pc_type", "none")
-    with pytest.raises(NotConverged, match=r"DIVERGED_LINEAR_SOLVE \(KSP DIVERGED_(MAX_IT|ITS)\)"):
+    said = r"DIVERGED_LINEAR_SOLVE \(KSP DIVERGED_(MAX_IT|ITS)\) after 0 .* and 1 linear"
+    with pytest.raises(NotConverged, match=said):
         solve(PROBLEM, SQUARE.mesh(0.05))
 
 
@@ -108,6 +109,15 @@ def test_a_function_of_one_mesh_is_not_taken_to_another(key, element):
     assert next(solutions).level.number == 0
     with pytest.raises(InputError, match="live on one mesh only"):
         next(solutions)
+
+
+def test_a_smaller_tolerance_costs_no_newton_steps(options):
+    usual = solve(PROBLEM, SQUARE.mesh(0.05))
+    options("snes_atol", 1e-12 * usual.level.system.load)
+    exact = solve(PROBLEM, SQUARE.mesh(0.05))
+    assert exact.contact.kkt.residual <= 1e-12
+    assert exact.iterations.newton == usual.iterations.newton
+    assert exact.iterations.linear > usual.iterations.linear
 
 
 def test_no_option_is_left_behind():
