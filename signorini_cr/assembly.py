@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import raise_together
-from .garbage import hold, sweep
+from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .moments import Data
 from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
@@ -99,8 +99,9 @@ class Level:
                 self._below = coarse, coarse_dofs, parents  # P1 on this mesh shall have them, too
             return Grid(*own, transfer, coarse, LONG_SWEEPS if dofs.cr else SWEEPS)
         if dofs.cr:
-            p1, vertices = self.conforming
-            return Grid(*own, inclusion(vertices, dofs), p1, on_same_mesh=True)
+            p1, into_cr = self._p1_in_cr
+            self.conforming = self._p1_grid(p1, into_cr), p1
+            return Grid(*own, into_cr, self.conforming[0], on_same_mesh=True)
         return Grid(*own)
 
     @cached_property
@@ -108,8 +109,19 @@ class Level:
         """P1 on this mesh, for the next one, and its dofs."""
         if self.forms.element == "P1":
             return self.grid, Layout.of_space(self.V)
-        system, dofs = self.system, Layout.of_space(self.V)
-        return p1_grid(system.A, dofs, self._owned_dirichlet, system.bounded, self._below)
+        p1, into_cr = self._p1_in_cr
+        grid = self._p1_grid(p1, into_cr)
+        release(into_cr)
+        return grid, p1
+
+    def _p1_grid(self, p1: Layout, into_cr: PETSc.Mat) -> Grid:
+        system = self.system
+        return p1_grid(system.A, into_cr, p1, self._owned_dirichlet, system.bounded, self._below)
+
+    @property
+    def _p1_in_cr(self) -> tuple[Layout, PETSc.Mat]:
+        p1 = Layout.of_p1(self.domain.mesh)
+        return p1, inclusion(p1, Layout.of_space(self.V))
 
     @cached_property
     def _below(self) -> Below | None:

@@ -27,7 +27,7 @@ from .masking import MaskedMatrix
 from .options import PREFIX, defaults, read
 from .parents import Layout, Parents
 from .smoothing import GaussSeidel
-from .transfer import inclusion, prolongation
+from .transfer import prolongation
 
 DIRECT = 2000
 """Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
@@ -252,34 +252,28 @@ Below = tuple[Grid, Layout, Parents]
 
 def p1_grid(
     A: PETSc.Mat,
-    cr: Layout,
+    into_cr: PETSc.Mat,
+    p1: Layout,
     dirichlet: npt.NDArray[np.int32],
     bounded: npt.NDArray[np.int32],
     below: Below | None = None,
-) -> tuple[Grid, Layout]:
+) -> Grid:
     """P1 as a subspace of CR on the same mesh.
 
     Args:
         A: Matrix of a_h in CR, with the identity in the rows and columns of Γ0's dofs.
-        cr: The dofs of CR.
+        into_cr: The matrix that writes P1 functions in CR.
+        p1: The dofs of P1.
         dirichlet: Owned CR dofs on Γ0.
         bounded: Owned CR dofs on Γ1.
         below: What comes next, if there is a coarser mesh.
-
-    Returns:
-        P1 and its dofs.
     """
-    p1 = Layout.of_p1(cr.mesh)
-    into_cr = inclusion(p1, cr)
     vertices = _touched(into_cr, dirichlet)
-    K = _product(A, into_cr, vertices)
-    at_bounded = _touched(into_cr, bounded)
-    release(into_cr)
+    space = _product(A, into_cr, vertices), p1, vertices, _touched(into_cr, bounded)
     if below is None:
-        return Grid(K, p1, vertices, at_bounded), p1
+        return Grid(*space)
     grid, dofs, parents = below
-    transfer = prolongation(dofs, p1, parents)
-    return Grid(K, p1, vertices, at_bounded, transfer, grid), p1
+    return Grid(*space, prolongation(dofs, p1, parents), grid)
 
 
 def _product(finer: PETSc.Mat, transfer: PETSc.Mat, dirichlet: npt.NDArray[np.int32]) -> PETSc.Mat:

@@ -28,8 +28,14 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
         others = [j for j in range(d + 1) if j != i]
         for k, j in enumerate(others):
             columns[cr.cells[:, i], k] = p1.cells[:, j]
-    ordered = np.sort(columns[:owned], axis=1)
-    return _matrix(cr, p1, d, ordered, np.full(owned * d, 1.0 / d))
+    columns = columns[:owned]
+    if d == 2:  # several times faster than sorting many short rows
+        one, other = columns.T.copy()
+        np.minimum(one, other, out=columns[:, 0])
+        np.maximum(one, other, out=columns[:, 1])
+    else:
+        columns.sort(axis=1)
+    return _matrix(cr, p1, d, columns, np.full(owned * d, 1.0 / d))
 
 
 def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
