@@ -21,19 +21,21 @@ class Load:
         hats: Means of (f − f_T) λ_i, shape (d + 1, cells); None where f is constant on each cell.
         bumps: Means of (f − f_T) b_i, shape (d + 1, cells), b_i as in `Rule`; or None.
         variance: Means of (f − f_T)², shape (cells,); or None.
+        vanishes: Whether f is the number 0; the same on all ranks, also on those without cells.
     """
 
-    def __init__(self, mean: FloatArray, rows: FloatArray | None, variance: FloatArray | None):
+    def __init__(
+        self,
+        mean: FloatArray,
+        rows: FloatArray | None,
+        variance: FloatArray | None,
+        vanishes: bool = False,
+    ):
         """Take the moments; the rows are those of hats and bumps."""
-        self.mean, self.variance = mean, variance
+        self.mean, self.variance, self.vanishes = mean, variance, vanishes
         half = 0 if rows is None else len(rows) // 2
         self.hats = None if rows is None else rows[:half]
         self.bumps = None if rows is None else rows[half:]
-
-    @property
-    def vanishes(self) -> bool:
-        """Whether f is 0 wherever it was looked at."""
-        return self.hats is None and not self.mean.any()
 
     def shares(self, cells: Cells, part: slice) -> FloatArray:
         """∫_T f ψ_i for the Crouzeix-Raviart functions ψ_i = 1 − d λ_i, shape (d + 1, n)."""
@@ -50,7 +52,7 @@ class Load:
         """Integrate f."""
         n, rule = cells.number, f.rule
         if f.number is not None:
-            return cls(np.full(n, f.number), None, None)
+            return cls(np.full(n, f.number), None, None, f.number == 0.0)
         values = f.at(cells)
         mean, variance = np.empty(n), np.empty(n)
         tests = np.concatenate(

@@ -69,7 +69,9 @@ class Volume:
         """Values at the quadrature points of owned cells, shape (cells, q)."""
         assert self._values is not None
         which = np.arange(cells.number, dtype=np.int32)
-        return self._values.eval(cells.domain.mesh, which).reshape(cells.number, -1)
+        return self._values.eval(cells.domain.mesh, which).reshape(
+            cells.number, len(self.rule.weights)
+        )
 
 
 class Coefficient:

@@ -41,6 +41,9 @@ _AMG = {
 
 _BOTTOM = PREFIX + "bottom_"
 
+# PETSc's smallest pivot is absolute and would refuse coefficients of small magnitude
+_PIVOTS = {"pc_factor_zeropivot": 1e-300, "redundant_pc_factor_zeropivot": 1e-300}
+
 NEARLY = 0.2
 """Part of the diagonal by which a coarse matrix may differ from the Galerkin product."""
 
@@ -116,7 +119,7 @@ class Grid:
         self.fix(self.operator.dofs[:0], deep=False)
         v, product, own = (self.matrix.createVecRight() for _ in range(3))
         u, image = finer.createVecs()
-        v.array[:] = np.random.default_rng(0).choice([-1.0, 1.0], v.local_size)
+        v.array[:] = np.random.default_rng(0).standard_normal(v.local_size)
         v.array[self._dirichlet] = 0.0
         transfer.mult(v, u)
         finer.mult(u, image)
@@ -152,6 +155,18 @@ class Grid:
             coarser,
             self._sweeps,
         )
+
+    def rounding(self, x: PETSc.Vec) -> float:
+        """Norm of the diagonal times x over the free dofs: what the residual's digits are lost in.
+
+        Dofs on Γ0 and those taken out have a diagonal of 1, whatever the matrix's magnitude.
+        """
+        terms = self.matrix.getDiagonal()
+        terms.pointwiseMult(terms, x)
+        terms.array[self._silent] = 0.0
+        norm = terms.norm()
+        release(terms)
+        return float(norm)
 
     def fix(self, dofs: npt.NDArray[np.int32], deep: bool = True) -> None:
         """Take dofs out of the space, and what does not vanish there out of the coarser ones.
@@ -225,7 +240,8 @@ class Grid:
             self._bottom = self._bottom_solver()
         if self._changed:
             self._bottom.setOperators(self.matrix)
-            self._bottom.setUp()
+            with defaults(_PIVOTS, _BOTTOM):
+                self._bottom.setUp()
             self._changed = False
         self._bottom.apply(b, x)
 
@@ -241,7 +257,7 @@ class Grid:
         pc = PETSc.PC().create(self.matrix.getComm())
         pc.setOptionsPrefix(_BOTTOM)
         pc.setType(self._bottom_type)
-        with defaults(_AMG if not self.bottom_is_direct else {}, _BOTTOM):
+        with defaults(_PIVOTS if self.bottom_is_direct else _AMG, _BOTTOM):
             read(pc)
         return pc
 

@@ -27,6 +27,21 @@ def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:
         ) from error
 
 
+def read_number(name: str, default: float) -> float:
+    """An option that is a number, 0 or more.
+
+    Raises:
+        InputError: It is something else.
+    """
+    try:
+        value = float(PETSc.Options(PREFIX).getReal(name, default))
+    except PETSc.Error as error:
+        raise InputError(f"PETSc refuses -{PREFIX}{name}: {_words(error)}") from error
+    if not value >= 0.0:
+        raise InputError(f"-{PREFIX}{name} is {value:g}; it must not be negative")
+    return value
+
+
 @contextmanager
 def explained() -> Iterator[None]:
     """Say what is behind errors of PETSc in a block.

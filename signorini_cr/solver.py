@@ -21,7 +21,7 @@ from petsc4py import PETSc
 from .errors import NotConverged
 from .garbage import release
 from .multigrid import Grid
-from .options import PREFIX, defaults, explained, read
+from .options import PREFIX, defaults, explained, read, read_number
 from .reduced import LINEAR_SHARE, MaskedSolver
 
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
@@ -91,8 +91,9 @@ def solve_vi(
     """
     operator, comm = grid.operator, grid.matrix.getComm()
     bounds = lower.array_r[operator.dofs]
-    # looked up here, as the linear solver has to know
-    target = PETSc.Options(PREFIX).getReal("snes_atol", tolerance * load or 1e-300)
+    target = tolerance * load or 1e-300
+    # looked up here, as the linear solver has to know; what is below rounding is all the same to it
+    wanted = max(read_number("snes_atol", target), 1e-30 * target)
     snes = PETSc.SNES().create(comm)
     snes.setOptionsPrefix(PREFIX)
     snes.setType(PETSc.SNES.Type.VINEWTONRSLS)
@@ -102,7 +103,7 @@ def solve_vi(
         f.axpy(-1.0, b)
 
     snes.setFunction(function, residual)
-    linear = MaskedSolver(grid, bounds, x, residual, LINEAR_SHARE * target)
+    linear = MaskedSolver(grid, bounds, x, residual, LINEAR_SHARE * wanted)
     jacobian = PETSc.Mat().createPython(grid.matrix.getSizes(), linear, comm=comm)
     jacobian.setUp()
     snes.setJacobian(lambda *_: None, jacobian)
@@ -122,13 +123,6 @@ def solve_vi(
             number = comm.tompi4py().allreduce(int(linear.active().sum()))
             monitor(step, norm, number, linear.iterations)
 
-    def noise(x: PETSc.Vec) -> float:
-        terms = operator.masked.getDiagonal()
-        terms.pointwiseMult(terms, x)
-        size = terms.norm()
-        release(terms)
-        return NOISE * size
-
     start, for_the_set = 0.0, 0
 
     def converged(snes: PETSc.SNES, step: int, norms: tuple[float, float, float]) -> int:
@@ -141,7 +135,7 @@ def solve_vi(
             return DIVERGED_NAN
         small = max(atol, rtol * start)
         if norm > small:
-            lost = step > 1 and norm <= noise(snes.getSolution())
+            lost = step > 1 and norm <= NOISE * grid.rounding(snes.getSolution())
             return Reason.CONVERGED_FNORM_ABS if lost else Reason.ITERATING
         allowed = SET_STEPS if step <= SET_STEPS else 1
         if step > 0 and for_the_set < allowed and linear.disputed() > SET_TOLERANCE * small:

@@ -111,6 +111,58 @@ def test_a_function_of_one_mesh_is_not_taken_to_another(key, element):
         next(solutions)
 
 
+@pytest.mark.parametrize("scale", [1e-14, 1e-7, 1e9])
+@pytest.mark.parametrize("shift", [0.0, 1e5])
+@pytest.mark.parametrize("levels", [1, 4])
+def test_coefficients_of_any_magnitude(scale, shift, levels):
+    """The solution does not depend on what κ and f are multiplied by, nor on a constant."""
+
+    def last(scale, shift):
+        problem = Problem(
+            f=lambda x: scale * (30 * ufl.sin(7 * x[0]) - 10),
+            obstacle=lambda x: shift + 0.02 * x[0],
+            dirichlet=lambda x: shift + 1.0 + x[0],
+            coefficient=scale,
+        )
+        *_, solution = solve_levels(problem, SQUARE.mesh(0.02 if levels == 1 else 0.2), levels)
+        return solution
+
+    one, scaled = last(1.0, shift), last(scale, shift)
+    assert one.contact.number_active > 3
+    assert scaled.contact.number_active == one.contact.number_active
+    assert scaled.iterations.newton == one.iterations.newton
+    assert scaled.contact.kkt.residual < 1e-8
+    assert scaled.contact.force / scale == pytest.approx(one.contact.force, rel=1e-6)
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("f", [-5.0, lambda x: -5.0 + x[0]], ids=["number", "function"])
+def test_ranks_without_cells(element, f):
+    """One triangle for all ranks; a process of its own solves the same."""
+    triangle = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"])
+    *_, solution = solve_levels(Problem(f=f), triangle.mesh(3.0), 4, element)
+    *_, alone = solve_levels(Problem(f=f), triangle.mesh(3.0, MPI.COMM_SELF), 4, element)
+    assert solution.energy == pytest.approx(alone.energy, rel=1e-8)
+    assert solution.contact.number_active == alone.contact.number_active == 8
+    if element == "CR":
+        assert solution.certificate.bound_h1 == pytest.approx(alone.certificate.bound_h1)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [("abc", "refuses -signorini_snes_atol: .*abc"), ("-1", "is -1; it must")]
+)
+def test_a_tolerance_that_is_none_is_the_users_mistake(options, value, said):
+    options("snes_atol", value)
+    with pytest.raises(InputError, match=said):
+        solve(PROBLEM, SQUARE.mesh(0.25))
+
+
+def test_a_tolerance_of_zero_ends_in_rounding(options):
+    options("snes_atol", 0)
+    *_, solution = solve_levels(PROBLEM, SQUARE.mesh(0.2), 3)
+    assert solution.contact.kkt.residual < 1e-12
+
+
 def test_a_smaller_tolerance_costs_no_newton_steps(options):
     usual = solve(PROBLEM, SQUARE.mesh(0.05))
     options("snes_atol", 1e-12 * usual.level.system.load)
