@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .commandline import UsageError, launched, read_arguments, start_petsc, wait_for_all
-from .screen import Screen
+from .screen import Screen, wrapped
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -109,7 +109,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
             records.append(output.level_record(solution, records[-1] if records else None))
             finest = solution
             if screen.verbose:
-                screen.line(f"  linear systems: {solution.iterations.preconditioner}")
+                taken = solution.iterations.preconditioner
+                screen.line(wrapped(taken, "  linear systems: "))
             if len(records) == 1:
                 screen.line(output.table_header(records[0]))
             screen.line(output.table_row(records[-1], records[0]))

@@ -225,8 +225,8 @@ class Grid:
             grid = grid.coarser
         bottom = grid.describe()
         if self.meshes == 1:
-            return f"P1 auxiliary space with {bottom} (there is no coarser mesh)"
-        return f"geometric multigrid on {self.meshes} meshes with {bottom} on the coarsest"
+            return f"P1 auxiliary space with {bottom}, as there is no coarser mesh"
+        return f"multigrid on {self.meshes} meshes with {bottom} on the coarsest"
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what belongs to this space alone, not the matrix it was made with."""

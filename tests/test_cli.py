@@ -370,6 +370,7 @@ def test_quiet_and_p1(write) -> None:
 
 def test_verbose_prints_the_steps(write) -> None:
     status, text, _ = run("solve", write(CASE), "--out", "out", "-v")
+    assert max(map(len, text.split("\n"))) <= 80
     assert status == 0
     steps = [line.split() for line in text.split("\n") if line.startswith("  level 1")]
     if COMM.rank == 0:
