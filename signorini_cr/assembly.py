@@ -197,10 +197,9 @@ class System:
         middle = 0.5 * (bottom + top) if bottom <= top else 0.0
         norms = []
         for number in dict.fromkeys((middle, 0.0)):
-            start, residual = self.start(), fem.Function(self.u_D.function_space)
-            free = np.ones(len(start.x.array), dtype=bool)
-            free[self.dirichlet] = False
-            start.x.array[free] = number
+            start, residual = (fem.Function(self.u_D.function_space) for _ in range(2))
+            start.x.array[:] = number
+            start.x.array[self.dirichlet] = values
             start.x.array[bounded] = np.maximum(self.lower[bounded], number)
             norms.append(self.residual(start, residual))
         return max(norms[0], ROUNDING * norms[-1])

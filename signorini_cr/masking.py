@@ -18,6 +18,16 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 
+def rows_of(A: PETSc.Mat, dofs: IntArray) -> PETSc.Mat:
+    """The rows of owned dofs, local numbers, as a matrix of their own; A is square."""
+    first, end = A.getOwnershipRange()
+    rows = PETSc.IS().createGeneral((dofs + first).astype(PETSc.IntType), comm=A.comm)
+    columns = PETSc.IS().createStride(end - first, first, 1, comm=A.comm)
+    matrix = A.createSubMatrix(rows, columns)
+    release(rows, columns)
+    return matrix
+
+
 class MaskedMatrix:
     """A symmetric matrix A with the identity in the rows and columns of some dofs.
 
@@ -34,10 +44,7 @@ class MaskedMatrix:
         self.fixed: npt.NDArray[np.bool_] = np.zeros(len(dofs), dtype=bool)
         first = A.getOwnershipRange()[0]
         numbers = (dofs + first).astype(PETSc.IntType)
-        rows = PETSc.IS().createGeneral(numbers, comm=A.comm)
-        columns = PETSc.IS().createStride(A.getLocalSize()[1], first, 1, comm=A.comm)
-        self._rows = A.createSubMatrix(rows, columns)
-        release(rows, columns)
+        self._rows = rows_of(A, dofs)
         start, self._column, self._value = self._rows.getValuesCSR()
         self._entry = np.repeat(np.arange(len(dofs)), np.diff(start))
         self._row = numbers[self._entry]

@@ -205,25 +205,11 @@ class Grid:
         """The V-cycle as PETSc's preconditioner of type python."""
         self.cycle(b, x)
 
-    @property
-    def bottom_is_direct(self) -> bool:
-        """Whether the space at the bottom is small enough to be factorised."""
-        return (
-            self.matrix.getSize()[0] <= DIRECT
-            if self.coarser is None
-            else self.coarser.bottom_is_direct
-        )
-
     def describe(self) -> str:
         """What the cycle is, in words."""
+        bottom = self._bottom_words()
         if self.coarser is None:
-            kind = self._bottom_type if self._bottom is None else self._bottom.getType()
-            usual = "a direct solver" if self.bottom_is_direct else "BoomerAMG"
-            return usual if kind == self._bottom_type else f"{kind} (option -{_BOTTOM}pc_type)"
-        grid = self
-        while grid.coarser is not None:
-            grid = grid.coarser
-        bottom = grid.describe()
+            return bottom
         if self.meshes == 1:
             return f"P1 auxiliary space with {bottom}, as there is no coarser mesh"
         return f"multigrid on {self.meshes} meshes with {bottom} on the coarsest"
@@ -245,10 +231,24 @@ class Grid:
             self._changed = False
         self._bottom.apply(b, x)
 
+    def _bottom_words(self) -> str:
+        """What solves the space at the bottom."""
+        if self.coarser is not None:
+            return self.coarser._bottom_words()
+        kind = self._bottom_type if self._bottom is None else self._bottom.getType()
+        if kind != self._bottom_type:
+            return f"{kind} (option -{_BOTTOM}pc_type)"
+        return "a direct solver" if self._is_small else "BoomerAMG"
+
+    @property
+    def _is_small(self) -> bool:
+        """Whether this space, at the bottom, is to be factorised."""
+        return self.matrix.getSize()[0] <= DIRECT
+
     @property
     def _bottom_type(self) -> str:
         """What solves this space at the bottom unless options say otherwise."""
-        if not self.bottom_is_direct:
+        if not self._is_small:
             return PETSc.PC.Type.HYPRE
         alone = self.matrix.getComm().getSize() == 1
         return PETSc.PC.Type.CHOLESKY if alone else PETSc.PC.Type.REDUNDANT
@@ -257,7 +257,7 @@ class Grid:
         pc = PETSc.PC().create(self.matrix.getComm())
         pc.setOptionsPrefix(_BOTTOM)
         pc.setType(self._bottom_type)
-        with defaults(_PIVOTS if self.bottom_is_direct else _AMG, _BOTTOM):
+        with defaults(_PIVOTS if self._is_small else _AMG, _BOTTOM):
             read(pc)
         return pc
 

@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .garbage import release
+from .masking import rows_of
 from .parents import Layout
 from .transfer import shared_sum
 
@@ -117,11 +118,9 @@ def _entries_between_ranks(matrix: PETSc.Mat, rows: IntArray) -> tuple[PETSc.Mat
     """
     comm = matrix.getComm()
     first, end = matrix.getOwnershipRange()
-    numbers = PETSc.IS().createGeneral((rows + first).astype(PETSc.IntType), comm=comm)
-    columns = PETSc.IS().createStride(end - first, first, 1, comm=comm)
-    whole = matrix.createSubMatrix(numbers, columns)
+    whole = rows_of(matrix, rows)
     start, column, value = whole.getValuesCSR()
-    release(numbers, columns, whole)
+    release(whole)
     row = np.repeat(np.arange(len(rows)), np.diff(start))
     diagonal = value[column == rows[row] + first]
     others = (column < first) | (column >= end)
