@@ -20,6 +20,7 @@ from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .moments import Data
 from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
+from .options import NO_INODES, defaults
 from .parents import Layout, Parents
 from .problem import Forms
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
@@ -89,6 +90,10 @@ class Level:
     @cached_property
     def grid(self) -> Grid:
         """The multigrid that starts with the discrete space."""
+        with defaults(NO_INODES, prefix=""):
+            return self._grid()
+
+    def _grid(self) -> Grid:
         system, dofs = self.system, Layout.of_space(self.V)
         own = system.A, dofs, self._owned_dirichlet, system.bounded
         if self._below is not None:
@@ -171,7 +176,8 @@ class System:
         self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
         bc = fem.dirichletbc(self.u_D, self.dirichlet)
         a = forms.a.on(domain, [V, V])
-        self.A = assemble_matrix(a, [bc])
+        with defaults(NO_INODES, prefix=""):
+            self.A = assemble_matrix(a, [bc])
         self.A.assemble()
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)

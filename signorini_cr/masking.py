@@ -18,14 +18,24 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 
-def rows_of(A: PETSc.Mat, dofs: IntArray) -> PETSc.Mat:
-    """The rows of owned dofs, local numbers, as a matrix of their own; A is square."""
-    first, end = A.getOwnershipRange()
-    rows = PETSc.IS().createGeneral((dofs + first).astype(PETSc.IntType), comm=A.comm)
-    columns = PETSc.IS().createStride(end - first, first, 1, comm=A.comm)
-    matrix = A.createSubMatrix(rows, columns)
-    release(rows, columns)
-    return matrix
+def rows_of(A: PETSc.Mat, numbers: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Some rows of A, which may be those of other ranks; collective.
+
+    PETSc has submatrices on several ranks, too, but they take a time that grows with A.
+
+    Args:
+        A: The matrix.
+        numbers: Global numbers of the rows.
+
+    Returns:
+        The rows in CSR format: where each begins, global columns, values.
+    """
+    rows = PETSc.IS().createGeneral(numbers.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+    columns = PETSc.IS().createStride(A.getSize()[1], 0, 1, PETSc.COMM_SELF)
+    (matrix,) = A.createSubMatrices(rows, columns)
+    csr: tuple[IntArray, IntArray, FloatArray] = matrix.getValuesCSR()
+    release(rows, columns, matrix)
+    return csr
 
 
 class MaskedMatrix:
@@ -44,8 +54,9 @@ class MaskedMatrix:
         self.fixed: npt.NDArray[np.bool_] = np.zeros(len(dofs), dtype=bool)
         first = A.getOwnershipRange()[0]
         numbers = (dofs + first).astype(PETSc.IntType)
-        self._rows = rows_of(A, dofs)
-        start, self._column, self._value = self._rows.getValuesCSR()
+        csr = start, self._column, self._value = rows_of(A, numbers)
+        sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
+        self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)
         self._entry = np.repeat(np.arange(len(dofs)), np.diff(start))
         self._row = numbers[self._entry]
         self.diagonal: FloatArray = self._value[self._column == self._row]

@@ -23,6 +23,9 @@ from .space import function_space
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
+_DIRECTION = np.sqrt([2.0, 3.0, 5.0])
+"""Of no edge on purpose, in the plane or in space."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -106,15 +109,14 @@ class Parents:
         nodes = compat.cell_nodes(fine)[: len(self.cell)]
         parents = compat.cell_nodes(coarse)
         if len(self.cell) > 0 and self.regular:
-            # does the pattern of the first cell repeat? one vertex of each child tells
+            # Does the pattern of the first cell repeat? One vertex of each child tells, and of that
+            # one coordinate, along a direction that no two points of a mesh will have in common
             first = x_coarse[parents[:1].repeat(children, axis=0)]
             pattern = barycentric_coordinates(first, x[nodes[:children]])
+            theirs, own = (points @ _DIRECTION[: points.shape[1]] for points in (x_coarse, x))
             inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
-            deviation = [
-                np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
-                for theirs, own in zip(x_coarse.T.copy(), x.T.copy(), strict=True)
-            ]
-            if max(deviation) <= 1e-10 * np.abs(x_coarse).max():
+            deviation = np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
+            if deviation <= 1e-10 * np.abs(x_coarse).max():
                 return pattern
         return barycentric_coordinates(x_coarse[parents[self.cell]], x[nodes])
 

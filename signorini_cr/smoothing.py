@@ -54,8 +54,7 @@ class GaussSeidel:
         self._alone = matrix.getComm().getSize() == 1
         if self._alone:
             return
-        self._rows = _rows_between_ranks(dofs)
-        self._between, radius = _entries_between_ranks(matrix, self._rows)
+        self._rows, self._between, radius = _entries_between_ranks(matrix, dofs)
         self.relaxation = min(OVER_RELAXATION, 0.99 * 2.0 / (1.0 + radius))
         self._taken_out: npt.NDArray[np.intp] = np.empty(0, dtype=np.intp)
         self._share = self._between.createVecLeft()
@@ -74,7 +73,7 @@ class GaussSeidel:
         self._sweep(b, x, _FORWARD, from_zero=True)
 
     def backward(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Sweep from the last row to the first, starting from x."""
+        """Sweep from the last row to the first, starting from x, for the same b as before."""
         self._sweep(b, x, _BACKWARD, from_zero=False)
 
     def free(self) -> None:
@@ -87,7 +86,8 @@ class GaussSeidel:
         if self._alone:
             self._matrix.SOR(b, x, self.relaxation, first, its=self._sweeps)
             return
-        self._b.array[:] = b.array_r
+        if from_zero:
+            self._b.array[:] = b.array_r
         for sweep in range(self._sweeps):
             if sweep > 0 or not from_zero:
                 self._between.mult(x, self._share)
@@ -98,31 +98,27 @@ class GaussSeidel:
             x.restoreLocalVector(self._x)
 
 
-def _rows_between_ranks(dofs: Layout) -> IntArray:
-    """The owned dofs that may share a cell with dofs of other ranks, ascending."""
-    owned = dofs.index_map.size_local
-    seen = np.zeros(owned + dofs.index_map.num_ghosts)
-    seen[owned:] = 1.0
-    shared = shared_sum(dofs, seen) > 0.0
-    cells = np.flatnonzero(shared.take(dofs.cells)) // dofs.cells.shape[1]
-    near = np.union1d(dofs.cells[cells], np.flatnonzero(shared[:owned]))
-    return near[near < owned].astype(np.int32)
-
-
-def _entries_between_ranks(matrix: PETSc.Mat, rows: IntArray) -> tuple[PETSc.Mat, float]:
-    """The entries of some owned rows in columns of other ranks.
+def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, PETSc.Mat, float]:
+    """The entries of owned rows in columns of other ranks.
 
     Returns:
-        They as a matrix, and a bound on the spectral radius of all such entries, the matrix scaled
-        to a diagonal of ones.
+        The rows that may have such entries, ascending local numbers; the entries as a matrix with
+        these rows; and a bound on the spectral radius of all of them, the matrix scaled to a
+        diagonal of ones.
     """
     comm = matrix.getComm()
     first, end = matrix.getOwnershipRange()
-    whole = rows_of(matrix, rows)
-    start, column, value = whole.getValuesCSR()
-    release(whole)
+    # An entry stems from a cell, and one of its two ranks at least has the other's dof for a ghost
+    owned, ghosts = dofs.size[0], dofs.index_map.ghosts
+    seen = np.zeros(owned + len(ghosts))
+    seen[owned:] = 1.0
+    shared = np.flatnonzero(shared_sum(dofs, seen)[:owned]) + first
+    _, column, _ = rows_of(matrix, ghosts)
+    numbers = np.union1d(shared, column[(column >= first) & (column < end)])
+    start, column, value = rows_of(matrix, numbers)
+    rows = (numbers - first).astype(np.int32)
     row = np.repeat(np.arange(len(rows)), np.diff(start))
-    diagonal = value[column == rows[row] + first]
+    diagonal = value[column == numbers[row]]
     others = (column < first) | (column >= end)
     start = np.zeros(len(rows) + 1, dtype=PETSc.IntType)
     np.cumsum(np.bincount(row[others], minlength=len(rows)), out=start[1:])
@@ -141,4 +137,4 @@ def _entries_between_ranks(matrix: PETSc.Mat, rows: IntArray) -> tuple[PETSc.Mat
         radius = min(radius, comm.tompi4py().allreduce(ratios.max(initial=0.0), op=MPI.MAX))
         v.array[rows] += image
     release(magnitudes, v, product)
-    return between, float(radius)
+    return rows, between, float(radius)

@@ -52,8 +52,13 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
         slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
         slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
         slot = slot[: fine.size[0]]
-        values = weights.reshape(-1, corners).take(slot % (len(weights) * corners), axis=0)
-        columns = coarse.cells.take(parent_cell.take(slot // corners), axis=0)
+        if len(weights) < len(parent_cell):  # the same in each parent, whose children are in a row
+            parent = slot // (len(weights) * corners)
+            slot = slot - parent * (len(weights) * corners)
+        else:
+            parent = parent_cell.take(slot // corners)
+        values = weights.reshape(-1, corners).take(slot, axis=0)
+        columns = coarse.cells.take(parent, axis=0)
         if fine.cr:  # few zeros: leave them
             return _matrix(fine, coarse, corners, columns, values.ravel())
         kept = values != 0.0
