@@ -305,7 +305,7 @@ def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np
     fine, coarse = transfer.createVecLeft(), transfer.createVecRight()
     fine.array[dofs] = 1.0
     transfer.multTranspose(fine, coarse)
-    touched = np.flatnonzero(coarse.array_r).astype(np.int32)
+    touched = np.flatnonzero(coarse.array_r != 0.0).astype(np.int32)
     fine.destroy()
     coarse.destroy()
     return touched

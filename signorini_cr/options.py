@@ -12,7 +12,6 @@ from .errors import InputError
 PREFIX = "signorini_"
 """Prefix of the PETSc options that reach the solver, as in ``-signorini_ksp_rtol 1e-10``."""
 
-
 NO_INODES = {"mat_no_inode": None}
 """PETSc joins rows of the same pattern; on simplices there are none, and looking takes time."""
 

@@ -24,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
-"""Of no edge on purpose, in the plane or in space."""
+"""A direction that no edge is at right angles to, unless on purpose."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Parents:
         parents = compat.cell_nodes(coarse)
         if len(self.cell) > 0 and self.regular:
             # Does the pattern of the first cell repeat? One vertex of each child tells, and of that
-            # one coordinate, along a direction that no two points of a mesh will have in common
+            # one coordinate, in a direction where no two points of a cell are at the same place
             first = x_coarse[parents[:1].repeat(children, axis=0)]
             pattern = barycentric_coordinates(first, x[nodes[:children]])
             theirs, own = (points @ _DIRECTION[: points.shape[1]] for points in (x_coarse, x))

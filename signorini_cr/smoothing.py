@@ -112,7 +112,7 @@ def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, P
     owned, ghosts = dofs.size[0], dofs.index_map.ghosts
     seen = np.zeros(owned + len(ghosts))
     seen[owned:] = 1.0
-    shared = np.flatnonzero(shared_sum(dofs, seen)[:owned]) + first
+    shared = np.flatnonzero(shared_sum(dofs, seen)[:owned] > 0.0) + first
     _, column, _ = rows_of(matrix, ghosts)
     numbers = np.union1d(shared, column[(column >= first) & (column < end)])
     start, column, value = rows_of(matrix, numbers)

@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact
 from signorini_cr.assembly import Level
+from signorini_cr.masking import rows_of
 from signorini_cr.parents import Layout
 from signorini_cr.problem import Forms
 from signorini_cr.smoothing import OVER_RELAXATION, GaussSeidel
@@ -38,6 +39,18 @@ def dense(matrix):
     owner[first:end] = MPI.COMM_WORLD.rank
     comm = MPI.COMM_WORLD
     return comm.allreduce(mine), comm.allreduce(owner)
+
+
+def test_rows_of_any_rank_in_any_order():
+    own, _ = system(exact.S1.mesh(0.2), "CR")
+    A, _ = dense(own.A)
+    rng = np.random.default_rng(MPI.COMM_WORLD.rank)
+    for number in (7, 7 * (MPI.COMM_WORLD.rank % 2)):  # none on some ranks
+        numbers = rng.permutation(len(A))[:number]
+        start, column, value = rows_of(own.A, numbers)
+        rows = np.zeros((number, len(A)))
+        rows[np.repeat(np.arange(number), np.diff(start)), column] = value
+        assert np.array_equal(rows, A[numbers])
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
