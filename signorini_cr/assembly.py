@@ -88,12 +88,9 @@ class Level:
         return System(self)
 
     @cached_property
+    @defaults(NO_INODES, prefix="")
     def grid(self) -> Grid:
         """The multigrid that starts with the discrete space."""
-        with defaults(NO_INODES, prefix=""):
-            return self._grid()
-
-    def _grid(self) -> Grid:
         system, dofs = self.system, Layout.of_space(self.V)
         own = system.A, dofs, self._owned_dirichlet, system.bounded
         if self._below is not None:

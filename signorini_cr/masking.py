@@ -18,7 +18,9 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 
-def rows_of(A: PETSc.Mat, numbers: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+def rows_of(
+    A: PETSc.Mat, numbers: npt.NDArray[np.integer]
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Some rows of A, which may be those of other ranks; collective.
 
     PETSc has submatrices on several ranks, too, but they take a time that grows with A.
@@ -53,7 +55,7 @@ class MaskedMatrix:
         self.masked, self.dofs = A, dofs
         self.fixed: npt.NDArray[np.bool_] = np.zeros(len(dofs), dtype=bool)
         first = A.getOwnershipRange()[0]
-        numbers = (dofs + first).astype(PETSc.IntType)
+        numbers = dofs.astype(PETSc.IntType) + first
         csr = start, self._column, self._value = rows_of(A, numbers)
         sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
         self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)

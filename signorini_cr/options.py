@@ -1,4 +1,4 @@
-"""PETSc options: all of ours stand under one prefix, and those the user has set come first."""
+"""PETSc options: what users may set stands under one prefix, and comes first."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PREFIX = "signorini_"
 """Prefix of the PETSc options that reach the solver, as in ``-signorini_ksp_rtol 1e-10``."""
 
 NO_INODES = {"mat_no_inode": None}
-"""PETSc joins rows of the same pattern; on simplices there are none, and looking takes time."""
+"""PETSc joins neighbouring rows of the same pattern, which takes time to look for; few have it."""
 
 
 def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:

@@ -24,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
 
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
-"""A direction that no edge is at right angles to, unless on purpose."""
+"""No edge or median of a cell is at right angles to it, unless on purpose."""
 
 
 @dataclass(frozen=True)
