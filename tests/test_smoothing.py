@@ -11,6 +11,7 @@ from signorini_cr.masking import rows_of
 from signorini_cr.parents import Layout
 from signorini_cr.problem import Forms
 from signorini_cr.smoothing import OVER_RELAXATION, GaussSeidel
+from signorini_cr.transfer import inclusion
 
 # Corners of five degrees: large entries, many of them positive
 FLAT = Polygon([[0, 0], [5, 0], [5, 0.4]], ["contact", "dirichlet", "neumann"])
@@ -53,19 +54,23 @@ def test_rows_of_any_rank_in_any_order():
         assert np.array_equal(rows, A[numbers])
 
 
-@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("element", ["CR", "P1", "product"])
 @pytest.mark.parametrize("sweeps", [1, 3])
 def test_sweeps_are_petscs(element, sweeps):
-    own, dofs = system(exact.S1.mesh(0.1), element)
-    smoother = GaussSeidel(own.A, dofs, sweeps)
-    b, start = random(own.A, 1), random(own.A, 2)
+    own, dofs = system(exact.S1.mesh(0.1), "P1" if element == "P1" else "CR")
+    A = own.A
+    if element == "product":
+        p1 = Layout.of_p1(dofs.mesh)
+        A, dofs = A.ptap(inclusion(p1, dofs)), p1
+    smoother = GaussSeidel(A, dofs, sweeps)
+    b, start = random(A, 1), random(A, 2)
     for name, way in (
         ("forward", PETSc.Mat.SORType.LOCAL_FORWARD_SWEEP | PETSc.Mat.SORType.ZERO_INITIAL_GUESS),
         ("backward", PETSc.Mat.SORType.LOCAL_BACKWARD_SWEEP),
     ):
         x, theirs = start.copy(), start.copy()
         getattr(smoother, name)(b, x)
-        own.A.SOR(b, theirs, smoother.relaxation, way, its=sweeps)
+        A.SOR(b, theirs, smoother.relaxation, way, its=sweeps)
         scale = theirs.norm()
         theirs.axpy(-1.0, x)
         assert theirs.norm() < 1e-13 * scale
