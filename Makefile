@@ -18,8 +18,8 @@ test:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
 
 # What depends on how a mesh is shared out, on more ranks than that.
-shared = $(addprefix tests/test_,contact.py hierarchy.py multigrid.py output.py smoothing.py solver.py \
-    studies.py)
+shared = $(addprefix tests/test_,contact.py hierarchy.py multigrid.py output.py pattern.py smoothing.py \
+    solver.py studies.py)
 
 ranks:
 	$(run) $(limit) mpirun -n 3 python3 -m pytest $(shared) -k 'not rates'

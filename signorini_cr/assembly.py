@@ -22,6 +22,7 @@ from .moments import Data
 from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
 from .options import NO_INODES, defaults
 from .parents import Layout, Parents
+from .pattern import empty_matrix
 from .problem import Forms
 from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
 from .transfer import inclusion, prolongation
@@ -174,7 +175,10 @@ class System:
         bc = fem.dirichletbc(self.u_D, self.dirichlet)
         a = forms.a.on(domain, [V, V])
         with defaults(NO_INODES, prefix=""):
-            self.A = assemble_matrix(a, [bc])
+            if forms.element == "CR":
+                self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
+            else:
+                self.A = assemble_matrix(a, [bc])
         self.A.assemble()
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)

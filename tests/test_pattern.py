@@ -1,0 +1,55 @@
+"""Room for the matrix: exactly what DOLFINx finds by searching."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
+from dolfinx.mesh import GhostMode, create_rectangle, create_unit_cube
+from mpi4py import MPI
+
+from signorini_cr import Polygon, exact
+from signorini_cr.hierarchy import refine
+from signorini_cr.parents import Layout
+from signorini_cr.pattern import empty_matrix
+from signorini_cr.space import function_space
+
+WORLD = MPI.COMM_WORLD
+
+
+TRIANGLE = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"])
+
+
+def rectangle(mode):
+    return create_rectangle(WORLD, [[0.0, 0.0], [2.0, 1.0]], [9, 5], ghost_mode=mode)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: rectangle(GhostMode.none),
+        lambda: rectangle(GhostMode.shared_facet),
+        lambda: create_unit_cube(WORLD, 3, 4, 3, ghost_mode=GhostMode.none),
+        lambda: create_unit_cube(WORLD, 3, 4, 3, ghost_mode=GhostMode.shared_facet),
+        lambda: refine(exact.S1.mesh(0.3))[0].mesh,
+        lambda: refine(TRIANGLE.mesh(3.0))[0].mesh,  # one rank has all
+    ],
+    ids=["plane", "plane, ghosts", "space", "space, ghosts", "refined", "tiny"],
+)
+def test_each_row_has_the_length_that_a_search_finds(make):
+    mesh = make()
+    V = function_space(mesh)
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    a = fem.form(ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx)
+    searched = assemble_matrix(a)
+    searched.assemble()
+    matrix = assemble_matrix(empty_matrix(Layout.of_space(V)), a)
+    matrix.assemble()
+    for ours, theirs in zip(matrix.getValuesCSR()[:2], searched.getValuesCSR()[:2], strict=True):
+        assert np.array_equal(ours, theirs)
+    info = matrix.getInfo()
+    assert (info["nz_unneeded"], info["mallocs"]) == (0, 0)
+    matrix.axpy(-1.0, searched)
+    assert matrix.norm() <= 1e-14 * searched.norm()
+    for thing in (matrix, searched):
+        thing.destroy()
