@@ -16,6 +16,9 @@ from .errors import InputError, on_root
 Writer = Callable[[Path], object]
 """Writes one file; called on every rank, and raises on every rank if at all."""
 
+STAGE = ".signorini-cr-"
+"""What the names of hidden folders begin with in which files are written at first."""
+
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
@@ -29,7 +32,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 def check_writable(
     folder: str | os.PathLike[str], names: Iterable[str] = (), comm: MPI.Comm = MPI.COMM_WORLD
 ) -> None:
-    """Raise InputError on all ranks if files could not be put into a folder; touch nothing.
+    """Raise InputError on all ranks if files could not be put into a folder; leave no trace.
 
     Args:
         folder: Need not be there.
@@ -42,8 +45,12 @@ def check_writable(
         anchor = _nearest(path)
         if not anchor.is_dir():
             raise InputError(f"cannot write to {path}: {anchor} is not a folder")
-        if not os.access(anchor, os.W_OK | os.X_OK):
-            raise InputError(f"cannot write to {path}: {anchor} is not writable")
+        try:  # permissions don't tell all, of /proc for one
+            os.rmdir(tempfile.mkdtemp(prefix=STAGE, dir=anchor))
+        except OSError as error:
+            raise InputError(
+                f"cannot write to {path}: {anchor} is not writable ({error.strerror})"
+            ) from error
         for name in names:
             if (path / name).is_dir():
                 raise InputError(f"cannot write {path / name}: a folder of that name is there")
@@ -71,7 +78,7 @@ def write_files(
 
     def prepare() -> str:
         with disk_errors(path):
-            return tempfile.mkdtemp(prefix=".signorini-cr-", dir=_nearest(path))
+            return tempfile.mkdtemp(prefix=STAGE, dir=_nearest(path))
 
     def publish() -> None:
         with disk_errors(path):

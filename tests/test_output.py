@@ -325,21 +325,19 @@ def test_only_our_own_leftovers_are_removed(finished, shared_tmp_path):
     assert json.loads((shared_tmp_path / "report.json").read_text())["title"] == "A"
 
 
-def test_a_folder_that_cannot_be_written_is_found_out_first(shared_tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_found_out_first(shared_tmp_path):
     if WORLD.rank == 0:
         (shared_tmp_path / "file").write_text("")
         (shared_tmp_path / "taken" / "report.json").mkdir(parents=True)
     WORLD.barrier()
     check_writable(shared_tmp_path / "a" / "b")
-    assert not (shared_tmp_path / "a").exists()
+    assert {path.name for path in shared_tmp_path.iterdir()} == {"file", "taken"}
     with pytest.raises(InputError, match="file is not a folder"):
         check_writable(shared_tmp_path / "file" / "out")
     with pytest.raises(InputError, match="of that name"):
         check_writable(shared_tmp_path / "taken", output.FILES)
-    if WORLD.rank == 0:
-        monkeypatch.setattr("os.access", lambda *_: False)
-    with pytest.raises(InputError, match="not writable"):
-        check_writable(shared_tmp_path)
+    with pytest.raises(InputError, match="/proc is not writable"):
+        check_writable("/proc/none")  # whatever its permissions say
 
 
 def test_a_full_disk_is_told_in_words(finished, shared_tmp_path, monkeypatch):
