@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
-from .errors import raise_together
+from .errors import InputError, raise_together
 from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .moments import Data
@@ -164,8 +164,6 @@ class System:
         forms.insist_on_mesh(domain.mesh)
         on_dirichlet, self.u_D, _ = _boundary_values(level, DIRICHLET)
         on_contact, lower, self.obstacle_at_vertices = _boundary_values(level, CONTACT)
-        for key, values in (("dirichlet", self.u_D), ("obstacle", lower)):
-            _require_finite(comm, key, values.x.array)
         # Where the two parts meet in a P1 vertex the Dirichlet value holds
         bounded = on_contact & ~on_dirichlet
         self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
@@ -180,6 +178,11 @@ class System:
             else:
                 self.A = assemble_matrix(a, [bc])
         self.A.assemble()
+        diagonal = self.A.getDiagonal()
+        positive = comm.allreduce(bool((diagonal.array_r > 0.0).all()), op=MPI.LAND)
+        release(diagonal)
+        if not positive:
+            raise InputError("data: the coefficient must be finite and above 0 everywhere")
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
         if forms.element == "CR" and forms.loaded:
@@ -243,10 +246,14 @@ def _boundary_values(
     facets = domain.facets(part)
     means, at_vertices = level.forms.boundary_data[part].at(domain, facets)
     dofs = closure_dofs(V, facets)
+    of_dofs = means[:, None] if dofs.shape[1] == 1 else at_vertices
+    # before the maximum over the ranks, which a NaN may lose
+    key = {DIRICHLET: "dirichlet", CONTACT: "obstacle"}[part]
+    _require_finite(V.mesh.comm, key, of_dofs)
     values = fem.Function(V)
     on_part = np.zeros_like(values.x.array)
     values.x.array[:] = PETSc.NINFINITY
-    values.x.array[dofs] = means[:, None] if dofs.shape[1] == 1 else at_vertices
+    values.x.array[dofs] = of_dofs
     on_part[dofs] = 1.0
     # A rank may own a dof of the part without owning any of its facets
     for array in (values.x.array, on_part):

@@ -17,7 +17,7 @@ from dolfinx import fem, la
 
 from . import compat
 from .domain import DIRICHLET, PARTS, Domain
-from .space import facet_entities
+from .space import facet_entities, shared_sum
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -210,15 +210,9 @@ class Cells:
 
     def share(self, values: FloatArray, dim: int | None = None) -> FloatArray:
         """Sum the ranks' shares of facet dofs, or of vertices (``dim`` = 0), in place."""
-        if self.comm.size > 1:
-            topology = self.domain.mesh.topology
-            index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
-            vector = la.vector(index_map, dtype=np.float64)
-            vector.array[:] = values
-            vector.scatter_reverse(la.InsertMode.add)
-            vector.scatter_forward()
-            values[:] = vector.array
-        return values
+        topology = self.domain.mesh.topology
+        index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
+        return shared_sum(self.comm, index_map, values)
 
     @cached_property
     def between(self) -> IntArray:

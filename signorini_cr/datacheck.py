@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
-from .domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain
+from .domain import CONTACT, DIRICHLET, NEUMANN, Domain, part_name
 from .errors import InputError
 from .expressions import Expression, parse
 
@@ -62,7 +62,7 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     if math.isfinite(bad[3]):
         raise InputError(f"{message}; the coefficient must be above 0 everywhere")
     part = USED_ON[key]
-    where = "in the domain" if part is None else f"on the {_name(part)} part"
+    where = "in the domain" if part is None else f"on the {part_name(part)} part"
     raise InputError(
         f"{message}; it must be finite everywhere {where}"
         " (where(condition, a, b) can set a value apart)"
@@ -128,10 +128,6 @@ def _vertices(domain: Domain, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.i
 
 def _global(domain: Domain, nodes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
     return domain.mesh.geometry.index_map().local_to_global(nodes.astype(np.int32))
-
-
-def _name(part: int) -> str:
-    return next(name for name, value in PARTS.items() if value == part)
 
 
 def _point(x: Collection[float]) -> str:

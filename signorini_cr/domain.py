@@ -91,7 +91,7 @@ class Domain:
         for a, b in itertools.combinations(wanted, 2):
             if len(both := np.intersect1d(wanted[a], wanted[b])):
                 raise InputError(
-                    f"the facet value {both[0]} stands for {_name(a)} and for {_name(b)}: "
+                    f"the facet value {both[0]} stands for {part_name(a)} and for {part_name(b)}: "
                     "a value can stand for one part only"
                 )
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
@@ -107,8 +107,8 @@ class Domain:
             values[chosen] = part
             if np.any(inside[chosen]):
                 complaint = (
-                    f"{np.count_nonzero(inside[chosen])} facets tagged {_name(part)} lie inside "
-                    "the domain: only exterior facets can be tagged"
+                    f"{np.count_nonzero(inside[chosen])} facets tagged {part_name(part)} lie "
+                    "inside the domain: only exterior facets can be tagged"
                 )
         raise_together(mesh.comm, complaint)
         domain = cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
@@ -116,13 +116,14 @@ class Domain:
             if mesh.comm.allreduce(len(domain.facets(part))) == 0:
                 there = set().union(*mesh.comm.allgather(set(facet_tags.values.tolist())))
                 raise InputError(
-                    f"no exterior facet is tagged {_name(part)} (value {_list(wanted[part])}): "
+                    f"no exterior facet is tagged {part_name(part)} (value {_list(wanted[part])}): "
                     f"the values there are {_list(sorted(there))}"
                 )
         return domain
 
 
-def _name(part: int) -> str:
+def part_name(part: int) -> str:
+    """The key of `PARTS` that a number stands for."""
     return next(name for name, value in PARTS.items() if value == part)
 
 
@@ -152,6 +153,8 @@ def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
         return f"{kind} cells in {mesh.geometry.dim} dimensions: the mesh has to fill its space"
     if coordinate_map(mesh).degree != 1:
         return "the mesh has curved cells: straight-sided ones are needed"
+    if mesh.geometry.x.dtype != np.float64:
+        return f"the mesh has coordinates of type {mesh.geometry.x.dtype}: float64 is needed"
     if facet_tags.dim != tdim - 1:
         return f"the tags have dimension {facet_tags.dim}: facets have dimension {tdim - 1}"
     return None

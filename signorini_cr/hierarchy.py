@@ -278,13 +278,12 @@ def _give_facets(
 
 def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: IntArray) -> Mesh:
     """Put a mesh together whose nodes are numbered like its vertices."""
-    kind = "float32" if vertices.x.dtype == np.float32 else "float64"
     index_map = vertices.index_map
     number = np.concatenate([np.arange(*index_map.local_range, dtype=np.int64), index_map.ghosts])
-    geometry = getattr(cpp.mesh, f"Geometry_{kind}")(
+    geometry = cpp.mesh.Geometry_float64(
         index_map, children, compat.coordinate_map(coarse), vertices.x, number
     )
-    mesh = getattr(cpp.mesh, f"Mesh_{kind}")(coarse.comm, topology, geometry)
+    mesh = cpp.mesh.Mesh_float64(coarse.comm, topology, geometry)
     # a new UFL domain, because it carries a reference to the C++ mesh
     return Mesh(mesh, ufl.Mesh(coarse.ufl_domain().ufl_coordinate_element()))
 

@@ -40,6 +40,12 @@ def rows_of(
     return csr
 
 
+def numbers_of(A: PETSc.Mat, dofs: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """Global numbers of owned rows of A, in integers that hold them."""
+    numbers: npt.NDArray[np.integer] = dofs.astype(PETSc.IntType) + A.getOwnershipRange()[0]
+    return numbers
+
+
 class MaskedMatrix:
     """A symmetric matrix A with the identity in the rows and columns of some dofs.
 
@@ -54,8 +60,7 @@ class MaskedMatrix:
         """Note the rows of the dofs, all that may ever have to be taken out."""
         self.masked, self.dofs = A, dofs
         self.fixed: npt.NDArray[np.bool_] = np.zeros(len(dofs), dtype=bool)
-        first = A.getOwnershipRange()[0]
-        numbers = dofs.astype(PETSc.IntType) + first
+        numbers = numbers_of(A, dofs)
         csr = start, self._column, self._value = rows_of(A, numbers)
         sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
         self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)

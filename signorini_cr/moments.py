@@ -18,6 +18,7 @@ from . import compat
 from .cells import Cells, Side
 from .problem import Forms
 from .ranges import Range, range_of
+from .space import facet_quadrature
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -127,8 +128,7 @@ class Trace:
         cell = forms.mesh.basix_cell()
         facet = basix.cell.subentity_types(cell)[-2][0]
         corners = basix.geometry(facet)
-        self.points, weights = basix.make_quadrature(facet, degree)
-        self.weights = weights / weights.sum()
+        self.points, self.weights = facet_quadrature(forms.mesh, degree)
         self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
         self._corners, self._gdim = len(corners), forms.mesh.geometry.dim
         self._constant = None

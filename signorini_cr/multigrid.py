@@ -23,7 +23,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .garbage import release
-from .masking import MaskedMatrix
+from .masking import MaskedMatrix, numbers_of
 from .options import PREFIX, defaults, read
 from .parents import Layout, Parents
 from .smoothing import GaussSeidel
@@ -93,7 +93,6 @@ class Grid:
         self._dirichlet = dirichlet
         self._silent = dirichlet
         self._changed = True
-        self._deep = False
         self._bottom: PETSc.PC | None = None
         self._vectors: list[PETSc.Vec] = []  # residual, and the coarser space's b and x
         self._smoother: GaussSeidel | None = None
@@ -180,11 +179,9 @@ class Grid:
             if self._smoother is not None:
                 self._smoother.take_out(dofs)
             self._changed = True
-        elif self._deep or not deep:
-            return
+        # the coarser spaces may have served another fine one since
         if self.coarser is not None and self._transfer is not None and deep:
             self.coarser.fix(_touched(self._transfer, dofs))
-        self._deep = deep
 
     def cycle(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """One V-cycle for masked x = b, from x = 0; b is 0 in the fixed dofs."""
@@ -296,7 +293,7 @@ def _product(finer: PETSc.Mat, transfer: PETSc.Mat, dirichlet: npt.NDArray[np.in
     """The Galerkin product, the identity in the rows and columns of owned dofs on Γ0."""
     product = finer.ptap(transfer)
     # there it holds rubbish, as the finer matrix has the identity
-    product.zeroRowsColumns((dirichlet + product.getOwnershipRange()[0]).astype(PETSc.IntType), 1.0)
+    product.zeroRowsColumns(numbers_of(product, dirichlet), 1.0)
     return product
 
 

@@ -32,7 +32,7 @@ from .space import (
     facet_measures,
     ghosted_vector,
 )
-from .transfer import prolongate, shared_sum
+from .transfer import prolongate
 
 if TYPE_CHECKING:
     from .solution import Solution
@@ -89,7 +89,7 @@ def nested_start(coarse: Solution, level: Level, start: fem.Function) -> None:
     for _ in range(ROUNDS):
         shift = surplus / operator.diagonal * (others.shape[1] - 1) / number
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
-        x += shared_sum(layout, moves)
+        x += layout.shared_sum(moves)
         moves[:] = 0.0
         surplus = operator.times(vector) - b - force
     vector.destroy()
@@ -136,5 +136,5 @@ def _front(solution: Solution) -> npt.NDArray[np.bool_]:
     for which in (contact.active, ~contact.active):
         count = np.zeros(len(there))
         np.add.at(count, ends[which], 1.0)
-        there &= shared_sum(p1, count) > 0.0
+        there &= p1.shared_sum(count) > 0.0
     return there

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -16,7 +15,7 @@ from mpi4py import MPI
 from . import compat
 from .problem import Data, Forms, as_expression
 from .solution import Solution
-from .space import facet_entities, vertex_values
+from .space import facet_entities, facet_quadrature, vertex_values
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -91,13 +90,6 @@ def cell_gradients(u: fem.Function) -> tuple[FloatArray, FloatArray]:
     rises = (values[:, 1:] - values[:, :1])[..., None]
     volumes = np.abs(np.linalg.det(edges)) / np.prod(np.arange(1, tdim + 1))
     return np.linalg.solve(edges, rises)[..., 0], volumes
-
-
-def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Points on the reference facet, shape (q, d − 1), and weights that add up to 1."""
-    facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
-    points, weights = basix.make_quadrature(facet, degree)
-    return points, weights / weights.sum()
 
 
 def facet_values(

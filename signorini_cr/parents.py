@@ -18,7 +18,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from . import compat
-from .space import function_space
+from .space import function_space, shared_sum
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
@@ -73,6 +73,10 @@ class Layout:
         numbers = self.index_map.local_to_global(dofs.ravel())
         return numbers.astype(PETSc.IntType).reshape(dofs.shape)
 
+    def shared_sum(self, array: FloatArray) -> FloatArray:
+        """Sum up, in place, what the ranks have for each shared dof."""
+        return shared_sum(self.mesh.comm, self.index_map, array)
+
 
 class Parents:
     """Which coarse cell each fine cell lies in, and where.
@@ -109,13 +113,16 @@ class Parents:
         nodes = compat.cell_nodes(fine)[: len(self.cell)]
         parents = compat.cell_nodes(coarse)
         if len(self.cell) > 0 and self.regular:
-            # Does the pattern of the first cell repeat? One vertex of each child tells, and of that
-            # one coordinate, in a direction where no two points of a cell are at the same place
+            # Does the pattern of the first cell repeat? One coordinate of each vertex tells, in a
+            # direction where no two points of a cell are at the same place
             first = x_coarse[parents[:1].repeat(children, axis=0)]
             pattern = barycentric_coordinates(first, x[nodes[:children]])
             theirs, own = (points @ _DIRECTION[: points.shape[1]] for points in (x_coarse, x))
-            inner, corner = parents[: len(nodes) // children], nodes[:, 0].reshape(-1, children)
-            deviation = np.abs(theirs[inner] @ pattern[:, 0].T - own[corner]).max()
+            inner = theirs[parents[: len(nodes) // children]]
+            deviation = max(
+                np.abs(inner @ pattern[:, k].T - own[nodes[:, k].reshape(-1, children)]).max()
+                for k in range(d + 1)
+            )
             if deviation <= 1e-10 * np.abs(x_coarse).max():
                 return pattern
         return barycentric_coordinates(x_coarse[parents[self.cell]], x[nodes])

@@ -11,7 +11,6 @@ import numpy as np
 from petsc4py import PETSc
 
 from .parents import Layout
-from .transfer import shared_sum
 
 
 def empty_matrix(cr: Layout) -> PETSc.Mat:
@@ -28,15 +27,16 @@ def empty_matrix(cr: Layout) -> PETSc.Mat:
     if comm.size > 1:
         owner = np.full(local, comm.rank)
         owner[owned:] = cr.index_map.owners
-        there = cells[(cells >= owned).any(axis=1)]
+        there = cells[np.unique(np.flatnonzero(cells.ravel() >= owned) // (d + 1))]
         elsewhere = owner[there][:, :, None] != owner[there][:, None, :]
         np.add.at(outside, there, elsewhere.sum(axis=2))
-        inside = shared_sum(cr, inside - outside)
-        shared_sum(cr, outside)
+        inside = cr.shared_sum(inside - outside)
+        cr.shared_sum(outside)
     lengths = [n[:owned].astype(PETSc.IntType) for n in (1.0 + inside, outside)]
-    matrix = PETSc.Mat().createAIJ((cr.size, cr.size), comm=comm)
-    matrix.setPreallocationNNZ(lengths if comm.size > 1 else lengths[0])
-    # PETSc does not set it where a rank has no rows, and would have the ranks ask one another
+    nnz = lengths if comm.size > 1 else lengths[0]
+    matrix = PETSc.Mat().createAIJ((cr.size, cr.size), nnz=nnz, comm=comm)
+    # PETSc does not set it on ranks without rows, and these alone would then wait for an answer
+    # when the matrix is assembled
     matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
     numbers = cr.numbers(np.arange(local, dtype=np.int32))
     local_to_global = PETSc.LGMap().create(numbers.astype(PETSc.IntType, copy=False), comm=comm)

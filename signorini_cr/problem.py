@@ -25,7 +25,7 @@ from ufl.core.expr import Expr
 from . import compat
 from .domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from .errors import InputError
-from .space import facet_entities, ufl_element
+from .space import facet_entities, facet_quadrature, ufl_element
 
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
@@ -43,7 +43,8 @@ class Problem:
         coefficient: κ, positive scalar (or symmetric positive definite tensor).
         exact: The exact solution, where it is known. f, g and u_D that are None are then
             derived from it by differentiation; without it, None means 0.
-        quadrature_degree: Polynomial degree up to which the loads are integrated exactly.
+        quadrature_degree: Polynomial degree up to which loads and coefficient are integrated
+            exactly, 0 or more.
         error_degree: The same for the errors against ``exact``.
     """
 
@@ -55,6 +56,13 @@ class Problem:
     exact: Data | None = None
     quadrature_degree: int = 4
     error_degree: int = 6
+
+    def __post_init__(self) -> None:
+        """Refuse degrees that Basix would stop the process for."""
+        for name in ("quadrature_degree", "error_degree"):
+            degree = getattr(self, name)
+            if not isinstance(degree, int | np.integer) or degree < 0:
+                raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
 
 
 def as_expression(data: Data, x: Expr) -> Expr:
@@ -92,10 +100,8 @@ class Kernel:
         """Bind to a mesh, argument spaces and one function per stand-in."""
         subdomains: dict[Any, list[tuple[int, npt.NDArray[np.int32]]]] = {}
         if "exterior_facet" in self._types:
-            subdomains[fem.IntegralType.exterior_facet] = [
-                (part, facet_entities(domain.mesh, domain.facets(part)).ravel())
-                for part in sorted((DIRICHLET, NEUMANN))
-            ]
+            entities = facet_entities(domain.mesh, domain.facets(NEUMANN))
+            subdomains[fem.IntegralType.exterior_facet] = [(NEUMANN, entities.ravel())]
         return fem.create_form(
             self._compiled,
             list(spaces),
@@ -123,6 +129,8 @@ class Forms:
         self.dx, self.ds = ufl.Measure("dx", cell), ufl.Measure("ds", cell)
         self.x = ufl.SpatialCoordinate(cell)
         self.kappa = as_expression(problem.coefficient, self.x)
+        if self.uniform and not float(self.kappa) > 0.0:
+            raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
         # UFL can't differentiate a number
         level = self.exact is None or _is_constant(self.exact)
@@ -144,7 +152,7 @@ class Forms:
     def a(self) -> Kernel:
         """a_h(u, v) = Σ_T ∫_T κ∇u·∇v, (1.9)."""
         u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-        return Kernel(ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx, self.mesh)
+        return Kernel(self._stiffness(u, v), self.mesh)
 
     def insist_on_mesh(self, mesh: Mesh) -> None:
         """Refuse a mesh on which the data are not to be had.
@@ -185,11 +193,12 @@ class Forms:
     @cached_property
     def a_of_w(self) -> Kernel:
         """a_h(w, w)."""
-        return Kernel(
-            ufl.inner(self.kappa * ufl.grad(self.w), ufl.grad(self.w)) * self.dx,
-            self.mesh,
-            [self.w],
-        )
+        return Kernel(self._stiffness(self.w, self.w), self.mesh, [self.w])
+
+    def _stiffness(self, u: Expr, v: Expr) -> ufl.Form:
+        """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
+        rule = {} if self.uniform else {"quadrature_degree": self.problem.quadrature_degree}
+        return ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
 
     @cached_property
     def _squared_errors(self) -> Kernel:
@@ -242,8 +251,7 @@ class FacetData:
         cell = forms.mesh.basix_cell()
         facet = basix.cell.subentity_types(cell)[-2][0]
         corners = basix.geometry(facet)
-        points, weights = basix.make_quadrature(facet, forms.problem.quadrature_degree)
-        self._weights = weights / weights.sum()
+        points, self._weights = facet_quadrature(forms.mesh, forms.problem.quadrature_degree)
         self._size = len(corners)
         self._constant = float(expression) if _is_constant(expression) else None
         if self._constant is None:

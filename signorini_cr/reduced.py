@@ -18,6 +18,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from .garbage import release
+from .masking import numbers_of
 from .multigrid import Grid
 from .options import PREFIX, read
 
@@ -60,7 +61,6 @@ class MaskedSolver:
             atol: What the linear solver may leave at the end.
         """
         self._grid, self._lower, self._x, self._residual = grid, lower, x, residual
-        self._first = grid.matrix.getOwnershipRange()[0]
         self._is_active = np.zeros(len(lower), dtype=bool)
         self._step = x.duplicate()
         self.iterations = 0
@@ -101,7 +101,7 @@ class MaskedSolver:
     ) -> PETSc.Mat:
         """Note which dofs are inactive, and return a matrix of the right size."""
         inactive = rows.array
-        numbers = self._grid.operator.dofs + self._first
+        numbers = numbers_of(matrix, self._grid.operator.dofs)
         place = np.searchsorted(inactive, numbers)
         if len(inactive):
             self._is_active = inactive.take(place, mode="clip") != numbers

@@ -15,7 +15,6 @@ from petsc4py import PETSc
 from .garbage import release
 from .masking import rows_of
 from .parents import Layout
-from .transfer import shared_sum
 
 IntArray = npt.NDArray[np.int32]
 
@@ -113,7 +112,7 @@ def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, P
     owned, ghosts = dofs.size[0], dofs.index_map.ghosts
     seen = np.zeros(owned + len(ghosts))
     seen[owned:] = 1.0
-    shared = np.flatnonzero(shared_sum(dofs, seen)[:owned] > 0.0) + first
+    shared = np.flatnonzero(dofs.shared_sum(seen)[:owned] > 0.0) + first
     _, column, _ = rows_of(matrix, np.sort(ghosts))  # PETSc looks for their owners in order
     numbers = np.union1d(shared, column[(column >= first) & (column < end)])
     start, column, value = rows_of(matrix, numbers)

@@ -27,7 +27,7 @@ from .reduced import LINEAR_SHARE, MaskedSolver
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
 # usual line search tests a norm that may rightly rise. A contact dof counts as active within the
 # zero tolerance of its bound; PETSc's is absolute and would freeze data of small magnitude.
-DEFAULTS = {"snes_linesearch_type": "basic", "snes_vi_zero_tolerance": 1e-30}
+DEFAULTS = {"snes_linesearch_type": "basic", "snes_vi_zero_tolerance": 0.0}
 
 SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""

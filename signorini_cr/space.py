@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import Mesh
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from .compat import cell_nodes
@@ -137,6 +138,31 @@ def ghosted_vector(V: fem.FunctionSpace, array: FloatArray | None = None) -> PET
     if array is None:
         return PETSc.Vec().createGhost(ghosts, size, comm=V.mesh.comm)
     return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=V.mesh.comm)
+
+
+def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray) -> FloatArray:
+    """Sum up, in place, what the ranks have for each shared entity.
+
+    Args:
+        comm: The ranks.
+        index_map: How they share the entities.
+        array: One number for each local entity, ghosts included.
+    """
+    if comm.size > 1:
+        size = (index_map.size_local, index_map.size_global)
+        ghosts = index_map.ghosts.astype(PETSc.IntType)
+        vector = PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=comm)
+        vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        vector.destroy()
+    return array
+
+
+def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Points on the reference facet, shape (q, d − 1), and weights that add up to 1."""
+    facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
+    points, weights = basix.make_quadrature(facet, degree)
+    return points, weights / weights.sum()
 
 
 def shared_maximum(V: fem.FunctionSpace, array: FloatArray) -> None:

@@ -26,10 +26,10 @@ from mpi4py import MPI
 
 from .domain import CONTACT, DIRICHLET, Domain
 from .exact import Example
-from .norms import facet_quadrature, facet_values
+from .norms import facet_values
 from .problem import Data, as_expression
 from .solution import Solution
-from .space import facet_to_dof, function_space
+from .space import facet_quadrature, facet_to_dof, function_space
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -118,14 +118,14 @@ def prolongate(
                 of_families = gain[coarse.cells].reshape(-1, 1, values.shape[1])
                 values.reshape(len(of_families), len(weights), -1)[:] += of_families
     values = values.ravel()
-    total = shared_sum(fine, _sums(fine, values))
+    total = fine.shared_sum(_sums(fine, values))
     values[:] = 1.0
-    return total / shared_sum(fine, _sums(fine, values))
+    return total / fine.shared_sum(_sums(fine, values))
 
 
 def touching_cells(layout: Layout) -> FloatArray:
     """The number of cells that touch each local dof, over all ranks."""
-    return shared_sum(layout, _sums(layout, np.ones(layout.cells.size)))
+    return layout.shared_sum(_sums(layout, np.ones(layout.cells.size)))
 
 
 def _sums(layout: Layout, values: FloatArray) -> FloatArray:
@@ -173,15 +173,3 @@ def _matrix(
     matrix = PETSc.Mat().createAIJWithArrays((rows.size, columns.size), csr, comm=comm)
     matrix.assemble()
     return matrix
-
-
-def shared_sum(layout: Layout, array: FloatArray) -> FloatArray:
-    """Sum up, in place, what the ranks have for each shared dof."""
-    comm = layout.mesh.comm
-    if comm.size > 1:
-        ghosts = layout.index_map.ghosts.astype(PETSc.IntType)
-        vector = PETSc.Vec().createGhostWithArray(ghosts, array, layout.size, comm=comm)
-        vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
-        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-        vector.destroy()
-    return array

@@ -472,3 +472,21 @@ def test_ranges_hold_everywhere(expression):
     values = fem.Expression(expression(x), points).eval(domain.mesh, which).reshape(len(which), -1)
     assert np.all(low[:, None] - 1e-12 <= values) and np.all(values <= high[:, None] + 1e-12)
     assert np.all(high - low < 3.0)
+
+
+@pytest.mark.parametrize("contrast", [10.0, 1e5])
+def test_a_coefficient_that_jumps_inside_cells_is_the_same_to_solver_and_certificate(contrast):
+    """Both take it by one rule, so that the solver leaves nothing; the bound falls as it does."""
+    sides = ["contact", "dirichlet", "contact", "dirichlet"]
+    problem = Problem(
+        f=-3.0,
+        obstacle=-0.1,
+        coefficient=lambda x: ufl.conditional(x[0] + 0.3 * x[1] < 0.9, contrast, 1.0),
+    )
+    domain = Polygon([[0, 0], [2, 0], [2, 1], [0, 1]], sides).mesh(0.2)
+    certificates = [solution.certificate for solution in solve_levels(problem, domain, 4)]
+    for certificate in certificates:
+        assert certificate.parts["solver"] < 1e-6 * certificate.bound_h1
+    bounds = [certificate.bound_h1 for certificate in certificates]
+    if contrast == 10.0:
+        assert np.all(np.diff(bounds) < 0) and bounds[-1] < 0.5 * bounds[0]

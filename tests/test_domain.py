@@ -458,6 +458,12 @@ def test_own_tags_by_several_values():
     assert lengths(domain) == pytest.approx([2, 4, 0])
 
 
+def test_single_precision_is_refused():
+    mesh = dolfinx.mesh.create_unit_square(MPI.COMM_WORLD, 2, 2, dtype=np.float32)
+    tags = dolfinx.mesh.meshtags(mesh, 1, np.arange(2, dtype=np.int32), np.ones(2, np.int32))
+    assert "float64 is needed" in fails_alike(lambda: Domain.from_tags(mesh, tags))
+
+
 def test_own_tags_that_do_not_fit():
     mesh, tags = tagged_rectangle(dolfinx.mesh.GhostMode.shared_facet)
 

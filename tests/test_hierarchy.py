@@ -224,15 +224,6 @@ def test_eight_levels_keep_the_angles():
     assert COMM.allreduce(h.max(initial=0), op=MPI.MAX) == pytest.approx(longest / 2**8)
 
 
-def test_single_precision_stays_single():
-    mesh = dolfinx.mesh.create_unit_square(COMM, 2, 2, dtype=np.float32)
-    mesh.topology.create_connectivity(1, 2)
-    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-    values = np.arange(len(facets), dtype=np.int32) % 2 + 1
-    fine, _ = refine(Domain.from_tags(mesh, dolfinx.mesh.meshtags(mesh, 1, facets, values)))
-    assert fine.mesh.geometry.x.dtype == np.float32
-
-
 def test_what_cannot_be_refined():
     mesh = dolfinx.mesh.create_unit_cube(COMM, 2, 2, 2)
     mesh.topology.create_connectivity(2, 3)

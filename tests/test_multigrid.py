@@ -11,7 +11,7 @@ from dolfinx.fem.petsc import assemble_matrix
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import Polygon, Problem, exact, solve, solve_levels
+from signorini_cr import Polygon, Problem, exact, garbage, solve, solve_levels
 from signorini_cr.assembly import Level
 from signorini_cr.domain import CONTACT
 from signorini_cr.hierarchy import refine, refine_marked
@@ -78,6 +78,21 @@ def test_affine_functions_are_prolonged_exactly(element, pattern):
     parents = Parents(coarse.mesh, fine.mesh, parent_cell)
     result = prolongate(u, v.function_space, parents)
     assert difference(result, v.x.array) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_children_in_a_row_need_not_repeat(seed):
+    """Every cell has four children, but not all of them the same four."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) + rng.uniform(-0.3, 0.3, (4, 2))
+    coarse = Polygon(corners, ["contact", "dirichlet", "neumann", "dirichlet"]).mesh(10.0)
+    cells = coarse.mesh.topology.index_map(2).size_local
+    fine, parent_cell = refine_marked(coarse, np.ones(cells, dtype=bool))
+    u, v = (fem.Function(function_space(d.mesh)) for d in (coarse, fine))
+    for function in (u, v):
+        function.interpolate(affine)
+    parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+    assert difference(prolongate(u, v.function_space, parents), v.x.array) < 1e-12
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
@@ -200,8 +215,20 @@ def test_dofs_are_taken_out_of_a_matrix_and_put_back():
         assert difference(operator.times(x), z.array[operator.dofs]) < 1e-14 * norm
 
 
+def test_petsc_frees_what_is_left_of_a_sequence(monkeypatch):
+    """On several ranks it keeps what is not freed in so many words, until it is told to."""
+    told = []
+    monkeypatch.setattr("signorini_cr.garbage.PETSc.garbage_cleanup", told.append)
+    for _ in range(2):
+        last(exact.A.problem, exact.A.structured(4), 3)
+        gc.collect()
+    alone = MPI.COMM_WORLD.size == 1
+    assert (len(told) == 0) if alone else (len(told) >= 3)
+    assert len(garbage._held) <= 6  # no more meshes are kept than one sequence has, and one more
+
+
 def test_nothing_outlives_its_solution():
-    """On several ranks PETSc keeps what is not freed in so many words."""
+    """Nobody else holds on to a solution's matrix."""
     solution = last(exact.A.problem, exact.A.structured(4), 3)
     matrix = weakref.ref(solution.level.system.A)
     assert matrix() is not None

@@ -135,6 +135,30 @@ def test_coefficients_of_any_magnitude(scale, shift, levels):
     assert scaled.contact.force / scale == pytest.approx(one.contact.force, rel=1e-6)
 
 
+@pytest.mark.parametrize("value", [-1.0, 0.0, lambda x: x[0] - 0.5, lambda x: 1 / (x[0] - x[0])])
+def test_a_coefficient_that_is_not_positive_is_refused(value):
+    with pytest.raises(InputError, match="coefficient"):
+        solve(Problem(f=-1.0, coefficient=value), SQUARE.mesh(0.2))
+
+
+@pytest.mark.parametrize("name", ["quadrature_degree", "error_degree"])
+@pytest.mark.parametrize("degree", [-1, 2.5, "4"])
+def test_degrees_that_there_are_none_of(name, degree):
+    with pytest.raises(InputError, match=f"{name} is {degree!r}"):
+        Problem(**{name: degree})
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_an_obstacle_that_is_no_number_at_one_vertex_is_refused_on_any_number_of_ranks(element):
+    """Also where the rank that owns the vertex has no contact facet, and a number for it."""
+    sides = ["contact", "neumann", "neumann", "dirichlet", "neumann"]
+    domain = Polygon([[0, 0], [1, 0], [2, 0], [2, 1], [0, 1]], sides).mesh(0.1)
+    edge = 1.0 if element == "P1" else 0.98
+    problem = Problem(f=-1.0, obstacle=lambda x: ufl.sqrt(edge - 1e-4 - x[0]) - 2.0)
+    with pytest.raises(InputError, match="obstacle is not finite"):
+        solve(problem, domain, element)
+
+
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("f", [-5.0, lambda x: -5.0 + x[0]], ids=["number", "function"])
 def test_ranks_without_cells(element, f):
@@ -189,7 +213,7 @@ def test_monitor_sees_every_step():
     assert all(MPI.COMM_WORLD.bcast(fact) == fact for fact in seen)
 
 
-@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("scale", [1e-35, 1e-8, 1.0, 1e8])
 def test_data_of_any_magnitude(scale):
     """u is linear in the data while the obstacle is 0: nothing in the solver is absolute."""
     one = solve(PROBLEM, SQUARE.mesh(0.1))
