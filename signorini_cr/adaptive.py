@@ -13,13 +13,16 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from .domain import Domain
-from .errors import InputError
+from .errors import InputError, NotConverged
 from .hierarchy import refine_marked
 from .levels import LevelMonitor, solve_sequence
 from .problem import Problem
 from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]
+
+RESOLUTION = 1e-9
+"""Least diameter of a cell to be refined, in parts of the largest coordinate."""
 
 
 def solve_adaptive(
@@ -50,7 +53,7 @@ def solve_adaptive(
 
     Raises:
         InputError: There is no bound to go by; the message says why.
-        NotConverged: The solver stopped short on one of the meshes.
+        NotConverged: The solver stopped short on one of the meshes, or cells got too small.
     """
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
@@ -69,6 +72,11 @@ def solve_adaptive(
             return None
         comm = solution.domain.mesh.comm
         marked = mark(certificate.indicators, fraction, comm)
+        if _smallest(solution.domain, marked) < RESOLUTION:
+            raise NotConverged(
+                "cells have become so small that rounding spoils their shape",
+                solution.level.number + 1,
+            )
         fine, parent_cell = refine_marked(solution.domain, marked)
         tdim = fine.mesh.topology.dim
         if fine.mesh.topology.index_map(tdim - 1).size_global > max_dofs:
@@ -78,6 +86,14 @@ def solve_adaptive(
     for solution in solve_sequence(problem, domain, step, element, monitor):
         _ = solution.certificate  # made here, so that it doesn't count as time for the mesh
         yield solution
+
+
+def _smallest(domain: Domain, marked: npt.NDArray[np.bool_]) -> float:
+    """Least diameter of the marked cells, in parts of the largest coordinate; collective."""
+    mesh = domain.mesh
+    h = mesh.h(mesh.topology.dim, np.flatnonzero(marked).astype(np.int32))
+    largest = mesh.comm.allreduce(float(np.abs(mesh.geometry.x).max(initial=0.0)), op=MPI.MAX)
+    return mesh.comm.allreduce(float(h.min(initial=np.inf)), op=MPI.MIN) / largest
 
 
 def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> npt.NDArray[np.bool_]:

@@ -130,6 +130,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
             names = output.write_output(folder, report, finest)
         screen.line("")
         screen.text(_facts(records[-1]))
+        if (reason := records[-1]["bound_reason"]) is not None:
+            screen.text(f"no bound of the error: {reason}")
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
         screen.complain(f"{case.path}: {_stopped(failure, len(records), folder)}")

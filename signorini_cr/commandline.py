@@ -10,6 +10,7 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -66,6 +67,9 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
     args, rest = parser.parse_known_args(own)
     for word in rest:
         _unknown(word, commands[args.command])
+    for option, value in pairwise(petsc):
+        if option == "-options_file" and not Path(value).is_file():
+            parser.error(f"-options_file {value}: there is no such file")
     args.petsc = petsc
     return args
 

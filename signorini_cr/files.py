@@ -45,6 +45,12 @@ def check_writable(
         anchor = _nearest(path)
         if not anchor.is_dir():
             raise InputError(f"cannot write to {path}: {anchor} is not a folder")
+        try:
+            path.lstat()
+        except FileNotFoundError:
+            pass
+        except OSError as error:  # a name that is too long, for one
+            raise InputError(f"cannot write to {path}: {error.strerror}") from error
         try:  # permissions don't tell all, of /proc for one
             os.rmdir(tempfile.mkdtemp(prefix=STAGE, dir=anchor))
         except OSError as error:
@@ -106,4 +112,5 @@ def write_text(path: Path, make: Callable[[], str]) -> None:
 
 def _nearest(path: Path) -> Path:
     """The path itself if it is there, or else the nearest of the folders it would be made in."""
-    return next(place for place in (path, *path.absolute().parents) if place.exists())
+    # a link that leads nowhere is there, too
+    return next(place for place in (path, *path.absolute().parents) if os.path.lexists(place))

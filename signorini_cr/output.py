@@ -95,8 +95,8 @@ def level_record(
             },
             "error_h1": h1,
             "error_l2": l2,
-            "rate_h1": _rate("error_h1", h1, solution.h, previous),
-            "rate_l2": _rate("error_l2", l2, solution.h, previous),
+            "rate_h1": _rate("error_h1", h1, solution, previous),
+            "rate_l2": _rate("error_l2", l2, solution, previous),
             "bound_h1": bound,
             "effectivity": bound / h1 if bound is not None and h1 else None,
             "bound_reason": certificate.reason,
@@ -192,13 +192,22 @@ def report_json(report: Mapping[str, Any]) -> str:
 
 
 def _rate(
-    key: str, value: float | None, h: float, previous: Mapping[str, Any] | None
+    key: str, value: float | None, solution: Solution, previous: Mapping[str, Any] | None
 ) -> float | None:
-    """log(e/e') / log(h/h'), None where there are no two errors to compare."""
+    """log(e/e') / log(h/h'), None where there are no two errors to compare.
+
+    On meshes that are not refined everywhere h, the largest diameter, says nothing; N^(−1/d) with
+    the number N of dofs takes its place.
+    """
     before = None if previous is None else previous[key]
-    if previous is None or not value or not before or h == previous["h"]:
+    if previous is None or not value or not before:
         return None
-    return math.log(value / before) / math.log(h / previous["h"])
+    d = solution.domain.mesh.topology.dim
+    if solution.cells == 2**d * previous["cells"]:
+        finer = math.log(solution.h / previous["h"])
+    else:
+        finer = math.log(previous["dofs"] / solution.dofs) / d
+    return math.log(value / before) / finer if finer else None
 
 
 def _version(package: str) -> str | None:

@@ -118,4 +118,13 @@ def _short(value: float | None) -> str:
 
 
 def _fixed(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    """Three digits in at most four characters, where they are between -9.9 and 999."""
+    if value is None:
+        return "-"
+    return (
+        f"{value:.2f}"
+        if 0 <= value < 9.995
+        else f"{value:.1f}"
+        if value < 99.95
+        else f"{value:.0f}"
+    )

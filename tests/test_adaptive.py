@@ -2,9 +2,18 @@
 
 import numpy as np
 import pytest
+import ufl
 from mpi4py import MPI
 
-from signorini_cr import InputError, Polygon, Problem, exact, solve_adaptive, solve_levels
+from signorini_cr import (
+    InputError,
+    NotConverged,
+    Polygon,
+    Problem,
+    exact,
+    solve_adaptive,
+    solve_levels,
+)
 from signorini_cr.adaptive import mark
 from signorini_cr.domain import PARTS
 from signorini_cr.space import facet_measures
@@ -109,3 +118,20 @@ def test_refusals():
         list(solve_adaptive(exact.S1.problem, domain, fraction=0.0))
     with pytest.raises(InputError, match="levels is 0"):
         list(solve_adaptive(exact.S1.problem, domain, levels=0))
+
+
+def test_cells_that_rounding_would_spoil_end_the_sequence():
+    """u_D jumps: no mesh is fine enough, and cells must not shrink to nothing."""
+    square = Polygon(
+        [[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "dirichlet", "neumann", "dirichlet"]
+    )
+    problem = Problem(
+        f=-3.0, obstacle=-0.25, dirichlet=lambda x: ufl.conditional(x[1] < 0.5, 0.0, 1.0)
+    )
+    solutions = []
+    with pytest.raises(NotConverged, match="cells have become so small") as caught:
+        for solution in solve_adaptive(problem, square.mesh(0.5), max_dofs=20_000):
+            solutions.append(solution)
+    assert caught.value.level == len(solutions) > 10
+    h = solution.domain.mesh.h(2, np.arange(solution.level.cells.number, dtype=np.int32))
+    assert 1e-10 < WORLD.allreduce(float(h.min()), op=MPI.MIN) < 1e-8

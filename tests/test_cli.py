@@ -315,6 +315,7 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "FILE", "--out="], ["--out", "folder"]),
         (["solve", "FILE", "--element", "p2"], ["--element", "cr", "p1"]),
         (["check", "FILE", "--levels", "2"], ["no option --levels"]),
+        (["solve", "FILE", "-options_file", "none"], ["-options_file none", "no such file"]),
         (["solve", "none.toml"], ["none.toml: there is no such file"]),
         (["solve", "."], ["folder; a problem file (TOML) is needed"]),
         (["solve", "FILE", "--out", "FILE/out"], ["--out: cannot write", "not a folder"]),
