@@ -21,7 +21,7 @@ from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]
 
-RESOLUTION = 1e-9
+RESOLUTION = 1e-11
 """Least diameter of a cell to be refined, in parts of the largest coordinate."""
 
 

@@ -121,10 +121,5 @@ def _fixed(value: float | None) -> str:
     """Three digits in at most four characters, where they are between -9.9 and 999."""
     if value is None:
         return "-"
-    return (
-        f"{value:.2f}"
-        if 0 <= value < 9.995
-        else f"{value:.1f}"
-        if value < 99.95
-        else f"{value:.0f}"
-    )
+    digits = 2 if 0 <= value < 9.995 else 1 if value < 99.95 else 0
+    return f"{value:.{digits}f}"

@@ -134,4 +134,4 @@ def test_cells_that_rounding_would_spoil_end_the_sequence():
             solutions.append(solution)
     assert caught.value.level == len(solutions) > 10
     h = solution.domain.mesh.h(2, np.arange(solution.level.cells.number, dtype=np.int32))
-    assert 1e-10 < WORLD.allreduce(float(h.min()), op=MPI.MIN) < 1e-8
+    assert 1e-12 < WORLD.allreduce(float(h.min()), op=MPI.MIN) < 1e-10

@@ -178,10 +178,11 @@ def variants(record):
     """The record with and without an exact solution and a bound, its numbers large."""
     large = record | {"cells": 9_999_999, "dofs": 9_999_999, "linear_iterations": 999, "level": 12}
     large["contact"] = record["contact"] | {"active": 123_456}
+    large |= {"rate_h1": -1.2345, "rate_l2": 12.345}
     for exact_known in (True, False):
         known = {} if exact_known else dict.fromkeys(("error_h1", "error_l2"), None)
         for bound in (1.234e-7, None):
-            yield large | known | {"bound_h1": bound, "effectivity": bound and 1.4}
+            yield large | known | {"bound_h1": bound, "effectivity": bound and 345.6}
 
 
 def test_the_table_fits_eighty_columns_and_is_aligned(finished):
