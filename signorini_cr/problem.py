@@ -66,8 +66,18 @@ class Problem:
 
 
 def as_expression(data: Data, x: Expr) -> Expr:
-    """Turn ``data`` into a UFL expression in the coordinates x."""
-    return ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+    """Turn ``data`` into a UFL expression in the coordinates x.
+
+    Raises:
+        InputError: That is not possible.
+    """
+    try:
+        return ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"data: {data!r} does not give a number or a UFL expression ({error}); functions of x "
+            "take theirs from ufl, as in ufl.sin(x[0])"
+        ) from error
 
 
 class Kernel:
@@ -147,6 +157,25 @@ class Forms:
         boundary = self.exact if problem.dirichlet is None else problem.dirichlet
         self.dirichlet = as_expression(0.0 if boundary is None else boundary, self.x)
         self.obstacle = as_expression(problem.obstacle, self.x)
+        d = mesh.geometry.dim
+        for key, data in self._data.items():
+            if data.ufl_shape != () and (key, data.ufl_shape) != ("coefficient", (d, d)):
+                raise InputError(f"data: {key} has the shape {data.ufl_shape}; a scalar is needed")
+            if any(found != cell for found in ufl.domain.extract_domains(data)):
+                raise InputError(f"data: {key} is given on another mesh than the one to solve on")
+
+    @property
+    def _data(self) -> dict[str, Expr]:
+        """What the user has given, or what was derived from it, by the names of `Problem`."""
+        data = {
+            "coefficient": self.kappa,
+            "f": self.f,
+            "g": self.g,
+            "dirichlet": self.dirichlet,
+            "obstacle": self.obstacle,
+            "exact": self.exact,
+        }
+        return {key: expression for key, expression in data.items() if expression is not None}
 
     @cached_property
     def a(self) -> Kernel:
@@ -160,8 +189,7 @@ class Forms:
         Raises:
             InputError: The data hold a Function on another mesh.
         """
-        data = (self.kappa, self.f, self.g, self.dirichlet, self.obstacle, self.exact)
-        held = (ufl.algorithms.extract_coefficients(each) for each in data if each is not None)
+        held = (ufl.algorithms.extract_coefficients(each) for each in self._data.values())
         if mesh is not self.mesh and any(held):
             raise InputError(
                 "data given as a dolfinx Function live on one mesh only; give a function of x "

@@ -141,6 +141,30 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
         solve(Problem(f=-1.0, coefficient=value), SQUARE.mesh(0.2))
 
 
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({"f": "x"}, "'x' does not give a number or a UFL expression"),
+        ({"obstacle": None}, "None does not give a number"),
+        ({"f": lambda x: np.sin(x[0])}, r"as in ufl.sin\(x\[0\]\)"),
+        ({"f": lambda x: x}, r"f has the shape \(2,\); a scalar"),
+        ({"g": lambda x: ufl.as_vector([x[0], 1.0])}, "g has the shape"),
+        ({"coefficient": lambda x: ufl.as_vector([1.0, 1.0])}, "coefficient has the shape"),
+    ],
+)
+def test_data_that_are_no_numbers_are_refused(data, said):
+    with pytest.raises(InputError, match=said):
+        solve(Problem(**data), SQUARE.mesh(0.2))
+
+
+@pytest.mark.parametrize("key", ["f", "coefficient", "obstacle"])
+def test_data_on_another_mesh_are_refused(key):
+    other = Function(function_space(SQUARE.mesh(0.2).mesh, "P1"))
+    other.x.array[:] = 1.0
+    with pytest.raises(InputError, match=f"{key} is given on another mesh"):
+        solve(Problem(**{key: other}), SQUARE.mesh(0.2))
+
+
 @pytest.mark.parametrize("name", ["quadrature_degree", "error_degree"])
 @pytest.mark.parametrize("degree", [-1, 2.5, "4"])
 def test_degrees_that_there_are_none_of(name, degree):
