@@ -15,7 +15,7 @@ from petsc4py import PETSc
 
 from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
-from .errors import InputError, raise_together
+from .errors import raise_together
 from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .moments import Data
@@ -179,10 +179,10 @@ class System:
                 self.A = assemble_matrix(a, [bc])
         self.A.assemble()
         diagonal = self.A.getDiagonal()
-        positive = comm.allreduce(bool((diagonal.array_r > 0.0).all()), op=MPI.LAND)
+        positive = bool((diagonal.array_r > 0.0).all())
         release(diagonal)
-        if not positive:
-            raise InputError("data: the coefficient must be finite and above 0 everywhere")
+        complaint = "data: the coefficient must be finite and above 0 everywhere"
+        raise_together(comm, None if positive else complaint)
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
         if forms.element == "CR" and forms.loaded:

@@ -218,10 +218,9 @@ class Cells:
     def between(self) -> IntArray:
         """Facet dofs that other ranks see as well, shape (n,)."""
         index_map = self.V.dofmap.index_map
-        mark = la.vector(index_map, dtype=np.float64)
-        mark.array[index_map.size_local :] = 1.0
-        mark.scatter_reverse(la.InsertMode.add)
-        return np.flatnonzero(mark.array > 0)
+        mark = np.zeros(index_map.size_local + index_map.num_ghosts)
+        mark[index_map.size_local :] = 1.0
+        return np.flatnonzero(self.share(mark) > 0)
 
     @cached_property
     def _mailbox(self) -> la.Vector:

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from .cells import dot_rows, sum_rows
 from .domain import CONTACT, DIRICHLET
 from .errors import InputError
-from .space import ghosted_vector
+from .space import ghosted_vector, shared_sum
 
 if TYPE_CHECKING:
     from .solution import Solution
@@ -88,7 +88,8 @@ def _weight(solution: Solution) -> fem.Function:
     for part in (CONTACT, DIRICHLET):
         marks.x.array[:] = 0.0
         marks.x.array[fem.locate_dofs_topological(V, fdim, domain.facets(part))] = 1.0
-        parts[part] = np.flatnonzero(_anywhere(marks)).astype(np.int32)
+        seen = shared_sum(mesh.comm, V.dofmap.index_map, marks.x.array)
+        parts[part] = np.flatnonzero(seen > 0).astype(np.int32)
     both = len(np.intersect1d(parts[CONTACT], parts[DIRICHLET]))
     if mesh.comm.allreduce(both) > 0:
         raise InputError(f"the contact force has no bounds: {TOUCHES}")
@@ -117,10 +118,3 @@ def _weight(solution: Solution) -> fem.Function:
     phi.x.array[parts[DIRICHLET]] = 0.0
     phi.x.scatter_forward()
     return phi
-
-
-def _anywhere(marks: fem.Function) -> npt.NDArray[np.bool_]:
-    marks.x.scatter_reverse(InsertMode.add)
-    marks.x.scatter_forward()
-    found: npt.NDArray[np.bool_] = marks.x.array > 0
-    return found

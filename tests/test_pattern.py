@@ -15,8 +15,6 @@ from signorini_cr.pattern import empty_matrix
 from signorini_cr.space import function_space
 
 WORLD = MPI.COMM_WORLD
-
-
 TRIANGLE = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"])
 
 
