@@ -13,13 +13,15 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from . import compat
 from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
 from .errors import raise_together
 from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
+from .masking import numbers_of
 from .moments import Data
-from .multigrid import LONG_SWEEPS, SWEEPS, Below, Grid, p1_grid
+from .multigrid import LONG_SWEEPS, SWEEPS, Grid
 from .options import NO_INODES, defaults
 from .parents import Layout, Parents
 from .pattern import empty_matrix
@@ -102,32 +104,37 @@ class Level:
                 self._below = coarse, coarse_dofs, parents  # P1 on this mesh shall have them, too
             return Grid(*own, transfer, coarse, LONG_SWEEPS if dofs.cr else SWEEPS)
         if dofs.cr:
-            p1, into_cr = self._p1_in_cr
-            self.conforming = self._p1_grid(p1, into_cr), p1
-            return Grid(*own, into_cr, self.conforming[0], on_same_mesh=True)
+            coarse, p1 = self.conforming
+            return Grid(*own, inclusion(p1, dofs), coarse, on_same_mesh=True)
         return Grid(*own)
 
     @cached_property
     def conforming(self) -> tuple[Grid, Layout]:
-        """P1 on this mesh, for the next one, and its dofs."""
+        """P1 on this mesh and its dofs: for the next mesh, or for CR on this one.
+
+        The function of CR that belongs to the facet opposite vertex i has −d times the gradient of
+        the hat function at i. So the kernel of a_h in CR, at work on the dofs of P1, makes d² times
+        the matrix of P1: no form is compiled, no product computed.
+        """
         if self.forms.element == "P1":
             return self.grid, Layout.of_space(self.V)
-        p1, into_cr = self._p1_in_cr
-        grid = self._p1_grid(p1, into_cr)
-        release(into_cr)
-        return grid, p1
-
-    def _p1_grid(self, p1: Layout, into_cr: PETSc.Mat) -> Grid:
-        system = self.system
-        return p1_grid(system.A, into_cr, p1, self._owned_dirichlet, system.bounded, self._below)
-
-    @property
-    def _p1_in_cr(self) -> tuple[Layout, PETSc.Mat]:
-        p1 = Layout.of_p1(self.domain.mesh)
-        return p1, inclusion(p1, Layout.of_space(self.V))
+        domain = self.domain
+        p1, d = Layout.of_p1(domain.mesh), domain.mesh.topology.dim
+        W = compat.with_dofs(self.V, p1.cells, p1.index_map)
+        matrix = assemble_matrix(empty_matrix(p1), self.forms.a.on(domain, [W, W]))
+        matrix.assemble()
+        matrix.scale(1.0 / d**2)
+        dirichlet, bounded = (p1.owned_ends(domain.facets(part)) for part in (DIRICHLET, CONTACT))
+        matrix.zeroRowsColumns(numbers_of(matrix, dirichlet), 1.0)
+        space = matrix, p1, dirichlet, bounded
+        if self._below is None:
+            return Grid(*space), p1
+        coarse, dofs, parents = self._below
+        return Grid(*space, prolongation(dofs, p1, parents), coarse), p1
 
     @cached_property
-    def _below(self) -> Below | None:
+    def _below(self) -> tuple[Grid, Layout, Parents] | None:
+        """P1 on the coarser mesh, its dofs, and the cells there that hold this mesh's."""
         if self.coarser is None or self.parents is None:
             return None
         return (*self.coarser.conforming, self.parents)
@@ -173,10 +180,7 @@ class System:
         bc = fem.dirichletbc(self.u_D, self.dirichlet)
         a = forms.a.on(domain, [V, V])
         with defaults(NO_INODES, prefix=""):
-            if forms.element == "CR":
-                self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
-            else:
-                self.A = assemble_matrix(a, [bc])
+            self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
         self.A.assemble()
         diagonal = self.A.getDiagonal()
         positive = bool((diagonal.array_r > 0.0).all())

@@ -102,6 +102,28 @@ def set_facets(
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(cells, start), tdim - 1, tdim)
 
 
+def with_dofs(V: fem.FunctionSpace, cells: IntArray, index_map: Any) -> fem.FunctionSpace:
+    """The element of one space at work on the dofs of another, one number each.
+
+    Args:
+        V: The space with the element.
+        cells: Dofs of every local cell, as many as the element has, shape (cells, n).
+        index_map: Their distribution over the ranks.
+    """
+    own = V._cpp_object
+    links = cpp.graph.AdjacencyList_int32(np.ascontiguousarray(cells))
+    parts = (
+        V.mesh._cpp_object,
+        own.element,
+        cpp.fem.DofMap(own.dofmap.dof_layout, index_map, 1, links, 1),
+    )
+    try:
+        space = cpp.fem.FunctionSpace_float64(*parts)
+    except TypeError:  # 0.9 wants the shape of a value, too
+        space = cpp.fem.FunctionSpace_float64(*parts, ())
+    return fem.FunctionSpace(V.mesh, V.ufl_element(), space)
+
+
 def compile_expression(
     expression: Any, points: npt.NDArray[np.float64], mesh: Mesh
 ) -> fem.Expression:

@@ -25,9 +25,9 @@ from petsc4py import PETSc
 from .garbage import release
 from .masking import MaskedMatrix, numbers_of
 from .options import PREFIX, defaults, read
-from .parents import Layout, Parents
+from .parents import Layout
 from .smoothing import GaussSeidel
-from .transfer import prolongation
+from .transfer import in_order
 
 DIRECT = 2000
 """Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
@@ -138,10 +138,11 @@ class Grid:
             finer: The finer space's matrix.
             transfer: The matrix that writes functions of this space there.
         """
-        transposed = transfer.transpose(PETSc.Mat())
-        ordered = transposed.transpose(PETSc.Mat())  # products need rows in ascending order
-        matrix = _product(finer, ordered, self._dirichlet)
-        release(transposed, ordered)
+        ordered = in_order(transfer)
+        matrix = finer.ptap(ordered)
+        # on Γ0 it holds rubbish, as the finer matrix has the identity there
+        matrix.zeroRowsColumns(numbers_of(matrix, self._dirichlet), 1.0)
+        release(ordered)
         coarser = self.coarser
         if coarser is not None and self._transfer is not None:
             coarser = coarser.projected(matrix, self._transfer)
@@ -257,44 +258,6 @@ class Grid:
         with defaults(_PIVOTS if self._is_small else _AMG, _BOTTOM):
             read(pc)
         return pc
-
-
-Below = tuple[Grid, Layout, Parents]
-"""P1 on the coarser mesh, its dofs, and the cells there that hold this mesh's."""
-
-
-def p1_grid(
-    A: PETSc.Mat,
-    into_cr: PETSc.Mat,
-    p1: Layout,
-    dirichlet: npt.NDArray[np.int32],
-    bounded: npt.NDArray[np.int32],
-    below: Below | None = None,
-) -> Grid:
-    """P1 as a subspace of CR on the same mesh.
-
-    Args:
-        A: Matrix of a_h in CR, with the identity in the rows and columns of Γ0's dofs.
-        into_cr: The matrix that writes P1 functions in CR.
-        p1: The dofs of P1.
-        dirichlet: Owned CR dofs on Γ0.
-        bounded: Owned CR dofs on Γ1.
-        below: What comes next, if there is a coarser mesh.
-    """
-    vertices = _touched(into_cr, dirichlet)
-    space = _product(A, into_cr, vertices), p1, vertices, _touched(into_cr, bounded)
-    if below is None:
-        return Grid(*space)
-    grid, dofs, parents = below
-    return Grid(*space, prolongation(dofs, p1, parents), grid)
-
-
-def _product(finer: PETSc.Mat, transfer: PETSc.Mat, dirichlet: npt.NDArray[np.int32]) -> PETSc.Mat:
-    """The Galerkin product, the identity in the rows and columns of owned dofs on Γ0."""
-    product = finer.ptap(transfer)
-    # there it holds rubbish, as the finer matrix has the identity
-    product.zeroRowsColumns(numbers_of(product, dirichlet), 1.0)
-    return product
 
 
 def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -130,8 +130,7 @@ def _front(solution: Solution) -> npt.NDArray[np.bool_]:
     """Whether contact begins or ends at a vertex, for all local ones."""
     mesh, contact = solution.domain.mesh, solution.contact
     p1 = Layout.of_p1(mesh)
-    cells, local = facet_entities(mesh, contact.facets).T
-    ends = p1.cells[cells[:, None], facet_corners(mesh)[local]]
+    ends = p1.ends(contact.facets)
     there = np.ones(p1.size[0] + p1.index_map.num_ghosts, dtype=bool)
     for which in (contact.active, ~contact.active):
         count = np.zeros(len(there))

@@ -18,7 +18,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from . import compat
-from .space import function_space, shared_sum
+from .space import facet_corners, facet_entities, function_space, shared_sum
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
@@ -72,6 +72,18 @@ class Layout:
             return dofs
         numbers = self.index_map.local_to_global(dofs.ravel())
         return numbers.astype(PETSc.IntType).reshape(dofs.shape)
+
+    def ends(self, facets: IntArray) -> IntArray:
+        """The dofs of P1 at the vertices of exterior facets, shape (n, d)."""
+        cells, local = facet_entities(self.mesh, facets).T
+        ends: IntArray = self.cells[cells[:, None], facet_corners(self.mesh)[local]]
+        return ends
+
+    def owned_ends(self, facets: IntArray) -> IntArray:
+        """The owned dofs of P1 at the vertices of any rank's exterior facets, ascending."""
+        there = np.zeros(self.size[0] + self.index_map.num_ghosts)
+        there[self.ends(facets)] = 1.0
+        return np.flatnonzero(self.shared_sum(there)[: self.size[0]]).astype(np.int32)
 
     def shared_sum(self, array: FloatArray) -> FloatArray:
         """Sum up, in place, what the ranks have for each shared dof."""

@@ -1,8 +1,8 @@
-"""Room for the matrix of a_h in CR, whose pattern needs no search.
+"""Room for the matrix of a_h, whose pattern needs no search.
 
-Two facets have no more than one cell in common, so a row has its diagonal entry and d for each cell
-of its facet. In general, entries that several cells have a share in must be found first, which
-takes DOLFINx as long as computing them all.
+A row has its diagonal entry and d for each cell of its dof. That is exact for CR, as two facets
+have no more than one cell in common; for P1 it is twice as much as is needed in the plane. To find
+out which entries several cells have a share in takes DOLFINx as long as computing them all.
 """
 
 from __future__ import annotations
@@ -13,32 +13,33 @@ from petsc4py import PETSc
 from .parents import Layout
 
 
-def empty_matrix(cr: Layout) -> PETSc.Mat:
+def empty_matrix(dofs: Layout) -> PETSc.Mat:
     """A matrix that takes the entries of all owned cells without allocating anything.
 
     Args:
-        cr: The dofs of CR.
+        dofs: The dofs of CR or P1.
     """
-    owned, comm = cr.size[0], cr.mesh.comm
-    local, d = owned + cr.index_map.num_ghosts, cr.cells.shape[1] - 1
-    cells = cr.cells[: cr.mesh.topology.index_map(d).size_local]
+    (owned, everywhere), comm = dofs.size, dofs.mesh.comm
+    local, d = owned + dofs.index_map.num_ghosts, dofs.cells.shape[1] - 1
+    cells = dofs.cells[: dofs.mesh.topology.index_map(d).size_local]
     inside = d * np.bincount(cells.ravel(), minlength=local).astype(np.float64)
     outside = np.zeros(local)  # in columns that the row's rank does not own
     if comm.size > 1:
         owner = np.full(local, comm.rank)
-        owner[owned:] = cr.index_map.owners
+        owner[owned:] = dofs.index_map.owners
         there = cells[np.unique(np.flatnonzero(cells.ravel() >= owned) // (d + 1))]
         elsewhere = owner[there][:, :, None] != owner[there][:, None, :]
         np.add.at(outside, there, elsewhere.sum(axis=2))
-        inside = cr.shared_sum(inside - outside)
-        cr.shared_sum(outside)
-    lengths = [n[:owned].astype(PETSc.IntType) for n in (1.0 + inside, outside)]
+        inside = dofs.shared_sum(inside - outside)
+        dofs.shared_sum(outside)
+    most = (1.0 + inside, owned), (outside, everywhere - owned)  # PETSc refuses more than that
+    lengths = [np.minimum(n[:owned], columns).astype(PETSc.IntType) for n, columns in most]
     nnz = lengths if comm.size > 1 else lengths[0]
-    matrix = PETSc.Mat().createAIJ((cr.size, cr.size), nnz=nnz, comm=comm)
+    matrix = PETSc.Mat().createAIJ((dofs.size, dofs.size), nnz=nnz, comm=comm)
     # PETSc does not set it on ranks without rows, and these alone would then wait for an answer
     # when the matrix is assembled
     matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
-    numbers = cr.numbers(np.arange(local, dtype=np.int32))
+    numbers = dofs.numbers(np.arange(local, dtype=np.int32))
     local_to_global = PETSc.LGMap().create(numbers.astype(PETSc.IntType, copy=False), comm=comm)
     matrix.setLGMap(local_to_global, local_to_global)
     local_to_global.destroy()

@@ -16,11 +16,12 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from .garbage import release
 from .parents import FloatArray, IntArray, Layout, Parents
 
 
 def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
-    """The matrix that writes a P1 function in CR: d entries 1/d in each row."""
+    """The matrix that writes a P1 function in CR: d entries 1/d in each row, in any order."""
     d = cr.cells.shape[1] - 1
     owned = cr.size[0]
     columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
@@ -28,18 +29,13 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
         others = [j for j in range(d + 1) if j != i]
         for k, j in enumerate(others):
             columns[cr.cells[:, i], k] = p1.cells[:, j]
-    columns = columns[:owned]
-    if d == 2:  # several times faster than sorting many short rows
-        one, other = columns.T.copy()
-        np.minimum(one, other, out=columns[:, 0])
-        np.maximum(one, other, out=columns[:, 1])
-    else:
-        columns.sort(axis=1)
-    return _matrix(cr, p1, d, columns, np.full(owned * d, 1.0 / d))
+    return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d))
 
 
 def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
     """The matrix of the prolongation between two nested meshes, from CR to CR or from P1 to either.
+
+    The entries of a row are in any order.
 
     Args:
         coarse: The coarse dofs.
@@ -77,6 +73,14 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
     matrix.setValuesIJV(start, columns, values[kept], PETSc.InsertMode.ADD_VALUES, rows)
     matrix.assemble()
     return matrix
+
+
+def in_order(matrix: PETSc.Mat) -> PETSc.Mat:
+    """A copy with the columns of each row ascending: PETSc's products stumble over any other."""
+    transposed = matrix.transpose(PETSc.Mat())
+    copy = transposed.transpose(PETSc.Mat())
+    release(transposed)
+    return copy
 
 
 def prolongate(
@@ -148,8 +152,7 @@ def _matrix(
         rows: Its rows.
         columns: Its columns.
         lengths: Number of entries of each row.
-        dofs: Their columns as local dofs, ascending in each row where products with other matrices
-            are wanted.
+        dofs: Their columns as local dofs.
         values: The entries.
     """
     owned, comm = rows.size[0], rows.mesh.comm

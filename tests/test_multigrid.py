@@ -8,12 +8,19 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_rectangle,
+    create_unit_cube,
+    exterior_facet_indices,
+    meshtags,
+)
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact, garbage, solve, solve_levels
 from signorini_cr.assembly import Level
-from signorini_cr.domain import CONTACT
+from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from signorini_cr.hierarchy import refine, refine_marked
 from signorini_cr.masking import MaskedMatrix
 from signorini_cr.multigrid import Grid
@@ -22,7 +29,7 @@ from signorini_cr.parents import Layout, Parents
 from signorini_cr.problem import Forms
 from signorini_cr.solver import solve_vi
 from signorini_cr.space import function_space, ghosted_vector
-from signorini_cr.transfer import inclusion, prolongate, prolongation
+from signorini_cr.transfer import in_order, inclusion, prolongate, prolongation
 
 # Obtuse corners, a hole, and contact in three pieces that meet in a corner and at the hole
 CROOKED = Polygon(
@@ -124,9 +131,59 @@ def test_p1_in_cr_has_the_p1_stiffness_matrix():
         A.assemble()
         return A
 
-    product = matrix(V).ptap(inclusion(Layout.of_space(W), Layout.of_space(V)))
+    product = matrix(V).ptap(in_order(inclusion(Layout.of_space(W), Layout.of_space(V))))
     product.axpy(-1.0, matrix(W))
     assert product.norm() < 1e-12
+
+
+def tensor(x):
+    return ufl.as_matrix([[2.0 + x[0], 0.5], [0.5, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("make", "coefficient"),
+    [
+        (lambda: exact.S1.structured(4), 3.0),
+        (lambda: CROOKED.mesh(0.3), stiffness),
+        (lambda: refined(CROOKED.mesh(0.5), "some")[0], tensor),
+        (lambda: boxed(create_rectangle(MPI.COMM_WORLD, [[0.0, 0.0], [2.0, 1.0]], [9, 5])), tensor),
+        (lambda: boxed(create_unit_cube(MPI.COMM_WORLD, 3, 4, 3)), stiffness),
+    ],
+    ids=["structured", "crooked", "marked", "ghosts", "space"],
+)
+def test_matrix_of_p1_without_a_product(make, coefficient):
+    """It is what the product with the inclusion gives, on Γ0 the identity."""
+    domain = make()
+    level = Level(Forms(Problem(coefficient=coefficient), domain.mesh), domain)
+    grid, p1 = level.conforming
+    product = level.system.A.ptap(in_order(inclusion(p1, Layout.of_space(level.V))))
+    on_dirichlet = vertex_dofs(domain, p1, DIRICHLET)
+    product.zeroRowsColumns(on_dirichlet + product.getOwnershipRange()[0], 1.0)
+    assert np.array_equal(grid.operator.dofs, vertex_dofs(domain, p1, CONTACT))
+    product.axpy(-1.0, grid.matrix)
+    assert product.norm() <= 1e-14 * grid.matrix.norm()
+
+
+def boxed(mesh):
+    """A box with contact on its lower, Γ0 on its upper side."""
+    d = mesh.topology.dim
+    mesh.topology.create_connectivity(d - 1, d)
+    facets = exterior_facet_indices(mesh.topology)
+    height = compute_midpoints(mesh, d - 1, facets)[:, d - 1]
+    values = np.where(np.isclose(height, 0.0), CONTACT, NEUMANN)
+    values[np.isclose(height, 1.0)] = DIRICHLET
+    return Domain.from_tags(mesh, meshtags(mesh, d - 1, facets, values.astype(np.int32)))
+
+
+def vertex_dofs(domain, p1, part):
+    """Owned dofs of P1 at the vertices of a boundary part, found by DOLFINx."""
+    W = fem.functionspace(domain.mesh, ("Lagrange", 1))
+    there = fem.Function(W)
+    dofs = fem.locate_dofs_topological(W, domain.mesh.topology.dim - 1, domain.facets(part))
+    there.x.array[dofs] = 1.0
+    values = np.zeros(p1.size[0] + p1.index_map.num_ghosts)
+    values[p1.cells] = there.x.array[W.dofmap.list]
+    return np.flatnonzero(values[: p1.size[0]]).astype(np.int32)
 
 
 def last(problem, domain, levels, **more):
