@@ -53,6 +53,8 @@ comm = MPI.COMM_WORLD
 COARSEST = 23
 """Squares per unit length on the coarsest mesh: 0.05, 0.2, 0.8, 3.3, 13 M dofs on the third on."""
 
+Coarsest = Callable[[], Domain]
+
 CROOKED = Polygon(
     [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],
     ["contact", "contact", "dirichlet", "neumann", "dirichlet"],
@@ -104,9 +106,9 @@ class Row:
     bytes: float
 
 
-def cases() -> dict[str, tuple[Problem, Callable[[], Domain]]]:
-    """Problems and coarsest meshes by name."""
-    result: dict[str, tuple[Problem, Callable[[], Domain]]] = {}
+def cases(n: int = COARSEST, comm: MPI.Comm = comm) -> dict[str, tuple[Problem, Coarsest]]:
+    """Problems and what makes their coarsest meshes, n squares per unit length, by name."""
+    result: dict[str, tuple[Problem, Coarsest]] = {}
     for name, example in (
         ("S1", exact.S1),
         ("A", exact.A),
@@ -116,9 +118,9 @@ def cases() -> dict[str, tuple[Problem, Callable[[], Domain]]]:
         for kind, shift in (("", 0.0), (" mapped", 0.31)):
             result[name + kind] = (
                 example.problem,
-                lambda example=example, shift=shift: example.structured(COARSEST, shift=shift),
+                lambda example=example, shift=shift: example.structured(n, comm, shift=shift),
             )
-    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(1.6 / COARSEST))
+    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(1.6 / n, comm))
     return result
 
 

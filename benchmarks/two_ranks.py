@@ -1,0 +1,146 @@
+"""How much faster two ranks are than one, beside what two cores of the machine have to give.
+
+    container/run python3 benchmarks/two_ranks.py
+
+One rank and two ranks solve the cases of one_solve.py in turns, at 3 to 4 M dofs, each time in new
+processes; the times are those of the variational inequality on the finest mesh. A third run has two
+ranks "apart": each solves half as large a problem by itself and has nothing to do with the other,
+so that whatever they lose they lose to the machine. Streaming bandwidth is measured in each run.
+Quotients are those of a turn, medians over the turns; the range behind them is that of the turns.
+
+As in one_solve.py the processes keep their memory, and the first solve of each does not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+SOLVES = 3
+"""Solves of each process that count; the median is taken."""
+
+STREAM = 40_000_000
+"""Numbers in each of three arrays that are streamed through, on all ranks together."""
+
+FINEST = 2.5e6
+"""The finest mesh is the first with more dofs than this, or than half of it for two apart."""
+
+NAMES = [f"{name}{kind}" for name in ("S1", "A", "C 7/2", "C 11/2") for kind in ("", " mapped")]
+NAMES += ["polygon"]
+
+MODES = {"one": 1, "two": 2, "apart": 2}
+
+
+def run(mode: str, name: str) -> None:
+    """What one process does; rank 0 prints its figures as JSON."""
+    import numpy as np
+    from mpi4py import MPI
+    from one_solve import COARSEST, cases, timed
+
+    from signorini_cr import solve_levels
+
+    comm, parts, members = MPI.COMM_WORLD, 1, MPI.COMM_WORLD
+    if mode == "apart":
+        parts, members = comm.size, MPI.COMM_SELF
+    problem, domain = cases(round(COARSEST / parts**0.5), members)[name]
+    seconds = []
+    for _ in range(1 + SOLVES):
+        for solution in solve_levels(problem, domain(), 99):
+            if solution.dofs > FINEST / parts:
+                break
+        seconds.append(comm.allreduce(solution.seconds["solve"], op=MPI.MAX))
+    a, b, c = (np.ones(STREAM // comm.size) for _ in range(3))
+
+    def stream() -> None:
+        np.multiply(b, 3.0, out=a)
+        np.add(a, c, out=a)
+
+    facts = {
+        "dofs": solution.dofs,
+        "steps": f"{solution.iterations.newton} / {solution.iterations.linear}",
+        "seconds": median(seconds[1:]),
+        "bandwidth": 5 * 8 * STREAM / median(timed(stream) for _ in range(7)) / 1e9,
+    }
+    if comm.rank == 0:
+        print(json.dumps(facts))
+
+
+def launched(mode: str, name: str) -> dict[str, Any]:
+    """The figures of one run in new processes."""
+    command = ["mpirun", "-n", str(MODES[mode]), sys.executable, __file__, "--run", mode, name]
+    result = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
+    facts: dict[str, Any] = json.loads(result.stdout.splitlines()[-1])
+    return facts
+
+
+def span(values: list[float], digits: int = 2) -> str:
+    """The median, and the range behind it."""
+    middle, low, high = (f"{f(values):.{digits}f}" for f in (median, min, max))
+    return f"{middle} ({low}–{high})"
+
+
+def row(name: str, turns: int) -> str:
+    """One line of the table."""
+    found = [{mode: launched(mode, name) for mode in MODES} for _ in range(turns)]
+
+    def of(mode: str, key: str) -> list[float]:
+        return [turn[mode][key] for turn in found]
+
+    def quotients(mode: str, key: str = "seconds") -> list[float]:
+        return [a / b for a, b in zip(of("one", key), of(mode, key), strict=True)]
+
+    first = found[0]
+    cells = [
+        name,
+        f"{first['one']['dofs'] / 1e6:.2f} M",
+        first["one"]["steps"],
+        first["two"]["steps"],
+        span(of("one", "seconds")),
+        span(of("two", "seconds")),
+        f"**{span(quotients('two'))}**",
+        span(quotients("apart")),
+        span([1.0 / q for q in quotients("two", "bandwidth")]),
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+HEAD = (
+    "case",
+    "dofs",
+    "Newton / CG, one",
+    "two",
+    "one rank, s",
+    "two ranks, s",
+    "faster by",
+    "two apart",
+    "bandwidth",
+)
+
+
+def main() -> None:
+    """Measure what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--cases", nargs="*", default=NAMES, choices=NAMES)
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--run", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    arguments = parser.parse_args()
+    if arguments.run:
+        run(*arguments.run)
+        return
+    lines = ["| " + " | ".join(HEAD) + " |", "|---|" + "---:|" * (len(HEAD) - 1)]
+    print("\n".join(lines))
+    for name in arguments.cases:
+        lines.append(row(name, arguments.turns))
+        print(lines[-1], flush=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "two_ranks.md").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
