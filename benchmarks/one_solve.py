@@ -106,8 +106,8 @@ class Row:
     bytes: float
 
 
-def cases(n: int = COARSEST, comm: MPI.Comm = comm) -> dict[str, tuple[Problem, Coarsest]]:
-    """Problems and what makes their coarsest meshes, n squares per unit length, by name."""
+def cases(comm: MPI.Comm = comm) -> dict[str, tuple[Problem, Coarsest]]:
+    """Problems and what makes their coarsest meshes, by name."""
     result: dict[str, tuple[Problem, Coarsest]] = {}
     for name, example in (
         ("S1", exact.S1),
@@ -118,9 +118,11 @@ def cases(n: int = COARSEST, comm: MPI.Comm = comm) -> dict[str, tuple[Problem, 
         for kind, shift in (("", 0.0), (" mapped", 0.31)):
             result[name + kind] = (
                 example.problem,
-                lambda example=example, shift=shift: example.structured(n, comm, shift=shift),
+                lambda example=example, shift=shift: example.structured(
+                    COARSEST, comm, shift=shift
+                ),
             )
-    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(1.6 / n, comm))
+    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(1.6 / COARSEST, comm))
     return result
 
 

@@ -223,7 +223,7 @@ def _facts(record: dict[str, Any]) -> str:
         f" {contact['length']:.6g}, force {contact['force']:.6g}"
     )
     points = [
-        "(" + ", ".join(f"{value:.4g}" for value in point) + ")" for point in contact["transitions"]
+        "(" + ", ".join(f"{value:.6g}" for value in point) + ")" for point in contact["transitions"]
     ]
     if points:
         more = f" and {len(points) - 6} more" if len(points) > 6 else ""

@@ -138,6 +138,14 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         expressions = _expressions(sections)
         refine = sections["refine"]
         mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
+        tolerance = get(refine, "refine", "tolerance", not_negative, 0.0)
+        max_dofs = get(refine, "refine", "max_dofs", whole, MAX_DOFS)
+        for key, limit in (("tolerance", tolerance), ("max_dofs", max_dofs)):
+            if mode == "uniform" and refine.get(key):
+                raise InputError(
+                    f'refine.{key}: {limit:g} is where adaptive refinement ends; mode = "adaptive"'
+                    " is needed beside it"
+                )
         return ProblemFile(
             path=path,
             title=title,
@@ -147,8 +155,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
             expressions=expressions,
             mode=mode,
             levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
-            tolerance=get(refine, "refine", "tolerance", not_negative, 0.0),
-            max_dofs=get(refine, "refine", "max_dofs", whole, MAX_DOFS),
+            tolerance=tolerance,
+            max_dofs=max_dofs,
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -87,6 +87,14 @@ BAD: dict[str, tuple[str, list[str]]] = {
         with_("tolerance = 0", "tolerance = -1e-3"),
         ["refine.tolerance: 0 or more is needed, found -0.001"],
     ),
+    "tolerance of a uniform sequence": (
+        with_("tolerance = 0", "tolerance = 0.25"),
+        ["refine.tolerance: 0.25 is where adaptive", 'mode = "adaptive" is needed'],
+    ),
+    "max_dofs of a uniform sequence": (
+        with_("tolerance = 0", "max_dofs = 5000"),
+        ["refine.max_dofs: 5000 is where", 'mode = "adaptive" is needed'],
+    ),
     "tolerance nan": (with_("tolerance = 0", "tolerance = nan"), ["tolerance:", "found nan"]),
     "mode": (
         with_('"uniform"', '"unifrom"'),
