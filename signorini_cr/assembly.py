@@ -109,6 +109,7 @@ class Level:
         return Grid(*own)
 
     @cached_property
+    @defaults(NO_INODES, prefix="")
     def conforming(self) -> tuple[Grid, Layout]:
         """P1 on this mesh and its dofs: for the next mesh, or for CR on this one.
 
@@ -118,6 +119,7 @@ class Level:
         """
         if self.forms.element == "P1":
             return self.grid, Layout.of_space(self.V)
+        _ = self.system  # looks at the data, and holds the mesh while there are objects on it
         domain = self.domain
         p1, d = Layout.of_p1(domain.mesh), domain.mesh.topology.dim
         W = compat.with_dofs(self.V, p1.cells, p1.index_map)
@@ -126,6 +128,7 @@ class Level:
         matrix.scale(1.0 / d**2)
         dirichlet, bounded = (p1.owned_ends(domain.facets(part)) for part in (DIRICHLET, CONTACT))
         matrix.zeroRowsColumns(numbers_of(matrix, dirichlet), 1.0)
+        matrix.setOption(PETSc.Mat.Option.SPD, True)
         space = matrix, p1, dirichlet, bounded
         if self._below is None:
             return Grid(*space), p1
@@ -180,7 +183,10 @@ class System:
         bc = fem.dirichletbc(self.u_D, self.dirichlet)
         a = forms.a.on(domain, [V, V])
         with defaults(NO_INODES, prefix=""):
-            self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
+            if forms.element == "CR":
+                self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
+            else:
+                self.A = assemble_matrix(a, [bc])
         self.A.assemble()
         diagonal = self.A.getDiagonal()
         positive = bool((diagonal.array_r > 0.0).all())

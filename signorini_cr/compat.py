@@ -103,7 +103,9 @@ def set_facets(
 
 
 def with_dofs(V: fem.FunctionSpace, cells: IntArray, index_map: Any) -> fem.FunctionSpace:
-    """The element of one space at work on the dofs of another, one number each.
+    """The element of one space at work on the dofs of another, to assemble over cells only.
+
+    Which entities the dofs belong to is still what V says.
 
     Args:
         V: The space with the element.

@@ -52,7 +52,7 @@ class Layout:
 
     @classmethod
     def of_p1(cls, mesh: Mesh) -> Layout:
-        """P1 without building a space: the nodes of a straight-sided mesh are its vertices.
+        """P1 without new numbers: the nodes of a straight-sided mesh are its vertices.
 
         On refined meshes those of the coarse mesh come first, which also suits Gauss-Seidel better
         than the order of a DOLFINx space.

@@ -1,8 +1,9 @@
 """Room for the matrix of a_h, whose pattern needs no search.
 
 A row has its diagonal entry and d for each cell of its dof. That is exact for CR, as two facets
-have no more than one cell in common; for P1 it is twice as much as is needed in the plane. To find
-out which entries several cells have a share in takes DOLFINx as long as computing them all.
+have no more than one cell in common; for P1 it is twice as much as is needed in the plane and five
+times in space. To find out which entries several cells have a share in takes DOLFINx as long as
+computing them all.
 """
 
 from __future__ import annotations

@@ -143,8 +143,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         for key, limit in (("tolerance", tolerance), ("max_dofs", max_dofs)):
             if mode == "uniform" and refine.get(key):
                 raise InputError(
-                    f'refine.{key}: {limit:g} is where adaptive refinement ends; mode = "adaptive"'
-                    " is needed beside it"
+                    f"refine.{key}: {shown(limit)} is where adaptive refinement ends;"
+                    ' mode = "adaptive" is needed beside it'
                 )
         return ProblemFile(
             path=path,

@@ -92,8 +92,8 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["refine.tolerance: 0.25 is where adaptive", 'mode = "adaptive" is needed'],
     ),
     "max_dofs of a uniform sequence": (
-        with_("tolerance = 0", "max_dofs = 5000"),
-        ["refine.max_dofs: 5000 is where", 'mode = "adaptive" is needed'],
+        with_("tolerance = 0", "max_dofs = 1234567"),
+        ["refine.max_dofs: 1234567 is where", 'mode = "adaptive" is needed'],
     ),
     "tolerance nan": (with_("tolerance = 0", "tolerance = nan"), ["tolerance:", "found nan"]),
     "mode": (

@@ -39,6 +39,9 @@ CROOKED = Polygon(
 )
 
 
+TRIANGLE = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"])
+
+
 def stiffness(x):
     return ufl.conditional(x[0] < 1.3, 1.0, 50.0)
 
@@ -148,8 +151,9 @@ def tensor(x):
         (lambda: refined(CROOKED.mesh(0.5), "some")[0], tensor),
         (lambda: boxed(create_rectangle(MPI.COMM_WORLD, [[0.0, 0.0], [2.0, 1.0]], [9, 5])), tensor),
         (lambda: boxed(create_unit_cube(MPI.COMM_WORLD, 3, 4, 3)), stiffness),
+        (lambda: TRIANGLE.mesh(3.0), stiffness),  # one rank has all
     ],
-    ids=["structured", "crooked", "marked", "ghosts", "space"],
+    ids=["structured", "crooked", "marked", "ghosts", "space", "tiny"],
 )
 def test_matrix_of_p1_without_a_product(make, coefficient):
     """It is what the product with the inclusion gives, on Γ0 the identity."""

@@ -54,11 +54,14 @@ def test_rows_of_any_rank_in_any_order():
         assert np.array_equal(rows, A[numbers])
 
 
-@pytest.mark.parametrize("element", ["CR", "P1", "product"])
+@pytest.mark.parametrize("element", ["CR", "P1", "P1 beside CR", "product"])
 @pytest.mark.parametrize("sweeps", [1, 3])
 def test_sweeps_are_petscs(element, sweeps):
-    own, dofs = system(exact.S1.mesh(0.1), "P1" if element == "P1" else "CR")
-    A = own.A
+    domain = exact.S1.mesh(0.1)
+    level = Level(Forms(Problem(), domain.mesh, "P1" if element == "P1" else "CR"), domain)
+    A, dofs = level.system.A, Layout.of_space(level.V)
+    if element == "P1 beside CR":
+        A, dofs = level.conforming[0].matrix, level.conforming[1]
     if element == "product":
         p1 = Layout.of_p1(dofs.mesh)
         A, dofs = A.ptap(in_order(inclusion(p1, dofs))), p1
