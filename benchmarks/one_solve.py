@@ -293,7 +293,7 @@ def picture(rows: list[Row], path: Path) -> None:
         axis.set_xlabel("dofs")
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
-    axes[2].legend(fontsize=7, ncols=2)
+    axes[2].legend(fontsize=7, ncols=3, loc="lower center")
     figure.savefig(path, dpi=130)
 
 
