@@ -240,6 +240,7 @@ COLUMNS = {
     "CG": lambda r: f"{r.cg}",
     "VI / linear solve": lambda r: f"{r.finest_ratio:.2f}",
     "all meshes / linear solve": lambda r: f"**{r.all_ratio:.2f}**",
+    "all meshes, products": lambda r: f"{r.all_levels / r.product:.0f}",
     "VI, products": lambda r: f"{r.vi / r.product:.0f}",
     "linear solve, products": lambda r: f"{r.linear / r.product:.0f}",
     "VI, µs a dof": lambda r: f"{1e6 * r.vi / r.dofs:.2f}",
