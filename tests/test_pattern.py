@@ -48,6 +48,7 @@ def test_rows_are_those_that_a_search_finds(make, element):
     for ours, theirs in zip(matrix.getValuesCSR()[:2], searched.getValuesCSR()[:2], strict=True):
         assert np.array_equal(ours, theirs)
     info = matrix.getInfo()
+    assert info["mallocs"] == 0
     assert info["nz_unneeded"] <= {"CR": 0, "P1": 5}[element] * info["nz_used"]
     matrix.axpy(-1.0, searched)
     assert matrix.norm() <= 1e-14 * searched.norm()
