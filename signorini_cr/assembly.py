@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from . import compat
 from .cells import Cells
 from .domain import CONTACT, DIRICHLET, Domain
-from .errors import raise_together
+from .errors import InputError, raise_together
 from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .masking import numbers_of
@@ -52,6 +52,11 @@ class Level:
     number: int = 0
     coarser: Level | None = None
     parent_cell: npt.NDArray[np.int32] | None = None
+
+    def __post_init__(self) -> None:
+        """Free what levels before have left, and hold the mesh while there are objects on it."""
+        sweep(self.domain.mesh.comm)
+        hold(self, self.domain.mesh)
 
     @cached_property
     def parents(self) -> Parents | None:
@@ -119,7 +124,6 @@ class Level:
         """
         if self.forms.element == "P1":
             return self.grid, Layout.of_space(self.V)
-        _ = self.system  # looks at the data, and holds the mesh while there are objects on it
         domain = self.domain
         p1, d = Layout.of_p1(domain.mesh), domain.mesh.topology.dim
         W = compat.with_dofs(self.V, p1.cells, p1.index_map)
@@ -169,8 +173,6 @@ class System:
     def __init__(self, level: Level):
         forms, domain, V = level.forms, level.domain, level.V
         comm = domain.mesh.comm
-        sweep(comm)
-        hold(level, domain.mesh)
         forms.insist_on_mesh(domain.mesh)
         on_dirichlet, self.u_D, _ = _boundary_values(level, DIRICHLET)
         on_contact, lower, self.obstacle_at_vertices = _boundary_values(level, CONTACT)
@@ -222,7 +224,10 @@ class System:
             start.x.array[self.dirichlet] = values
             start.x.array[bounded] = np.maximum(self.lower[bounded], number)
             norms.append(self.residual(start, residual))
-        return max(norms[0], ROUNDING * norms[-1])
+        load = max(norms[0], ROUNDING * norms[-1])
+        if not np.isfinite(load):
+            raise InputError("data: so large that their squares overflow; choose other units")
+        return load
 
     def start(self) -> fem.Function:
         """The function that is u_D on Γ0 and 0 elsewhere."""
@@ -276,7 +281,7 @@ def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
     raise_together(
         comm,
         None
-        if np.isfinite(values).all()
+        if (np.abs(values) < PETSc.INFINITY).all()
         else f"data: {key} is not finite at some quadrature point of the mesh; "
         "where(condition, a, b), or ufl.conditional, can set a value apart",
     )

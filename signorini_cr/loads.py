@@ -66,7 +66,8 @@ class Load:
             here = values[part]
             mean[part] = here @ rule.weights
             rows[:, part] = tests @ here.T
-            variance[part] = (here - mean[part, None]) ** 2 @ rule.weights
+            with np.errstate(over="ignore"):  # such data are refused where the load is known
+                variance[part] = (here - mean[part, None]) ** 2 @ rule.weights
         return cls(mean, rows, variance)
 
 

@@ -73,8 +73,7 @@ class MaskedMatrix:
         """Take dofs out, and put the others back.
 
         Args:
-            dofs: Owned dofs, local numbers. Others than `dofs` are left alone: a space may meet Γ0
-                where the finer one's bounds end, and the identity is there already.
+            dofs: Some of `dofs`, local numbers.
 
         Returns:
             Whether that changed anything, on any rank.

@@ -172,9 +172,11 @@ class Grid:
         """Take dofs out of the space, and what does not vanish there out of the coarser ones.
 
         Args:
-            dofs: Owned dofs, local numbers; replaces those of the call before.
+            dofs: Owned dofs, local numbers; replaces those of the call before. Others than the
+                bounded ones are left alone: a space may meet Γ0 where the finer one's bounds end.
             deep: Go on to the coarser spaces; without that the cycle may not be used.
         """
+        dofs = dofs[np.isin(dofs, self.operator.dofs)]
         if self.operator.fix(dofs):
             self._silent = np.concatenate([self._dirichlet, dofs])
             if self._smoother is not None:

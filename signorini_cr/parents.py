@@ -26,6 +26,9 @@ IntArray = npt.NDArray[np.int32]
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
 """No edge or median of a cell is at right angles to it, unless on purpose."""
 
+ROUNDING = 1e-6
+"""Barycentric coordinates below this are 0: far from the origin few digits of a cell are left."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -151,7 +154,7 @@ class Parents:
         if fine.cr:  # facet midpoints
             at = (at.sum(axis=1, keepdims=True) - at) / d
         weights = 1.0 - d * at if coarse.cr else at.copy()
-        weights[np.abs(weights) < 1e-10] = 0.0
+        weights[np.abs(weights) < ROUNDING] = 0.0
         return weights
 
 

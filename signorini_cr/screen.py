@@ -22,6 +22,9 @@ class Screen:
 
     def __init__(self, root: bool) -> None:
         """Take everything as it comes at first."""
+        for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+            if getattr(sys, name) is None:  # closed: no other file shall get its number
+                setattr(sys, name, open(os.devnull, mode))
         self.root, self.quiet, self.verbose = root, False, False
         self.passing = 0  # width of the progress line that stands on the terminal
 
@@ -74,9 +77,11 @@ class Screen:
         try:
             sys.stdout.write(text)
             sys.stdout.flush()
-        except BrokenPipeError:  # the reader has left; the results are still wanted
+        except OSError as error:  # the results are still wanted
             self.quiet = True
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if not isinstance(error, BrokenPipeError):  # the reader may leave
+                self.complain(f"cannot print to standard output: {error.strerror}")
 
 
 def wrapped(text: str, before: str = "") -> str:

@@ -59,7 +59,7 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
             return _matrix(fine, coarse, corners, columns, values.ravel())
         kept = values != 0.0
         return _matrix(fine, coarse, kept.sum(axis=1, dtype=np.int32), columns[kept], values[kept])
-    repeats = len(parent_cell) // len(weights)
+    repeats = len(parent_cell) // max(len(weights), 1)
     values = np.tile(weights, (repeats, 1, 1)) / touching_cells(fine)[fine.cells][:, :, None]
     kept = values != 0.0
     columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)

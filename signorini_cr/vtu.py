@@ -6,6 +6,8 @@ the DG1 interpolant, which is u_h itself, and nothing is averaged on the way to 
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -71,23 +73,34 @@ def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
     ).encode()
 
     def begin() -> None:
-        with disk_errors(path), path.open("wb") as file:
+        with disk_errors(path), path.open("w+b") as file:
             file.write(head)
             for place, size in places:
                 file.seek(len(head) + place)
                 file.write(np.array(size, dtype="<u8").tobytes())
             file.seek(len(head) + end)
             file.write(b"\n</AppendedData>\n</VTKFile>\n")
+            _reserve(file.fileno(), file.tell())
 
     on_root(comm, begin)
-    complaint = None
-    try:
-        file = MPI.File.Open(comm, str(path), MPI.MODE_WRONLY)
-        for (place, _), (_, _, kind, values, per_cell) in zip(places, arrays, strict=True):
-            data = np.ascontiguousarray(values, dtype=NUMPY_TYPES[kind])
-            at = len(head) + place + 8 + offset * per_cell * data.itemsize
+    complaints = []
+    file = MPI.File.Open(comm, str(path), MPI.MODE_WRONLY)
+    for (place, _), (_, _, kind, values, per_cell) in zip(places, arrays, strict=True):
+        data = np.ascontiguousarray(values, dtype=NUMPY_TYPES[kind])
+        at = len(head) + place + 8 + offset * per_cell * data.itemsize
+        try:
             file.Write_at_all(at, data)
-        file.Close()
-    except MPI.Exception as error:
-        complaint = f"cannot write {path.name}: {error}"
-    raise_together(comm, complaint)
+        except MPI.Exception as error:  # of this rank alone, perhaps: the others write on
+            complaints.append(f"cannot write {path.name}: {error}")
+    file.Close()
+    raise_together(comm, complaints[0] if complaints else None)
+
+
+def _reserve(file: int, length: int) -> None:
+    """Find out that a disk is full before all ranks write to it; not every system can tell."""
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(file, 0, length)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise

@@ -107,8 +107,10 @@ def test_children_in_a_row_need_not_repeat(seed):
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("pattern", ["all", "marked"])
-def test_prolongation_is_its_matrix(element, pattern):
-    coarse = CROOKED.mesh(0.4)
+@pytest.mark.parametrize("size", [0.4, 10.0])
+def test_prolongation_is_its_matrix(element, pattern, size):
+    """On few cells, too, when ranks have none."""
+    coarse = (CROOKED if size < 1.0 else TRIANGLE).mesh(size)
     fine, parent_cell = refined(coarse, pattern)
     V, W = (function_space(d.mesh, element) for d in (coarse, fine))
     parents = Parents(coarse.mesh, fine.mesh, parent_cell)
@@ -448,8 +450,21 @@ def test_a_mesh_without_a_hierarchy():
     assert "direct" in few.iterations.preconditioner
 
 
-def test_the_cycle_is_symmetric_and_keeps_fixed_dofs_out():
-    solution = last(exact.S1.problem, exact.S1.mesh(0.25), 3)
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_solving_leaves_the_matrices_of_all_meshes_whole(element):
+    for solution in list(solve_levels(exact.A.problem, exact.A.mesh(0.25), 3, element)):
+        residual = fem.Function(solution.u.function_space)
+        solution.level.system.residual(solution.u, residual)
+        assert solution.contact.number_active > 0
+        assert difference(residual.x.array, solution.residual.x.array) < 1e-10
+
+
+@pytest.mark.parametrize("away", [0.0, 4.6e6])
+def test_the_cycle_is_symmetric_and_keeps_fixed_dofs_out(away):
+    """Far from the origin, too, where midpoints are rounded to few digits of a cell."""
+    domain = CROOKED.mesh(0.25)
+    domain.mesh.geometry.x[:, :2] += away
+    solution = last(Problem(f=-1.0), domain, 3)
     level = Level(solution.level.forms, solution.domain, 2, solution.level.coarser)
     level.parent_cell = solution.level.parent_cell
     grid = level.grid

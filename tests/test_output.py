@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 from pathlib import Path
 
@@ -363,14 +364,20 @@ def test_a_folder_that_cannot_be_written_is_found_out_first(shared_tmp_path):
         check_writable("/proc/none")  # whatever its permissions say
 
 
-def test_a_full_disk_is_told_in_words(finished, shared_tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "place", "function"),
+    [("report.json", Path, "write_text"), ("solution.vtu", os, "posix_fallocate")],
+)
+def test_a_full_disk_is_told_in_words(
+    name, place, function, finished, shared_tmp_path, monkeypatch
+):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     if WORLD.rank == 0:
-        monkeypatch.setattr(Path, "write_text", full)
+        monkeypatch.setattr(place, function, full)
     solution, report = finished
-    with pytest.raises(InputError, match=r"cannot write report.json: No space left"):
+    with pytest.raises(InputError, match=f"cannot write {name}: No space left"):
         output.write_output(shared_tmp_path / "out", report, solution)
     WORLD.barrier()
     assert not (shared_tmp_path / "out").exists()

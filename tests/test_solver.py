@@ -183,6 +183,23 @@ def test_an_obstacle_that_is_no_number_at_one_vertex_is_refused_on_any_number_of
         solve(problem, domain, element)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"f": 1e200},
+        {"f": lambda x: 1e200 * (1.0 + x[0])},
+        {"g": 1e200},
+        {"dirichlet": 1e200},
+        {"obstacle": -1e308},  # below what PETSc takes for no bound
+    ],
+)
+def test_data_that_are_too_large_are_refused(data, element):
+    with pytest.raises(InputError, match="squares overflow|obstacle is not finite"):
+        solve(Problem(**data), SQUARE.mesh(0.25), element)
+
+
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("f", [-5.0, lambda x: -5.0 + x[0]], ids=["number", "function"])
 def test_ranks_without_cells(element, f):
