@@ -115,7 +115,7 @@ class Grid:
             finer: The finer space's matrix.
             transfer: The matrix that writes functions of this space there.
         """
-        self.fix(self.operator.dofs[:0], deep=False)
+        self.restore()
         v, product, own = (self.matrix.createVecRight() for _ in range(3))
         u, image = finer.createVecs()
         v.array[:] = np.random.default_rng(0).standard_normal(v.local_size)
@@ -177,14 +177,16 @@ class Grid:
             deep: Go on to the coarser spaces; without that the cycle may not be used.
         """
         dofs = dofs[np.isin(dofs, self.operator.dofs)]
-        if self.operator.fix(dofs):
-            self._silent = np.concatenate([self._dirichlet, dofs])
-            if self._smoother is not None:
-                self._smoother.take_out(dofs)
-            self._changed = True
+        self._take_out(dofs)
         # the coarser spaces may have served another fine one since
         if self.coarser is not None and self._transfer is not None and deep:
             self.coarser.fix(_touched(self._transfer, dofs))
+
+    def restore(self) -> None:
+        """Put all dofs back, those of the coarser spaces too."""
+        self._take_out(self.operator.dofs[:0])
+        if self.coarser is not None:
+            self.coarser.restore()
 
     def cycle(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """One V-cycle for masked x = b, from x = 0; b is 0 in the fixed dofs."""
@@ -220,6 +222,13 @@ class Grid:
         if self._smoother is not None:
             self._smoother.free()
         self.operator.free()
+
+    def _take_out(self, dofs: npt.NDArray[np.int32]) -> None:
+        if self.operator.fix(dofs):
+            self._silent = np.concatenate([self._dirichlet, dofs])
+            if self._smoother is not None:
+                self._smoother.take_out(dofs)
+            self._changed = True
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:

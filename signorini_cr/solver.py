@@ -157,7 +157,7 @@ def solve_vi(
     finally:
         # a monitor may raise on one rank alone, which must not wait for the others then
         if everywhere:
-            grid.fix(operator.dofs[:0])
+            grid.restore()
             release(outer, snes, jacobian, upper)
             linear.free()
     if reason < 0:

@@ -196,7 +196,7 @@ def test_an_obstacle_that_is_no_number_at_one_vertex_is_refused_on_any_number_of
     ],
 )
 def test_data_that_are_too_large_are_refused(data, element):
-    with pytest.raises(InputError, match="squares overflow|obstacle is not finite"):
+    with pytest.raises(InputError, match=r"squares overflow|obstacle is not finite"):
         solve(Problem(**data), SQUARE.mesh(0.25), element)
 
 
