@@ -282,6 +282,6 @@ def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
         comm,
         None
         if (np.abs(values) < PETSc.INFINITY).all()
-        else f"data: {key} is not finite at some quadrature point of the mesh; "
+        else f"data: {key} is not finite, or too large, at some point of the mesh; "
         "where(condition, a, b), or ufl.conditional, can set a value apart",
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,9 +81,10 @@ def _run(args: argparse.Namespace, screen: Screen) -> int:
         # Perhaps on this rank only: the others must not wait for it
         import traceback
 
-        traceback.print_exc()
         where = f" on rank {comm.rank}" if comm.size > 1 else ""
-        print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
+        with suppress(OSError):  # whether or not it can be told
+            traceback.print_exc()
+            print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
         if comm.size > 1:
             comm.Abort(FAULT)
         return FAULT

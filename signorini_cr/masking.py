@@ -73,7 +73,8 @@ class MaskedMatrix:
         """Take dofs out, and put the others back.
 
         Args:
-            dofs: Some of `dofs`, local numbers.
+            dofs: Owned dofs, local numbers. Others than `dofs` are left alone: a space may meet Γ0
+                where the finer one's bounds end, and far from the origin rounding touches more.
 
         Returns:
             Whether that changed anything, on any rank.

@@ -115,7 +115,7 @@ class Grid:
             finer: The finer space's matrix.
             transfer: The matrix that writes functions of this space there.
         """
-        self.restore()
+        self.fix(self.operator.dofs[:0], deep=False)
         v, product, own = (self.matrix.createVecRight() for _ in range(3))
         u, image = finer.createVecs()
         v.array[:] = np.random.default_rng(0).standard_normal(v.local_size)
@@ -172,19 +172,22 @@ class Grid:
         """Take dofs out of the space, and what does not vanish there out of the coarser ones.
 
         Args:
-            dofs: Owned dofs, local numbers; replaces those of the call before. Others than the
-                bounded ones are left alone: a space may meet Γ0 where the finer one's bounds end.
+            dofs: Owned dofs, local numbers; replaces those of the call before. Only those with a
+                bound count.
             deep: Go on to the coarser spaces; without that the cycle may not be used.
         """
-        dofs = dofs[np.isin(dofs, self.operator.dofs)]
-        self._take_out(dofs)
+        if self.operator.fix(dofs):
+            self._silent = np.concatenate([self._dirichlet, self._fixed])
+            if self._smoother is not None:
+                self._smoother.take_out(self._fixed)
+            self._changed = True
         # the coarser spaces may have served another fine one since
         if self.coarser is not None and self._transfer is not None and deep:
-            self.coarser.fix(_touched(self._transfer, dofs))
+            self.coarser.fix(_touched(self._transfer, self._fixed))
 
     def restore(self) -> None:
         """Put all dofs back, those of the coarser spaces too."""
-        self._take_out(self.operator.dofs[:0])
+        self.fix(self.operator.dofs[:0], deep=False)
         if self.coarser is not None:
             self.coarser.restore()
 
@@ -223,12 +226,10 @@ class Grid:
             self._smoother.free()
         self.operator.free()
 
-    def _take_out(self, dofs: npt.NDArray[np.int32]) -> None:
-        if self.operator.fix(dofs):
-            self._silent = np.concatenate([self._dirichlet, dofs])
-            if self._smoother is not None:
-                self._smoother.take_out(dofs)
-            self._changed = True
+    @property
+    def _fixed(self) -> npt.NDArray[np.int32]:
+        """The dofs that are out."""
+        return self.operator.dofs[self.operator.fixed]
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:

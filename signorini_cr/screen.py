@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import textwrap
+from typing import TextIO
 
 WIDTH = 80
 
@@ -32,7 +33,7 @@ class Screen:
         """A line of results."""
         if self.root and not self.quiet:
             self.clear()
-            self._put(text + "\n")
+            self._put(sys.stdout, text + "\n")
 
     def text(self, text: str) -> None:
         """Results as a paragraph."""
@@ -49,15 +50,13 @@ class Screen:
         """What is going on, on a terminal, until the next line."""
         if self.root and not self.quiet and sys.stderr.isatty():
             self.clear()
-            sys.stderr.write(text[: WIDTH - 1])
-            sys.stderr.flush()
+            self._put(sys.stderr, text[: WIDTH - 1])
             self.passing = len(text[: WIDTH - 1])
 
     def clear(self) -> None:
         """Take the progress line away."""
         if self.passing:
-            sys.stderr.write("\r" + " " * self.passing + "\r")
-            sys.stderr.flush()
+            self._put(sys.stderr, "\r" + " " * self.passing + "\r")
             self.passing = 0
 
     def complain(self, message: str) -> None:
@@ -65,23 +64,24 @@ class Screen:
         if self.root:
             self.clear()
             self.flush()
-            print(wrapped(message, "signorini-cr: "), file=sys.stderr, flush=True)
+            self._put(sys.stderr, wrapped(message, "signorini-cr: ") + "\n")
 
     def flush(self) -> None:
         """Bring out what was printed, and take away the progress line."""
         self.clear()
         if self.root:
-            self._put("")
+            self._put(sys.stdout, "")
 
-    def _put(self, text: str) -> None:
+    def _put(self, stream: TextIO, text: str) -> None:
         try:
-            sys.stdout.write(text)
-            sys.stdout.flush()
+            stream.write(text)
+            stream.flush()
         except OSError as error:  # the results are still wanted
-            self.quiet = True
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            if not isinstance(error, BrokenPipeError):  # the reader may leave
-                self.complain(f"cannot print to standard output: {error.strerror}")
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            if stream is sys.stdout:
+                self.quiet = True
+                if not isinstance(error, BrokenPipeError):  # the reader may leave
+                    self.complain(f"cannot print to standard output: {error.strerror}")
 
 
 def wrapped(text: str, before: str = "") -> str:

@@ -147,19 +147,18 @@ def solve_vi(
     snes.setMonitor(report)
     with defaults(DEFAULTS):
         read(snes)
-    everywhere = comm.getSize() == 1
+    together = comm.getSize() == 1
     try:
         with explained():
             snes.solve(None, x)
-        everywhere = True
+        together = True
         reason, linear_reason = snes.getConvergedReason(), linear.ksp.getConvergedReason()
         iterations = Iterations(snes.getIterationNumber(), linear.iterations, linear.describe())
     finally:
-        # a monitor may raise on one rank alone, which must not wait for the others then
-        if everywhere:
-            grid.restore()
-            release(outer, snes, jacobian, upper)
-            linear.free()
+        if together:  # a monitor may raise on one rank alone, which must not wait for the others
+            grid.fix(operator.dofs[:0], deep=False)
+        release(outer, snes, jacobian, upper)
+        linear.free()
     if reason < 0:
         words = _name(PETSc.SNES.ConvergedReason, reason)
         if linear_reason < 0:

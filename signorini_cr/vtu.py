@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -83,17 +85,24 @@ def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
             _reserve(file.fileno(), file.tell())
 
     on_root(comm, begin)
-    complaints = []
-    file = MPI.File.Open(comm, str(path), MPI.MODE_WRONLY)
+    complaint: str | None = None
+
+    def attempt(action: Callable[..., Any], *args: object) -> Any:
+        """Keep what goes wrong, on this rank alone perhaps, while the others go on."""
+        nonlocal complaint
+        try:
+            return action(*args)
+        except MPI.Exception as error:
+            complaint = complaint or f"cannot write {path.name}: {error}"
+
+    file = attempt(MPI.File.Open, comm, str(path), MPI.MODE_WRONLY)
+    raise_together(comm, complaint)
     for (place, _), (_, _, kind, values, per_cell) in zip(places, arrays, strict=True):
         data = np.ascontiguousarray(values, dtype=NUMPY_TYPES[kind])
         at = len(head) + place + 8 + offset * per_cell * data.itemsize
-        try:
-            file.Write_at_all(at, data)
-        except MPI.Exception as error:  # of this rank alone, perhaps: the others write on
-            complaints.append(f"cannot write {path.name}: {error}")
-    file.Close()
-    raise_together(comm, complaints[0] if complaints else None)
+        attempt(file.Write_at_all, at, data)
+    attempt(file.Close)
+    raise_together(comm, complaint)
 
 
 def _reserve(file: int, length: int) -> None:

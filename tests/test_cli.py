@@ -596,6 +596,7 @@ def test_without_out_the_results_lie_in_the_current_folder(tmp_path: Path) -> No
         ("| true", ""),
         (">&-", ""),
         (">&- 2>&-", ""),
+        (">/dev/full 2>&1", ""),
         (">/dev/full", "signorini-cr: cannot print to standard output: No space left on device\n"),
     ],
 )
