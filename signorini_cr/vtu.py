@@ -106,7 +106,10 @@ def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
 
 
 def _reserve(file: int, length: int) -> None:
-    """Find out that a disk is full before all ranks write to it; not every system can tell."""
+    """Find out that a disk is full before all ranks write to it; not every system can tell.
+
+    The file must be readable, too: some C libraries read where the system does not do it for them.
+    """
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(file, 0, length)
