@@ -14,7 +14,7 @@ and the quotient of the fastest: on a machine that others use, too, a delay of e
 both, and the fastest solves are those that nothing delayed.
 
 As in one_solve.py the processes keep their memory, and the first solves of each do not count. The
-memory comes in large pages where the system has them: with small ones times vary twice as much.
+memory comes in large pages where the system has them.
 """
 
 from __future__ import annotations

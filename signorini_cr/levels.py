@@ -145,8 +145,6 @@ def _solve(
             level.grid.free()  # the next level needs P1 alone
             del level.grid
         release(*vectors)
-    if level.forms.element == "P1":
-        level.grid.restore()  # its matrices are those of the levels below
     for function in (u, residual):
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock

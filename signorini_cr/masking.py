@@ -89,6 +89,11 @@ class MaskedMatrix:
             self.fixed = fixed
         return changed
 
+    @property
+    def out(self) -> IntArray:
+        """The dofs that are out, local numbers, ascending."""
+        return self.dofs[self.fixed]
+
     def times(self, x: PETSc.Vec) -> FloatArray:
         """A x in the dofs that can be taken out, shape (n,)."""
         self._rows.mult(x, self._part)
@@ -97,10 +102,9 @@ class MaskedMatrix:
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = A x, whatever is taken out."""
         self.masked.mult(x, y)
-        there = self.dofs[self.fixed]
         self._part.array[:] = np.where(self.fixed, x.array_r[self.dofs], 0.0)
         self._rows.multTransposeAdd(self._part, y, y)
-        y.array[there] = self.times(x)[self.fixed]
+        y.array[self.out] = self.times(x)[self.fixed]
 
     def free(self) -> None:
         """Free the rows; the matrix should be whole by then."""

@@ -177,18 +177,21 @@ class Grid:
             deep: Go on to the coarser spaces; without that the cycle may not be used.
         """
         if self.operator.fix(dofs):
-            self._silent = np.concatenate([self._dirichlet, self._fixed])
+            self._silent = np.concatenate([self._dirichlet, self.operator.out])
             if self._smoother is not None:
-                self._smoother.take_out(self._fixed)
+                self._smoother.take_out(self.operator.out)
             self._changed = True
         # the coarser spaces may have served another fine one since
         if self.coarser is not None and self._transfer is not None and deep:
-            self.coarser.fix(_touched(self._transfer, self._fixed))
+            self.coarser.fix(_touched(self._transfer, self.operator.out))
 
     def restore(self) -> None:
-        """Put all dofs back, those of the coarser spaces too."""
+        """Put all dofs back, and below P1 those of the coarser spaces, too.
+
+        Their matrices are the coarser meshes' own; those below CR nobody else uses.
+        """
         self.fix(self.operator.dofs[:0], deep=False)
-        if self.coarser is not None:
+        if self.coarser is not None and not self._dofs.cr:
             self.coarser.restore()
 
     def cycle(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -225,11 +228,6 @@ class Grid:
         if self._smoother is not None:
             self._smoother.free()
         self.operator.free()
-
-    @property
-    def _fixed(self) -> npt.NDArray[np.int32]:
-        """The dofs that are out."""
-        return self.operator.dofs[self.operator.fixed]
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self._bottom is None:

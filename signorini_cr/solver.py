@@ -156,7 +156,7 @@ def solve_vi(
         iterations = Iterations(snes.getIterationNumber(), linear.iterations, linear.describe())
     finally:
         if together:  # a monitor may raise on one rank alone, which must not wait for the others
-            grid.fix(operator.dofs[:0], deep=False)
+            grid.restore()
         release(outer, snes, jacobian, upper)
         linear.free()
     if reason < 0:
