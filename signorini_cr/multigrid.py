@@ -27,7 +27,7 @@ from .masking import MaskedMatrix, numbers_of
 from .options import PREFIX, defaults, read
 from .parents import Layout
 from .smoothing import GaussSeidel
-from .transfer import in_order
+from .transfer import Transfer
 
 DIRECT = 2000
 """Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
@@ -70,7 +70,7 @@ class Grid:
         dofs: Layout,
         dirichlet: npt.NDArray[np.int32],
         bounded: npt.NDArray[np.int32],
-        transfer: PETSc.Mat | None = None,
+        transfer: Transfer | None = None,
         coarser: Grid | None = None,
         sweeps: int = SWEEPS,
         on_same_mesh: bool = False,
@@ -82,7 +82,7 @@ class Grid:
             dofs: Its dofs.
             dirichlet: Its owned dofs on Γ0, local numbers.
             bounded: Its owned dofs that may be taken out, local numbers, ascending.
-            transfer: The matrix that writes functions of the coarser space in this one.
+            transfer: What writes functions of the coarser space in this one.
             coarser: The next space.
             sweeps: Number of Gauss-Seidel sweeps before and after.
             on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
@@ -98,31 +98,31 @@ class Grid:
         self._smoother: GaussSeidel | None = None
         if coarser is not None:
             self._smoother = GaussSeidel(matrix, dofs, sweeps)
-            spaces = (matrix, coarser.matrix, coarser.matrix)
-            self._vectors = [space.createVecRight() for space in spaces]
+            below = coarser._dofs
+            self._vectors = [matrix.createVecRight(), below.vector(), below.vector()]
 
     @property
     def matrix(self) -> PETSc.Mat:
         """The matrix as it is now, without what `fix` has taken out."""
         return self.operator.masked
 
-    def is_product(self, finer: PETSc.Mat, transfer: PETSc.Mat) -> bool:
+    def is_product(self, finer: PETSc.Mat, transfer: Transfer) -> bool:
         """Whether the whole matrix is, nearly, the Galerkin product of a finer space's.
 
         It is not where a mesh does not see what the coefficient does between its quadrature points.
 
         Args:
             finer: The finer space's matrix.
-            transfer: The matrix that writes functions of this space there.
+            transfer: What writes functions of this space there.
         """
         self.fix(self.operator.dofs[:0], deep=False)
-        v, product, own = (self.matrix.createVecRight() for _ in range(3))
+        v, product, own = (self._dofs.vector() for _ in range(3))
         u, image = finer.createVecs()
         v.array[:] = np.random.default_rng(0).standard_normal(v.local_size)
         v.array[self._dirichlet] = 0.0
-        transfer.mult(v, u)
+        transfer.add(v, u)
         finer.mult(u, image)
-        transfer.multTranspose(image, product)
+        transfer.restrict(image, product)
         self.matrix.mult(v, own)
         difference = np.abs(product.array_r - own.array_r)
         difference[self._dirichlet] = 0.0
@@ -131,18 +131,18 @@ class Grid:
         release(v, product, own, u, image, diagonal)
         return self.matrix.getComm().tompi4py().allreduce(largest, op=MPI.MAX) <= NEARLY
 
-    def projected(self, finer: PETSc.Mat, transfer: PETSc.Mat) -> Grid:
+    def projected(self, finer: PETSc.Mat, transfer: Transfer) -> Grid:
         """The same chain with Galerkin products of a finer space's matrix.
 
         Args:
             finer: The finer space's matrix.
-            transfer: The matrix that writes functions of this space there.
+            transfer: What writes functions of this space there.
         """
-        ordered = in_order(transfer)
-        matrix = finer.ptap(ordered)
+        whole = transfer.matrix()
+        matrix = finer.ptap(whole)
         # on Γ0 it holds rubbish, as the finer matrix has the identity there
         matrix.zeroRowsColumns(numbers_of(matrix, self._dirichlet), 1.0)
-        release(ordered)
+        release(whole)
         coarser = self.coarser
         if coarser is not None and self._transfer is not None:
             coarser = coarser.projected(matrix, self._transfer)
@@ -183,7 +183,7 @@ class Grid:
             self._changed = True
         # the coarser spaces may have served another fine one since
         if self.coarser is not None and self._transfer is not None and deep:
-            self.coarser.fix(_touched(self._transfer, self.operator.out))
+            self.coarser.fix(self._transfer.touched(self.operator.out))
 
     def restore(self) -> None:
         """Put all dofs back, and below P1 those of the coarser spaces, too.
@@ -203,10 +203,10 @@ class Grid:
         self._smoother.forward(b, x)
         self.matrix.mult(x, r)
         r.aypx(-1.0, b)
-        self._transfer.multTranspose(r, b_coarse)
+        self._transfer.restrict(r, b_coarse)
         b_coarse.array[self.coarser._silent] = 0.0
         self.coarser.cycle(b_coarse, x_coarse)
-        self._transfer.multAdd(x_coarse, x, x)
+        self._transfer.add(x_coarse, x)
         self._smoother.backward(b, x)
 
     def apply(self, _: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -224,9 +224,10 @@ class Grid:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what belongs to this space alone, not the matrix it was made with."""
-        release(self._transfer, self._bottom, *self._vectors)
-        if self._smoother is not None:
-            self._smoother.free()
+        release(self._bottom, *self._vectors)
+        for part in (self._transfer, self._smoother):
+            if part is not None:
+                part.free()
         self.operator.free()
 
     def _solve_bottom(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
@@ -268,14 +269,3 @@ class Grid:
         with defaults(_PIVOTS if self._is_small else _AMG, _BOTTOM):
             read(pc)
         return pc
-
-
-def _touched(transfer: PETSc.Mat, dofs: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
-    fine, coarse = transfer.createVecLeft(), transfer.createVecRight()
-    fine.array[dofs] = 1.0
-    transfer.multTranspose(fine, coarse)
-    touched = np.flatnonzero(coarse.array_r != 0.0).astype(np.int32)
-    fine.destroy()
-    coarse.destroy()
-    return touched

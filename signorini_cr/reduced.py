@@ -126,7 +126,11 @@ class MaskedSolver:
         self.ksp.setOperators(self._grid.matrix)
         self.ksp.solve(self._residual, self._step)
         self._residual.array[dofs] = self._at_start[1]
-        x.array[:] = np.delete(self._step.array_r, active)
+        # by hand: numpy.delete takes memory of the size of x
+        step, reduced = self._step.array_r, x.array
+        starts, ends = np.concatenate([[0], active + 1]), np.append(active, len(step))
+        for gone, (start, end) in enumerate(zip(starts, ends, strict=True)):
+            reduced[start - gone : end - gone] = step[start:end]
         self.iterations += self.ksp.getIterationNumber()
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())

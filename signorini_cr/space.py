@@ -130,14 +130,24 @@ def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> F
     return values
 
 
-def ghosted_vector(V: fem.FunctionSpace, array: FloatArray | None = None) -> PETSc.Vec:
-    """A PETSc vector with room for the ghosts of V, on ``array`` if given (no copy)."""
-    index_map = V.dofmap.index_map
+def ghosted(comm: MPI.Comm, index_map: Any, array: FloatArray | None = None) -> PETSc.Vec:
+    """A PETSc vector with room for ghosts.
+
+    Args:
+        comm: The ranks.
+        index_map: How they share its entries.
+        array: Memory for it, one number for each local entry, ghosts included (no copy).
+    """
     size = (index_map.size_local, index_map.size_global)
     ghosts = index_map.ghosts.astype(PETSc.IntType)
     if array is None:
-        return PETSc.Vec().createGhost(ghosts, size, comm=V.mesh.comm)
-    return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=V.mesh.comm)
+        return PETSc.Vec().createGhost(ghosts, size, comm=comm)
+    return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=comm)
+
+
+def ghosted_vector(V: fem.FunctionSpace, array: FloatArray | None = None) -> PETSc.Vec:
+    """A PETSc vector with room for the ghosts of V, on ``array`` if given (no copy)."""
+    return ghosted(V.mesh.comm, V.dofmap.index_map, array)
 
 
 def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray) -> FloatArray:
@@ -149,9 +159,7 @@ def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray) -> FloatArray:
         array: One number for each local entity, ghosts included.
     """
     if comm.size > 1:
-        size = (index_map.size_local, index_map.size_global)
-        ghosts = index_map.ghosts.astype(PETSc.IntType)
-        vector = PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=comm)
+        vector = ghosted(comm, index_map, array)
         vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
         vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
         vector.destroy()

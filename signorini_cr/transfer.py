@@ -20,8 +20,83 @@ from .garbage import release
 from .parents import FloatArray, IntArray, Layout, Parents
 
 
-def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
-    """The matrix that writes a P1 function in CR: d entries 1/d in each row, in any order."""
+class Transfer:
+    """What writes functions of a P1 space in a finer space.
+
+    A rank has the rows of its own fine dofs. Their columns are local coarse dofs, ghosts included,
+    so that none has to be given another number, and no matrix of several ranks is put together.
+    """
+
+    def __init__(
+        self,
+        coarse: Layout,
+        fine: Layout,
+        lengths: IntArray | int,
+        dofs: IntArray,
+        values: FloatArray,
+    ):
+        """Take the entries as they are, one row after the other.
+
+        Args:
+            coarse: The coarse dofs.
+            fine: The fine dofs.
+            lengths: Number of entries of each owned fine dof's row.
+            dofs: The entries' local coarse dofs, in each row in any order.
+            values: The entries.
+        """
+        self._coarse, self._fine = coarse, fine
+        rows = fine.size[0]
+        if isinstance(lengths, int):
+            start = np.arange(0, (rows + 1) * lengths, lengths, dtype=PETSc.IntType)
+        else:
+            start = np.zeros(rows + 1, dtype=PETSc.IntType)
+            np.cumsum(lengths, out=start[1:])
+        self._csr = start, dofs.ravel().astype(PETSc.IntType, copy=False), values
+        sizes = rows, coarse.size[0] + coarse.index_map.num_ghosts
+        self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
+        self._own = self._rows.createVecLeft()
+
+    def add(self, x_coarse: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Add a coarse function to x; its vector has room for ghosts."""
+        x_coarse.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        x.getLocalVector(self._own)
+        with x_coarse.localForm() as local:
+            self._rows.multAdd(local, self._own, self._own)
+        x.restoreLocalVector(self._own)
+
+    def restrict(self, b: PETSc.Vec, b_coarse: PETSc.Vec) -> None:
+        """Multiply b by the transposed matrix; the coarse vector has room for ghosts."""
+        b.getLocalVector(self._own, readonly=True)
+        with b_coarse.localForm() as local:
+            self._rows.multTranspose(self._own, local)
+        b.restoreLocalVector(self._own, readonly=True)
+        b_coarse.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+
+    def touched(self, dofs: IntArray) -> IntArray:
+        """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
+        fine, coarse = self._rows.createVecLeft(), self._coarse.vector()
+        fine.array[dofs] = 1.0
+        self.restrict(fine, coarse)
+        touched = np.flatnonzero(coarse.array_r != 0.0).astype(np.int32)
+        release(fine, coarse)
+        return touched
+
+    def matrix(self) -> PETSc.Mat:
+        """As a matrix of all ranks, for products."""
+        start, dofs, values = self._csr
+        number = self._coarse.numbers(dofs)
+        order = np.lexsort((number, np.repeat(np.arange(len(start) - 1), np.diff(start))))
+        csr = start, number[order], values[order]
+        sizes = self._fine.size, self._coarse.size
+        return PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._fine.mesh.comm)
+
+    def free(self) -> None:
+        """Free the rows."""
+        release(self._rows, self._own)
+
+
+def inclusion(p1: Layout, cr: Layout) -> Transfer:
+    """P1 in CR on the same mesh: d entries 1/d in each row."""
     d = cr.cells.shape[1] - 1
     owned = cr.size[0]
     columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
@@ -29,13 +104,11 @@ def inclusion(p1: Layout, cr: Layout) -> PETSc.Mat:
         others = [j for j in range(d + 1) if j != i]
         for k, j in enumerate(others):
             columns[cr.cells[:, i], k] = p1.cells[:, j]
-    return _matrix(cr, p1, d, columns[:owned], np.full(owned * d, 1.0 / d))
+    return Transfer(p1, cr, d, columns[:owned], np.full(owned * d, 1.0 / d))
 
 
-def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
-    """The matrix of the prolongation between two nested meshes, from CR to CR or from P1 to either.
-
-    The entries of a row are in any order.
+def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
+    """P1 on a coarse mesh in P1 or CR on a nested one: any fine cell of a dof tells all.
 
     Args:
         coarse: The coarse dofs.
@@ -44,21 +117,31 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
     """
     weights, parent_cell = parents.weights(coarse, fine), parents.cell
     corners = fine.cells.shape[1]
-    if not coarse.cr:  # continuous: one cell tells all
-        slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
-        slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
-        slot = slot[: fine.size[0]]
-        if len(weights) < len(parent_cell):  # the same in each parent, whose children are in a row
-            parent = slot // (len(weights) * corners)
-            slot = slot - parent * (len(weights) * corners)
-        else:
-            parent = parent_cell.take(slot // corners)
-        values = weights.reshape(-1, corners).take(slot, axis=0)
-        columns = coarse.cells.take(parent, axis=0)
-        if fine.cr:  # few zeros: leave them
-            return _matrix(fine, coarse, corners, columns, values.ravel())
-        kept = values != 0.0
-        return _matrix(fine, coarse, kept.sum(axis=1, dtype=np.int32), columns[kept], values[kept])
+    slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
+    slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
+    slot = slot[: fine.size[0]]
+    if len(weights) < len(parent_cell):  # the same in each parent, whose children are in a row
+        parent = slot // (len(weights) * corners)
+        slot = slot - parent * (len(weights) * corners)
+    else:
+        parent = parent_cell.take(slot // corners)
+    values = weights.reshape(-1, corners).take(slot, axis=0)
+    dofs = coarse.cells.take(parent, axis=0)
+    if fine.cr:  # few zeros: leave them
+        return Transfer(coarse, fine, corners, dofs, values.ravel())
+    kept = values != 0.0
+    return Transfer(coarse, fine, kept.sum(axis=1, dtype=np.int32), dofs[kept], values[kept])
+
+
+def averaging(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
+    """The matrix of the prolongation from CR to CR, which `prolongate` applies without it.
+
+    Args:
+        coarse: The coarse dofs.
+        fine: The fine dofs.
+        parents: The coarse cells that hold the fine ones.
+    """
+    weights, parent_cell = parents.weights(coarse, fine), parents.cell
     repeats = len(parent_cell) // max(len(weights), 1)
     values = np.tile(weights, (repeats, 1, 1)) / touching_cells(fine)[fine.cells][:, :, None]
     kept = values != 0.0
@@ -66,21 +149,13 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
     start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
     np.cumsum(kept.sum(axis=2), out=start[1:])
     # no facet touches more than two cells
-    most = 2 * corners
+    most = 2 * fine.cells.shape[1]
     matrix = PETSc.Mat().createAIJ((fine.size, coarse.size), nnz=(most, most), comm=fine.mesh.comm)
     rows = fine.numbers(fine.cells).ravel().astype(PETSc.IntType, copy=False)
     columns = columns[kept].astype(PETSc.IntType, copy=False)
     matrix.setValuesIJV(start, columns, values[kept], PETSc.InsertMode.ADD_VALUES, rows)
     matrix.assemble()
     return matrix
-
-
-def in_order(matrix: PETSc.Mat) -> PETSc.Mat:
-    """A copy with the columns of each row ascending: PETSc's products stumble over any other."""
-    transposed = matrix.transpose(PETSc.Mat())
-    copy = transposed.transpose(PETSc.Mat())
-    release(transposed)
-    return copy
 
 
 def prolongate(
@@ -141,38 +216,3 @@ def _sums(layout: Layout, values: FloatArray) -> FloatArray:
     vector.assemble()
     vector.destroy()
     return result
-
-
-def _matrix(
-    rows: Layout, columns: Layout, lengths: IntArray | int, dofs: IntArray, values: FloatArray
-) -> PETSc.Mat:
-    """A matrix from the owned rows' entries, one row after the other, which it takes as they are.
-
-    Args:
-        rows: Its rows.
-        columns: Its columns.
-        lengths: Number of entries of each row.
-        dofs: Their columns as local dofs.
-        values: The entries.
-    """
-    owned, comm = rows.size[0], rows.mesh.comm
-    if isinstance(lengths, int):
-        start = np.arange(0, (owned + 1) * lengths, lengths, dtype=PETSc.IntType)
-    else:
-        start = np.zeros(owned + 1, dtype=PETSc.IntType)
-        np.cumsum(lengths, out=start[1:])
-    dofs = dofs.ravel().astype(PETSc.IntType, copy=False)
-    csr: tuple = start, dofs, values
-    if comm.size > 1:  # owned columns by local numbers, the few others by global ones
-        at = np.flatnonzero(dofs >= columns.size[0])
-        row = np.searchsorted(start, at, side="right") - 1
-        number = columns.numbers(dofs[at].astype(np.int32, copy=False))
-        order = np.lexsort((number, row))
-        at, number = at[order], number[order]
-        before = np.zeros(owned + 1, dtype=PETSc.IntType)
-        np.cumsum(np.bincount(row, minlength=owned), out=before[1:])
-        inside = start - before, np.delete(dofs, at), np.delete(values, at)
-        csr = inside, (before, number.astype(PETSc.IntType, copy=False), values[at])
-    matrix = PETSc.Mat().createAIJWithArrays((rows.size, columns.size), csr, comm=comm)
-    matrix.assemble()
-    return matrix
