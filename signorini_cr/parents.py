@@ -88,9 +88,13 @@ class Layout:
 
     def owned_ends(self, facets: IntArray) -> IntArray:
         """The owned dofs of P1 at the vertices of any rank's exterior facets, ascending."""
-        there = np.zeros(self.size[0] + self.index_map.num_ghosts)
-        there[self.ends(facets)] = 1.0
-        return np.flatnonzero(self.shared_sum(there)[: self.size[0]]).astype(np.int32)
+        return self.owned_among(self.ends(facets))
+
+    def owned_among(self, dofs: IntArray) -> IntArray:
+        """The owned dofs among those that any rank names, local numbers, ascending."""
+        named = np.zeros(self.size[0] + self.index_map.num_ghosts)
+        named[dofs] = 1.0
+        return np.flatnonzero(self.shared_sum(named)[: self.size[0]]).astype(np.int32)
 
     def shared_sum(self, array: FloatArray) -> FloatArray:
         """Sum up, in place, what the ranks have for each shared dof."""

@@ -110,9 +110,7 @@ def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, P
     # An entry stems from a cell. If this rank does not own the cell, its dof is a ghost there and
     # thereby shared; if it does, the other dof is a ghost here, whose row has this one for a column
     owned, ghosts = dofs.size[0], dofs.index_map.ghosts
-    seen = np.zeros(owned + len(ghosts))
-    seen[owned:] = 1.0
-    shared = np.flatnonzero(dofs.shared_sum(seen)[:owned] > 0.0) + first
+    shared = dofs.owned_among(np.arange(owned, owned + len(ghosts), dtype=np.int32)) + first
     _, column, _ = rows_of(matrix, np.sort(ghosts))  # PETSc looks for their owners in order
     numbers = np.union1d(shared, column[(column >= first) & (column < end)])
     start, column, value = rows_of(matrix, numbers)

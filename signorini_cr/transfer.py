@@ -17,6 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .garbage import release
+from .masking import rows_of
 from .parents import FloatArray, IntArray, Layout, Parents
 
 
@@ -74,12 +75,8 @@ class Transfer:
 
     def touched(self, dofs: IntArray) -> IntArray:
         """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
-        fine, coarse = self._rows.createVecLeft(), self._coarse.vector()
-        fine.array[dofs] = 1.0
-        self.restrict(fine, coarse)
-        touched = np.flatnonzero(coarse.array_r != 0.0).astype(np.int32)
-        release(fine, coarse)
-        return touched
+        _, columns, values = rows_of(self._rows, dofs)
+        return self._coarse.owned_among(columns[values != 0.0])
 
     def matrix(self) -> PETSc.Mat:
         """As a matrix of all ranks, for products."""
