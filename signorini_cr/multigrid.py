@@ -96,10 +96,10 @@ class Grid:
         self._bottom: PETSc.PC | None = None
         self._vectors: list[PETSc.Vec] = []  # residual, and the coarser space's b and x
         self._smoother: GaussSeidel | None = None
-        if coarser is not None:
+        if transfer is not None:
             self._smoother = GaussSeidel(matrix, dofs, sweeps)
-            below = coarser._dofs
-            self._vectors = [matrix.createVecRight(), below.vector(), below.vector()]
+            coarse = transfer.coarse_vector(), transfer.coarse_vector()
+            self._vectors = [matrix.createVecRight(), *coarse]
 
     @property
     def matrix(self) -> PETSc.Mat:

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .garbage import release
-from .masking import rows_of
+from .masking import numbers_of, rows_of
 from .parents import Layout
 
 IntArray = npt.NDArray[np.int32]
@@ -110,7 +110,8 @@ def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, P
     # An entry stems from a cell. If this rank does not own the cell, its dof is a ghost there and
     # thereby shared; if it does, the other dof is a ghost here, whose row has this one for a column
     owned, ghosts = dofs.size[0], dofs.index_map.ghosts
-    shared = dofs.owned_among(np.arange(owned, owned + len(ghosts), dtype=np.int32)) + first
+    ghost = np.arange(owned, owned + len(ghosts), dtype=np.int32)
+    shared = numbers_of(matrix, dofs.owned_among(ghost))
     _, column, _ = rows_of(matrix, np.sort(ghosts))  # PETSc looks for their owners in order
     numbers = np.union1d(shared, column[(column >= first) & (column < end)])
     start, column, value = rows_of(matrix, numbers)

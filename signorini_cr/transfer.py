@@ -55,10 +55,14 @@ class Transfer:
         self._csr = start, dofs.ravel().astype(PETSc.IntType, copy=False), values
         sizes = rows, coarse.size[0] + coarse.index_map.num_ghosts
         self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
-        self._own = self._rows.createVecLeft()
+        self._own, self._marks = self._rows.createVecLeft(), coarse.vector()
+
+    def coarse_vector(self) -> PETSc.Vec:
+        """A vector for coarse functions, with room for ghosts."""
+        return self._marks.duplicate()
 
     def add(self, x_coarse: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Add a coarse function to x; its vector has room for ghosts."""
+        """Add a coarse function to x."""
         x_coarse.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
         x.getLocalVector(self._own)
         with x_coarse.localForm() as local:
@@ -66,7 +70,7 @@ class Transfer:
         x.restoreLocalVector(self._own)
 
     def restrict(self, b: PETSc.Vec, b_coarse: PETSc.Vec) -> None:
-        """Multiply b by the transposed matrix; the coarse vector has room for ghosts."""
+        """Multiply b by the transposed matrix."""
         b.getLocalVector(self._own, readonly=True)
         with b_coarse.localForm() as local:
             self._rows.multTranspose(self._own, local)
@@ -76,20 +80,23 @@ class Transfer:
     def touched(self, dofs: IntArray) -> IntArray:
         """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
         _, columns, values = rows_of(self._rows, dofs)
-        return self._coarse.owned_among(columns[values != 0.0])
+        with self._marks.localForm() as local:
+            local.set(0.0)
+            local.array[columns[values != 0.0]] = 1.0
+        self._marks.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+        return np.flatnonzero(self._marks.array_r).astype(np.int32)
 
     def matrix(self) -> PETSc.Mat:
         """As a matrix of all ranks, for products."""
         start, dofs, values = self._csr
-        number = self._coarse.numbers(dofs)
-        order = np.lexsort((number, np.repeat(np.arange(len(start) - 1), np.diff(start))))
-        csr = start, number[order], values[order]
+        numbers = self._coarse.numbers(dofs.astype(np.int32, copy=False))
+        csr = start, numbers.astype(PETSc.IntType, copy=False), values
         sizes = self._fine.size, self._coarse.size
         return PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._fine.mesh.comm)
 
     def free(self) -> None:
         """Free the rows."""
-        release(self._rows, self._own)
+        release(self._rows, self._own, self._marks)
 
 
 def inclusion(p1: Layout, cr: Layout) -> Transfer:
@@ -140,7 +147,8 @@ def averaging(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
     """
     weights, parent_cell = parents.weights(coarse, fine), parents.cell
     repeats = len(parent_cell) // max(len(weights), 1)
-    values = np.tile(weights, (repeats, 1, 1)) / touching_cells(fine)[fine.cells][:, :, None]
+    touching = _sums(fine, np.ones(fine.cells.size))
+    values = np.tile(weights, (repeats, 1, 1)) / touching[fine.cells][:, :, None]
     kept = values != 0.0
     columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)
     start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
@@ -194,22 +202,17 @@ def prolongate(
                 of_families = gain[coarse.cells].reshape(-1, 1, values.shape[1])
                 values.reshape(len(of_families), len(weights), -1)[:] += of_families
     values = values.ravel()
-    total = fine.shared_sum(_sums(fine, values))
+    total = _sums(fine, values)
     values[:] = 1.0
-    return total / fine.shared_sum(_sums(fine, values))
-
-
-def touching_cells(layout: Layout) -> FloatArray:
-    """The number of cells that touch each local dof, over all ranks."""
-    return layout.shared_sum(_sums(layout, np.ones(layout.cells.size)))
+    return total / _sums(fine, values)
 
 
 def _sums(layout: Layout, values: FloatArray) -> FloatArray:
-    """Sum of what the local cells have for each local dof; PETSc's loop needs no copies."""
+    """Sum of what all ranks' cells have for each local dof; PETSc's loop needs no copies."""
     result = np.zeros(layout.index_map.size_local + layout.index_map.num_ghosts)
     vector = PETSc.Vec().createWithArray(result, comm=PETSc.COMM_SELF)
     dofs = layout.cells.ravel().astype(PETSc.IntType, copy=False)
     vector.setValues(dofs, values, PETSc.InsertMode.ADD_VALUES)
     vector.assemble()
     vector.destroy()
-    return result
+    return layout.shared_sum(result)

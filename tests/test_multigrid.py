@@ -125,6 +125,43 @@ def test_prolongation_is_its_matrix(element, pattern, size):
     assert difference(product.array_r, prolongate(u, W, parents)[:owned]) < 1e-12
 
 
+@pytest.mark.parametrize("element", ["CR", "P1", "same mesh"])
+@pytest.mark.parametrize("pattern", ["all", "marked"])
+@pytest.mark.parametrize("size", [0.4, 10.0])
+def test_transfers_are_their_matrices(element, pattern, size):
+    """What they add, restrict and touch, on few cells, too, when ranks have none."""
+    coarse = (CROOKED if size < 1.0 else TRIANGLE).mesh(size)
+    fine, parent_cell = refined(coarse, pattern)
+    if element == "same mesh":
+        p1, dofs = Layout.of_p1(fine.mesh), Layout.of_space(function_space(fine.mesh))
+        transfer = inclusion(p1, dofs)
+    else:
+        parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+        p1, dofs = Layout.of_p1(coarse.mesh), Layout.of_space(function_space(fine.mesh, element))
+        transfer = prolongation(p1, dofs, parents)
+    matrix = transfer.matrix()
+    rng = np.random.default_rng(MPI.COMM_WORLD.rank)
+    x_coarse, x, b_coarse = transfer.coarse_vector(), *matrix.createVecs()[::-1]
+    x_coarse.array[:] = rng.standard_normal(x_coarse.local_size)
+    x.array[:] = rng.standard_normal(x.local_size)
+    expected = matrix.createVecLeft()
+    matrix.multAdd(x_coarse, x, expected)
+    transfer.add(x_coarse, x)
+    assert difference(x.array_r, expected.array_r) < 1e-14
+
+    matrix.multTranspose(x, b_coarse)
+    transfer.restrict(x, x_coarse)
+    assert difference(x_coarse.array_r, b_coarse.array_r) < 1e-13
+
+    chosen = np.flatnonzero(rng.random(x.local_size) < 0.1).astype(np.int32)
+    x.set(0.0)
+    x.array[chosen] = 1.0
+    matrix.multTranspose(x, b_coarse)
+    for _ in range(2):  # the second time where there are marks already
+        assert np.array_equal(transfer.touched(chosen), np.flatnonzero(b_coarse.array_r))
+    assert not len(transfer.touched(chosen[:0]))
+
+
 def test_p1_in_cr_has_the_p1_stiffness_matrix():
     """Also with a coefficient that varies and a term of order zero."""
     mesh = CROOKED.mesh(0.3).mesh
