@@ -53,6 +53,9 @@ comm = MPI.COMM_WORLD
 COARSEST = 23
 """Squares per unit length on the coarsest mesh: 0.05, 0.2, 0.8, 3.3, 13 M dofs on the third on."""
 
+SIZE = 0.08
+"""Size of the polygon's coarsest cells: as many dofs as the others."""
+
 SHOWN = 4e4
 """Meshes with more dofs are in the table and in the picture."""
 
@@ -125,7 +128,7 @@ def cases(comm: MPI.Comm = comm) -> dict[str, tuple[Problem, Coarsest]]:
                     COARSEST, comm, shift=shift
                 ),
             )
-    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(1.6 / COARSEST, comm))
+    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(SIZE, comm))
     return result
 
 
