@@ -2,7 +2,7 @@
 
     container/run python3 benchmarks/two_ranks.py
 
-One rank and two ranks solve the cases of one_solve.py in turns, at 3 to 4 M dofs, each time in new
+One rank and two ranks solve the cases of one_solve.py in turns, at 3 M dofs, each time in new
 processes; the times are those of the variational inequality on the finest mesh. A third run has two
 ranks "apart": each solves all of the problem by itself and has nothing to do with the other, so
 that twice the time of one rank over theirs is what the machine has to give in these minutes.
