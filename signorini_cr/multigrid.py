@@ -116,7 +116,7 @@ class Grid:
             transfer: What writes functions of this space there.
         """
         self.fix(self.operator.dofs[:0], deep=False)
-        v, product, own = (self._dofs.vector() for _ in range(3))
+        v, product, own = (transfer.coarse_vector() for _ in range(3))
         u, image = finer.createVecs()
         v.array[:] = np.random.default_rng(0).standard_normal(v.local_size)
         v.array[self._dirichlet] = 0.0

@@ -18,7 +18,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from . import compat
-from .space import facet_corners, facet_entities, function_space, ghosted, shared_sum
+from .space import facet_corners, facet_entities, function_space, shared_sum
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
@@ -75,10 +75,6 @@ class Layout:
             return dofs
         numbers = self.index_map.local_to_global(dofs.ravel())
         return numbers.astype(PETSc.IntType).reshape(dofs.shape)
-
-    def vector(self) -> PETSc.Vec:
-        """A PETSc vector with room for the ghosts."""
-        return ghosted(self.mesh.comm, self.index_map)
 
     def ends(self, facets: IntArray) -> IntArray:
         """The dofs of P1 at the vertices of exterior facets, shape (n, d)."""

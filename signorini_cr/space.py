@@ -145,8 +145,8 @@ def ghosted(comm: MPI.Comm, index_map: Any, array: FloatArray | None = None) -> 
     return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=comm)
 
 
-def ghosted_vector(V: fem.FunctionSpace, array: FloatArray | None = None) -> PETSc.Vec:
-    """A PETSc vector with room for the ghosts of V, on ``array`` if given (no copy)."""
+def ghosted_vector(V: fem.FunctionSpace, array: FloatArray) -> PETSc.Vec:
+    """A PETSc vector with room for the ghosts of V, on an array (no copy)."""
     return ghosted(V.mesh.comm, V.dofmap.index_map, array)
 
 

@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from .garbage import release
 from .masking import rows_of
 from .parents import FloatArray, IntArray, Layout, Parents
+from .space import ghosted
 
 
 class Transfer:
@@ -55,7 +56,8 @@ class Transfer:
         self._csr = start, dofs.ravel().astype(PETSc.IntType, copy=False), values
         sizes = rows, coarse.size[0] + coarse.index_map.num_ghosts
         self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
-        self._own, self._marks = self._rows.createVecLeft(), coarse.vector()
+        self._own = self._rows.createVecLeft()
+        self._marks = ghosted(coarse.mesh.comm, coarse.index_map)
 
     def coarse_vector(self) -> PETSc.Vec:
         """A vector for coarse functions, with room for ghosts."""
