@@ -90,7 +90,7 @@ class Layout:
         """The owned dofs among those that any rank names, local numbers, ascending."""
         named = np.zeros(self.size[0] + self.index_map.num_ghosts)
         named[dofs] = 1.0
-        return np.flatnonzero(self.shared_sum(named)[: self.size[0]]).astype(np.int32)
+        return np.flatnonzero(self.shared_sum(named)[: self.size[0]] > 0.0).astype(np.int32)
 
     def shared_sum(self, array: FloatArray) -> FloatArray:
         """Sum up, in place, what the ranks have for each shared dof."""

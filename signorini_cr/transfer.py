@@ -86,7 +86,7 @@ class Transfer:
             local.set(0.0)
             local.array[columns[values != 0.0]] = 1.0
         self._marks.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
-        return np.flatnonzero(self._marks.array_r).astype(np.int32)
+        return np.flatnonzero(self._marks.array_r > 0.0).astype(np.int32)
 
     def matrix(self) -> PETSc.Mat:
         """As a matrix of all ranks, for products."""
