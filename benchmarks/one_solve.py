@@ -7,7 +7,8 @@ Each case is solved on a sequence of nested meshes, several times over. On each 
 the variational inequality, one linear system with the same matrix and right-hand side is solved by
 CG and BoomerAMG with PETSc's defaults to rtol 1e-8, set-up included, and one product is timed.
 Times are medians over the repetitions, the quotients medians of those of each repetition, memory is
-the largest ever held until the variational inequality on that mesh was solved.
+the largest ever held until the variational inequality on that mesh was solved. Only a case that
+needs more than those before it shows its own; with `--cases`, alone, each does.
 
 The process keeps the memory it has once had from the system. On virtual machines fresh memory can
 come at a quarter of a gigabyte a second, which would be all that is measured. So there is one more

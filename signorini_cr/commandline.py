@@ -18,7 +18,7 @@ from . import __version__
 from .screen import WIDTH
 
 PETSC_NOTE = (
-    "Options with a single dash, such as -log_view or -signorini_ksp_rtol 1e-10, are left to PETSc"
+    "Options with a single dash, such as -log_view or -signorini_snes_atol 1e-12, are left to PETSc"
     " (-options_left shows those that nothing used)."
 )
 EXIT_NOTE = (

@@ -81,13 +81,14 @@ class MaskedMatrix:
         """
         fixed = np.isin(self.dofs, dofs)
         comm = self.masked.getComm().tompi4py()
-        changed = bool(comm.allreduce(not np.array_equal(fixed, self.fixed)))
+        differs = not np.array_equal(fixed, self.fixed)
+        changed, some_out = comm.allreduce(np.array([differs, self.fixed.any()]))  # + is "or"
         if changed:
-            if comm.allreduce(bool(self.fixed.any())):
+            if some_out:
                 self._set(self.fixed, self._value)
             self._set(fixed, np.where(self._column == self._row, 1.0, 0.0))
             self.fixed = fixed
-        return changed
+        return bool(changed)
 
     @property
     def out(self) -> IntArray:

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from .errors import InputError
 
 PREFIX = "signorini_"
-"""Prefix of the PETSc options that reach the solver, as in ``-signorini_ksp_rtol 1e-10``."""
+"""Prefix of the PETSc options that reach the solver, as in ``-signorini_snes_atol 1e-12``."""
 
 NO_INODES = {"mat_no_inode": None}
 """PETSc joins neighbouring rows of the same pattern, which takes time to look for; few have it."""

@@ -87,7 +87,8 @@ def solve_vi(
 
     Raises:
         NotConverged: With the name PETSc gives to the reason.
-        InputError: PETSc can't solve with the options that are set.
+        InputError: PETSc can't solve with the options that are set. On several ranks the grid's
+            matrices are then left as they are, without the dofs taken out last.
     """
     operator, comm = grid.operator, grid.matrix.getComm()
     bounds = lower.array_r[operator.dofs]
