@@ -7,10 +7,10 @@ processes; the times are those of the variational inequality on the finest mesh.
 ranks "apart": each solves all of the problem by itself and has nothing to do with the other, so
 that twice the time of one rank over theirs is what the machine has to give in these minutes.
 
-After every solve of one rank and of two, arrays are streamed through, twice. Once the ranks have
-nothing to do with one another until the end. The other time they are "in step": after each of
-PIECES pieces, every few milliseconds as in the solver, they wait for the slower one. Where
-the cores do not keep the same speed for that long, this is what no parallel program can avoid.
+After every solve arrays are streamed through, twice. Once the ranks have nothing to do with one
+another until the end. The other time they are "in step": after each of PIECES pieces, every few
+milliseconds as in the solver, they wait for the slower one. Two ranks are compared with one; those
+apart do it, too, so that the three runs differ in nothing else.
 
 A process has the median of its solves, a turn the quotients of these medians; the table has the
 median over the turns and, behind it, the range. What stands apart is the fastest solve of all turns

@@ -86,6 +86,7 @@ class Transfer:
             local.set(0.0)
             local.array[columns[values != 0.0]] = 1.0
         self._marks.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+        # numpy is ten times as fast over truth values as over numbers
         return np.flatnonzero(self._marks.array_r > 0.0).astype(np.int32)
 
     def matrix(self) -> PETSc.Mat:
