@@ -212,6 +212,19 @@ def test_one_rank_alone_refines_like_several(monkeypatch):
     assert geometry(given) == pytest.approx(geometry(found), rel=1e-13)
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_neighbours_have_numbers_that_lie_close_together(shape: str):
+    """A cell's vertices are about √n numbers apart, not n/2 as with corners before midpoints."""
+    domain = SHAPES[shape].mesh(0.2)
+    for _ in range(4):
+        domain, _ = refine(domain)
+    topology = domain.mesh.topology
+    owned = topology.index_map(0).size_local
+    corners = topology.connectivity(2, 0).array.reshape(-1, 3)
+    corners = corners[(corners < owned).all(axis=1)]
+    assert np.ptp(corners, axis=1).mean() < 2.0 * np.sqrt(owned)
+
+
 def test_eight_levels_keep_the_angles():
     domain = SHAPES["rectangle"].mesh(2)
     angle, width = smallest_angle(domain.mesh), np.linalg.norm(sides(domain.mesh), axis=2)
