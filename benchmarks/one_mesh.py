@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 from statistics import median
 
-from one_solve import CROOKED, PUSHED, linear_solve, timed
+from one_solve import CROOKED, PUSHED, linear_solve, tabulate, timed
 from petsc4py import PETSc
 
 from signorini_cr import exact
@@ -51,7 +51,18 @@ def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
     return seconds, steps
 
 
-def row(name: str, problem: Problem, domain: Domain, repeats: int) -> str:
+HEAD = (
+    "mesh",
+    "dofs",
+    "CG, two levels",
+    "CG, BoomerAMG",
+    "two levels, µs a dof",
+    "BoomerAMG, µs a dof",
+    "quotient",
+)
+
+
+def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:
     """One line of the table."""
     level = Level(Forms(problem, domain.mesh, "CR"), domain)
     b = ghosted_vector(level.V, level.system.b.x.array)
@@ -62,10 +73,8 @@ def row(name: str, problem: Problem, domain: Domain, repeats: int) -> str:
     dofs = b.getSize()
     ratio = median(mine[0] / other[0] for mine, other in zip(ours, theirs, strict=True))
     mine, other = (1e6 * median(t for t, _ in runs) / dofs for runs in (ours, theirs))
-    return (
-        f"| {name} | {dofs / 1e6:.2f} M | {ours[0][1]} | {theirs[0][1]} | {mine:.2f} "
-        f"| {other:.2f} | **{ratio:.2f}** |"
-    )
+    steps = f"{ours[0][1]}", f"{theirs[0][1]}"
+    return [name, f"{dofs / 1e6:.2f} M", *steps, f"{mine:.2f}", f"{other:.2f}", f"**{ratio:.2f}**"]
 
 
 def main() -> None:
@@ -75,20 +84,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
-    lines = [
-        "| mesh | dofs | CG, two levels | CG, BoomerAMG | two levels, µs a dof "
-        "| BoomerAMG, µs a dof | quotient |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
-    for size in arguments.sizes:
-        for name, problem, polygon in (
-            ("rectangle", exact.S1.problem, exact.S1.polygon),
-            ("polygon", PUSHED, CROOKED),
-        ):
-            lines.append(row(name, problem, polygon.mesh(size), arguments.repeats))
-            print(lines[-1], flush=True)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "one_mesh.md").write_text("\n".join(lines) + "\n")
+    cases = (
+        ("rectangle", exact.S1.problem, exact.S1.polygon),
+        ("polygon", PUSHED, CROOKED),
+    )
+    rows = (
+        row(name, problem, polygon.mesh(size), arguments.repeats)
+        for size in arguments.sizes
+        for name, problem, polygon in cases
+    )
+    tabulate(HEAD, rows, arguments.out / "one_mesh.md")
 
 
 if __name__ == "__main__":

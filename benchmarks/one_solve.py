@@ -26,7 +26,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import median
@@ -199,20 +199,22 @@ def facts(solution: Solution) -> dict[str, float]:
     }
 
 
+def meshes(name: str, dofs: float, nested: bool = True) -> Iterator[Solution]:
+    """Solve one case on meshes of up to about so many dofs."""
+    problem, domain = cases()[name]
+    for solution in solve_levels(problem, domain(), 99, nested=nested):
+        yield solution
+        if 4 * solution.dofs > 1.1 * dofs:
+            return
+
+
 def measure(name: str, dofs: float, repeats: int) -> Iterator[Row]:
     """Solve one case several times over."""
-    problem, domain = cases()[name]
     before = peak()
     runs: list[list[dict[str, float]]] = []
     for _ in range(1 + repeats):
-        run: list[dict[str, float]] = []
-        for solution in solve_levels(problem, domain(), 99):
-            run.append(facts(solution))
-            if 4 * solution.dofs > 1.1 * dofs:
-                break
-        del solution
+        runs.append([facts(solution) for solution in meshes(name, dofs)])
         gc.collect()
-        runs.append(run)
     memory = [row["memory"] for row in runs.pop(0)]
     for level in range(len(memory)):
         sums = [sum(row["vi"] for row in run[: level + 1]) for run in runs]
@@ -265,11 +267,33 @@ def share(row: Row, seconds: float) -> str:
     return f"{100 * seconds / (row.mesh + row.assemble + row.vi + row.estimate):.0f} %"
 
 
+def line(cells: Iterable[str]) -> str:
+    """A line of a table in Markdown."""
+    return "| " + " | ".join(cells) + " |"
+
+
+def head(names: Collection[str]) -> str:
+    """The first two lines."""
+    return line(names) + "\n|---|" + "---:|" * (len(names) - 1)
+
+
 def table(rows: list[Row]) -> str:
     """The results in Markdown."""
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|---|" + "---:|" * (len(COLUMNS) - 1)]
-    lines += ["| " + " | ".join(show(r) for show in COLUMNS.values()) + " |" for r in rows]
-    return "\n".join(lines) + "\n"
+    lines = [line(show(r) for show in COLUMNS.values()) for r in rows]
+    return "\n".join([head(COLUMNS), *lines]) + "\n"
+
+
+def tabulate(names: Collection[str], rows: Iterable[Iterable[str]], path: Path) -> None:
+    """Print a table as its rows come in, and keep it."""
+    lines = [head(names)]
+    if comm.rank == 0:
+        print(lines[-1], flush=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+    for row in rows:
+        lines.append(line(row))
+        if comm.rank == 0:
+            print(lines[-1], flush=True)
+            path.write_text("\n".join(lines) + "\n")
 
 
 def picture(rows: list[Row], path: Path) -> None:

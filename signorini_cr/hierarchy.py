@@ -60,7 +60,7 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
         coarse.comm, CellType.triangle, vertices.index_map, cell_map, children
     )
     if compat.can_take_facets(coarse.comm):
-        _give_facets(topology, coarse, corners, facets, vertices)
+        _give_facets(topology, coarse, corners, facets, vertices, m)
     else:
         topology.create_entities(1)
         topology.create_connectivity(1, 2)
@@ -173,10 +173,10 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     """
     topology = mesh.topology
     maps = vertex_map, facet_map = topology.index_map(0), topology.index_map(1)
-    middles = _count(vertex_map)
-    first = _first_places(np.hstack([corners, middles + facets]), middles + _count(facet_map))
+    split = _count(vertex_map)  # facets are counted on from the vertices
+    first = _first_places(np.hstack([corners, split + facets]), split + _count(facet_map))
     owned = [m.size_local for m in maps]
-    mine = np.concatenate([first[: owned[0]], first[middles : middles + owned[1]]])
+    mine = np.concatenate([first[: owned[0]], first[split : split + owned[1]]])
     met = np.zeros(corners.size + facets.size + len(first), dtype=bool)
     met[mine] = True
     number = np.cumsum(met, dtype=np.int32)[mine] - 1
@@ -186,7 +186,8 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     for m, own, entities in zip(maps, np.split(number, [owned[0]]), (corners, facets), strict=True):
         kept = _ghosts_in(m, entities)
         everywhere = la.vector(m, dtype=np.int64)
-        everywhere.array[: m.size_local] = start + own
+        everywhere.array[: m.size_local] = own
+        everywhere.array[: m.size_local] += start  # in 64 bits
         everywhere.scatter_forward()
         part = np.full(_count(m), -1, dtype=np.int32)
         part[: m.size_local] = own
@@ -214,7 +215,8 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
 def _first_places(table: IntArray, count: int) -> IntArray:
     """Where each of the numbers below ``count`` first stands in a table; behind it if nowhere."""
     first = np.arange(table.size, table.size + count, dtype=np.int32)
-    first[table.ravel()[::-1]] = np.arange(table.size - 1, -1, -1, dtype=np.int32)  # the last wins
+    # of equal numbers the last one wins; if another did, it would cost locality and nothing else
+    first[table.ravel()[::-1]] = np.arange(table.size - 1, -1, -1, dtype=np.int32)
     return first
 
 
@@ -226,12 +228,17 @@ def _ghosts_in(index_map: Any, entities: IntArray) -> IntArray:
 
 
 def _give_facets(
-    topology: Any, coarse: Mesh, corners: IntArray, facets: IntArray, vertices: _Vertices
+    topology: Any,
+    coarse: Mesh,
+    corners: IntArray,
+    facets: IntArray,
+    vertices: _Vertices,
+    m: IntArray,
 ) -> None:
     """Hand over the fine facets: the halves 2 f and 2 f + 1 of facet f, then three in each cell.
 
-    Half 1 is the one at the end with the larger index; the facet opposite vertex k of child k is
-    number 2 F + 3 c + k and also belongs to the child in the middle.
+    Half 1 is the one at the end with the larger coarse index; the facet opposite vertex k of child
+    k is number 2 F + 3 c + k and also belongs to the child in the middle.
 
     Args:
         topology: The fine topology.
@@ -239,6 +246,7 @@ def _give_facets(
         corners: Coarse vertices of the coarse cells, shape (cells, 3).
         facets: Coarse facets of the coarse cells, shape (cells, 3).
         vertices: The fine vertices.
+        m: Those in the middle of the coarse cells' facets, shape (cells, 3).
     """
     cells = len(corners)
     count = coarse.topology.index_map(1).size_local
@@ -265,7 +273,6 @@ def _give_facets(
         corner = vertices.corner[end(old[:, 0], old[:, 1])]
         _ascending(corner, vertices.middle, ends[i : 2 * count : 2])
     inner = ends[2 * count :].reshape(cells, 3, 2)
-    m = vertices.middle[facets]
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         _ascending(m[:, i], m[:, j], inner[:, k])

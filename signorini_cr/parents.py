@@ -55,11 +55,7 @@ class Layout:
 
     @classmethod
     def of_p1(cls, mesh: Mesh) -> Layout:
-        """P1 without new numbers: the nodes of a straight-sided mesh are its vertices.
-
-        On refined meshes those of the coarse mesh come first, which also suits Gauss-Seidel better
-        than the order of a DOLFINx space.
-        """
+        """P1 without new numbers: the nodes of a straight-sided mesh are its vertices."""
         if compat.coordinate_map(mesh).degree == 1:
             return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False)
         return cls.of_space(function_space(mesh, "P1"))

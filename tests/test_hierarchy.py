@@ -220,9 +220,9 @@ def test_neighbours_have_numbers_that_lie_close_together(shape: str):
         domain, _ = refine(domain)
     topology = domain.mesh.topology
     owned = topology.index_map(0).size_local
-    corners = topology.connectivity(2, 0).array.reshape(-1, 3)
-    corners = corners[(corners < owned).all(axis=1)]
-    assert np.ptp(corners, axis=1).mean() < 2.0 * np.sqrt(owned)
+    vertices = topology.connectivity(2, 0).array.reshape(-1, 3)
+    inside = vertices[(vertices < owned).all(axis=1)]
+    assert np.ptp(inside, axis=1).mean() < 2.0 * np.sqrt(owned)
 
 
 def test_eight_levels_keep_the_angles():
