@@ -7,13 +7,11 @@ The phases of the finest mesh of a case, and the certificate of its solution; me
 
 from __future__ import annotations
 
-import argparse
 import gc
-from pathlib import Path
 from statistics import median
 
 from mpi4py import MPI
-from one_solve import cases, comm, meshes, tabulate, timed
+from one_solve import by_case, comm, meshes, timed
 
 CERTIFIED = ("mesh", "assemble", "solve")
 HEAD = ("case", "dofs", "mesh, s", "assembly, s", "VI, s", "certificate, s", "µs a dof", "quotient")
@@ -37,17 +35,5 @@ def row(name: str, limit: float, repeats: int) -> list[str]:
     return [name, f"{dofs:,}", *cells, f"{1e6 * middle[-1] / dofs:.2f}", f"{quotient:.2f}"]
 
 
-def main() -> None:
-    """Print and keep the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
-    rows = (row(name, arguments.dofs, arguments.repeats) for name in arguments.cases)
-    tabulate(HEAD, rows, arguments.out / "certificate.md")
-
-
 if __name__ == "__main__":
-    main()
+    by_case(__doc__, HEAD, row, "certificate.md")

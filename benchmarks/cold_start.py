@@ -9,19 +9,17 @@ differs.
 
 from __future__ import annotations
 
-import argparse
 import gc
-from pathlib import Path
 from statistics import median
 
 from mpi4py import MPI
-from one_solve import cases, comm, meshes, tabulate
+from one_solve import by_case, comm, meshes
 
 HEAD = ("case", "dofs", "Newton, nested", "VI, s", "Newton, cold", "VI, s")
 
 
 def row(name: str, limit: float, repeats: int) -> list[str]:
-    """One line of the table; the first of the solves do not count."""
+    """One line of the table; the first solves do not count."""
     newton: dict[bool, list[int]] = {}
     seconds: dict[bool, list[float]] = {True: [], False: []}
     for _ in range(1 + repeats):
@@ -39,17 +37,5 @@ def row(name: str, limit: float, repeats: int) -> list[str]:
     return cells
 
 
-def main() -> None:
-    """Print and keep the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
-    rows = (row(name, arguments.dofs, arguments.repeats) for name in arguments.cases)
-    tabulate(HEAD, rows, arguments.out / "cold_start.md")
-
-
 if __name__ == "__main__":
-    main()
+    by_case(__doc__, HEAD, row, "cold_start.md")

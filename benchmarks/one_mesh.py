@@ -24,6 +24,16 @@ from signorini_cr.domain import Domain
 from signorini_cr.problem import Forms, Problem
 from signorini_cr.space import ghosted_vector
 
+HEAD = (
+    "mesh",
+    "dofs",
+    "CG, two levels",
+    "CG, BoomerAMG",
+    "two levels, µs a dof",
+    "BoomerAMG, µs a dof",
+    "quotient",
+)
+
 
 def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
     """Time and steps of the program's method, set-up included."""
@@ -49,17 +59,6 @@ def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
     level.grid.free()
     x.destroy()
     return seconds, steps
-
-
-HEAD = (
-    "mesh",
-    "dofs",
-    "CG, two levels",
-    "CG, BoomerAMG",
-    "two levels, µs a dof",
-    "BoomerAMG, µs a dof",
-    "quotient",
-)
 
 
 def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:

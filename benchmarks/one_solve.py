@@ -296,6 +296,27 @@ def tabulate(names: Collection[str], rows: Iterable[Iterable[str]], path: Path) 
             path.write_text("\n".join(lines) + "\n")
 
 
+def by_case(
+    text: str | None, names: Collection[str], row: Callable[[str, float, int], list[str]], file: str
+) -> None:
+    """The command line of a benchmark that prints one row a case.
+
+    Args:
+        text: Its docstring.
+        names: Of the columns.
+        row: Makes a row of a case, the finest mesh's dofs and the number of repetitions.
+        file: What the table is called in the folder of results.
+    """
+    parser = argparse.ArgumentParser(description=(text or "").split("\n")[0])
+    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    arguments = parser.parse_args()
+    rows = (row(name, arguments.dofs, arguments.repeats) for name in arguments.cases)
+    tabulate(names, rows, arguments.out / file)
+
+
 def picture(rows: list[Row], path: Path) -> None:
     """All meshes together against one linear solve, and CG steps, over the number of dofs."""
     import matplotlib
