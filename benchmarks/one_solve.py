@@ -267,6 +267,11 @@ def share(row: Row, seconds: float) -> str:
     return f"{100 * seconds / (row.mesh + row.assemble + row.vi + row.estimate):.0f} %"
 
 
+def columns(row: Row) -> list[str]:
+    """A row's cells in the table."""
+    return [show(row) for show in COLUMNS.values()]
+
+
 def line(cells: Iterable[str]) -> str:
     """A line of a table in Markdown."""
     return "| " + " | ".join(cells) + " |"
@@ -279,8 +284,7 @@ def head(names: Collection[str]) -> str:
 
 def table(rows: list[Row]) -> str:
     """The results in Markdown."""
-    lines = [line(show(r) for show in COLUMNS.values()) for r in rows]
-    return "\n".join([head(COLUMNS), *lines]) + "\n"
+    return "\n".join([head(COLUMNS), *(line(columns(r)) for r in rows)]) + "\n"
 
 
 def tabulate(names: Collection[str], rows: Iterable[Iterable[str]], path: Path) -> None:
@@ -296,10 +300,20 @@ def tabulate(names: Collection[str], rows: Iterable[Iterable[str]], path: Path) 
             path.write_text("\n".join(lines) + "\n")
 
 
+def command_line(text: str) -> argparse.ArgumentParser:
+    """What benchmarks of the cases can be told; the text is their docstring."""
+    parser = argparse.ArgumentParser(description=text.split("\n")[0])
+    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    return parser
+
+
 def by_case(
-    text: str | None, names: Collection[str], row: Callable[[str, float, int], list[str]], file: str
+    text: str, names: Collection[str], row: Callable[[str, float, int], list[str]], file: str
 ) -> None:
-    """The command line of a benchmark that prints one row a case.
+    """A benchmark with one row a case.
 
     Args:
         text: Its docstring.
@@ -307,12 +321,7 @@ def by_case(
         row: Makes a row of a case, the finest mesh's dofs and the number of repetitions.
         file: What the table is called in the folder of results.
     """
-    parser = argparse.ArgumentParser(description=(text or "").split("\n")[0])
-    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
+    arguments = command_line(text).parse_args()
     rows = (row(name, arguments.dofs, arguments.repeats) for name in arguments.cases)
     tabulate(names, rows, arguments.out / file)
 
@@ -365,11 +374,7 @@ def read(folder: Path) -> list[Row]:
 
 def main() -> None:
     """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser = command_line(__doc__)
     parser.add_argument("--name", help="of the file of results")
     arguments = parser.parse_args()
     rows: list[Row] = []
@@ -379,7 +384,7 @@ def main() -> None:
         for row in measure(name, arguments.dofs, arguments.repeats):
             rows.append(row)
             if comm.rank == 0:
-                print(table([row]).splitlines()[-1], flush=True)
+                print(line(columns(row)), flush=True)
         if comm.rank == 0:
             path = arguments.out / f"{arguments.name or f'ranks-{comm.size}'}.csv"
             with path.open("w", newline="") as file:

@@ -164,7 +164,7 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     """Number the fine vertices; each stays with the rank of its coarse vertex or facet.
 
     They are numbered as the cells meet them, so that neighbours have numbers that lie close
-    together. Otherwise DOLFINx would look for the facets half as long again.
+    together. Where DOLFINx has to find the facets it takes half as long again without that.
 
     Args:
         mesh: The coarse mesh.
@@ -186,8 +186,7 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     for m, own, entities in zip(maps, np.split(number, [owned[0]]), (corners, facets), strict=True):
         kept = _ghosts_in(m, entities)
         everywhere = la.vector(m, dtype=np.int64)
-        everywhere.array[: m.size_local] = own
-        everywhere.array[: m.size_local] += start  # in 64 bits
+        np.add(own, start, out=everywhere.array[: m.size_local], dtype=np.int64)
         everywhere.scatter_forward()
         part = np.full(_count(m), -1, dtype=np.int32)
         part[: m.size_local] = own
@@ -199,21 +198,37 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     index_map = compat.index_map(
         mesh.comm, sum(owned), np.concatenate(ghosts), np.concatenate(owners)
     )
-
     corner, middle = parts
+    return _Vertices(index_map, corner, middle, _coordinates(mesh, corners, corner, middle))
+
+
+def _coordinates(
+    mesh: Mesh, corners: IntArray, corner: IntArray, middle: IntArray
+) -> npt.NDArray[np.floating]:
+    """Where the fine vertices are.
+
+    Args:
+        mesh: The coarse mesh.
+        corners: Coarse vertices of the coarse cells, shape (cells, 3).
+        corner: Number of every coarse vertex, −1 for ghosts that are left behind.
+        middle: Number of every coarse facet's midpoint, likewise.
+    """
     node = np.zeros(len(corner), dtype=np.int32)
     node[corners] = compat.cell_nodes(mesh)[: len(corners)]
     x_coarse = mesh.geometry.x[:, : mesh.geometry.dim].take(node, axis=0)
-    ends = topology.connectivity(1, 0).array.reshape(-1, 2)
-    x = np.empty((ghost + 1, mesh.geometry.dim), dtype=x_coarse.dtype)  # the last, -1, is nowhere
+    ends = mesh.topology.connectivity(1, 0).array.reshape(-1, 2)
+    count = max(corner.max(initial=-1), middle.max(initial=-1)) + 1
+    x = np.empty((count + 1, mesh.geometry.dim), dtype=x_coarse.dtype)  # the last one is for −1
     x[corner] = x_coarse
     x[middle] = 0.5 * (x_coarse.take(ends[:, 0], axis=0) + x_coarse.take(ends[:, 1], axis=0))
-    x = x[:-1]
-    return _Vertices(index_map, corner, middle, x)
+    return x[:-1]
 
 
 def _first_places(table: IntArray, count: int) -> IntArray:
-    """Where each of the numbers below ``count`` first stands in a table; behind it if nowhere."""
+    """Where each of the numbers below ``count`` first stands in a table.
+
+    Those of entities that no cell of this rank meets follow behind the table, one by one.
+    """
     first = np.arange(table.size, table.size + count, dtype=np.int32)
     # of equal numbers the last one wins; if another did, it would cost locality and nothing else
     first[table.ravel()[::-1]] = np.arange(table.size - 1, -1, -1, dtype=np.int32)
@@ -269,8 +284,8 @@ def _give_facets(
 
     ends = np.empty((2 * count + 3 * cells, 2), dtype=np.int32)
     old = coarse.topology.connectivity(1, 0).array.reshape(-1, 2)
-    for i, end in enumerate((np.minimum, np.maximum)):
-        corner = vertices.corner[end(old[:, 0], old[:, 1])]
+    for i, choose in enumerate((np.minimum, np.maximum)):
+        corner = vertices.corner[choose(old[:, 0], old[:, 1])]
         _ascending(corner, vertices.middle, ends[i : 2 * count : 2])
     inner = ends[2 * count :].reshape(cells, 3, 2)
     for k in range(3):
