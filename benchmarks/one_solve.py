@@ -26,7 +26,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import median
@@ -43,6 +43,7 @@ petsc4py.init(["one_solve", "-options_left", "no"])
 import ufl  # noqa: E402
 from mpi4py import MPI  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
+from tables import head, line, tabulate  # noqa: E402
 
 from signorini_cr import Polygon, Problem, exact, solve_levels  # noqa: E402
 from signorini_cr.domain import Domain  # noqa: E402
@@ -272,32 +273,9 @@ def columns(row: Row) -> list[str]:
     return [show(row) for show in COLUMNS.values()]
 
 
-def line(cells: Iterable[str]) -> str:
-    """A line of a table in Markdown."""
-    return "| " + " | ".join(cells) + " |"
-
-
-def head(names: Collection[str]) -> str:
-    """The first two lines."""
-    return line(names) + "\n|---|" + "---:|" * (len(names) - 1)
-
-
 def table(rows: list[Row]) -> str:
     """The results in Markdown."""
     return "\n".join([head(COLUMNS), *(line(columns(r)) for r in rows)]) + "\n"
-
-
-def tabulate(names: Collection[str], rows: Iterable[Iterable[str]], path: Path) -> None:
-    """Print a table as its rows come in, and keep it."""
-    lines = [head(names)]
-    if comm.rank == 0:
-        print(lines[-1], flush=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
-    for row in rows:
-        lines.append(line(row))
-        if comm.rank == 0:
-            print(lines[-1], flush=True)
-            path.write_text("\n".join(lines) + "\n")
 
 
 def command_line(text: str) -> argparse.ArgumentParser:
@@ -323,7 +301,7 @@ def by_case(
     """
     arguments = command_line(text).parse_args()
     rows = (row(name, arguments.dofs, arguments.repeats) for name in arguments.cases)
-    tabulate(names, rows, arguments.out / file)
+    tabulate(names, rows, arguments.out / file, comm.rank == 0)
 
 
 def picture(rows: list[Row], path: Path) -> None:

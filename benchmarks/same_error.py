@@ -22,6 +22,10 @@ import time
 from pathlib import Path
 from statistics import median
 
+from tables import tabulate
+
+HEAD = ("", "dofs", "H1 error", "Newton, finest", "mesh", "assembly", "VI", "whole run")
+
 WARM = "import numpy; numpy.ones(1 << 29)"
 BEGAN = time.time() - float(os.environ.get("SAME_ERROR_AGE", "0"))
 
@@ -128,21 +132,14 @@ def main() -> None:
             if repetition:  # the first one fills the cache of compiled forms
                 kept.append(json.loads(result.stdout.splitlines()[-1]))
     names = {"cr": "CR, this program", "p1": "P1, plain DOLFINx"}
-    lines = [
-        "| | dofs | H1 error | Newton, finest | mesh | assembly | VI | whole run |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
-    ]
+    rows = []
     for element, kept in runs.items():
         mid = {key: median(run[key] for run in kept) for key in kept[0]}
-        lines.append(
-            f"| {names[element]} | {mid['dofs'] / 1e6:.2f} M | {mid['error']:.2e} "
-            f"| {mid['newton']:.0f} | {mid['mesh']:.2f} s | {mid['assemble']:.2f} s "
-            f"| **{mid['vi']:.2f} s** | **{mid['whole']:.2f} s** |"
-        )
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    text = "\n".join(lines) + "\n"
-    (arguments.out / "same_error.md").write_text(text)
-    print(text)
+        facts = f"{mid['dofs'] / 1e6:.2f} M", f"{mid['error']:.2e}", f"{mid['newton']:.0f}"
+        times = f"{mid['mesh']:.2f} s", f"{mid['assemble']:.2f} s"
+        results = f"**{mid['vi']:.2f} s**", f"**{mid['whole']:.2f} s**"
+        rows.append([names[element], *facts, *times, *results])
+    tabulate(HEAD, rows, arguments.out / "same_error.md")
 
 
 if __name__ == "__main__":

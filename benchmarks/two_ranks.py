@@ -33,6 +33,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from tables import tabulate
+
 FIRST, SOLVES = 2, 3
 """Solves of each process that don't count, and of those that do."""
 
@@ -113,7 +115,7 @@ def span(values: list[float], digits: int = 2) -> str:
     return f"{middle} ({low}–{high})"
 
 
-def row(name: str, turns: int) -> str:
+def row(name: str, turns: int) -> list[str]:
     """One line of the table."""
     found = [{mode: launched(mode, name) for mode in MODES} for _ in range(turns)]
 
@@ -125,7 +127,7 @@ def row(name: str, turns: int) -> str:
 
     first = found[0]
     one, two, apart = (min(of(mode, "fastest")) for mode in MODES)
-    cells = [
+    return [
         name,
         f"{first['one']['dofs'] / 1e6:.2f} M",
         first["one"]["steps"],
@@ -140,7 +142,6 @@ def row(name: str, turns: int) -> str:
         f"**{one / two:.2f}**",
         f"{2.0 * one / apart:.2f}",
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
 HEAD = (
@@ -172,13 +173,8 @@ def main() -> None:
     if arguments.run:
         run(*arguments.run)
         return
-    lines = ["| " + " | ".join(HEAD) + " |", "|---|" + "---:|" * (len(HEAD) - 1)]
-    print("\n".join(lines))
-    for name in arguments.cases:
-        lines.append(row(name, arguments.turns))
-        print(lines[-1], flush=True)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    (arguments.out / "two_ranks.md").write_text("\n".join(lines) + "\n")
+    rows = (row(name, arguments.turns) for name in arguments.cases)
+    tabulate(HEAD, rows, arguments.out / "two_ranks.md")
 
 
 if __name__ == "__main__":

@@ -182,7 +182,7 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
     number = np.cumsum(met, dtype=np.int32)[mine] - 1
 
     start = sum(m.local_range[0] for m in maps)
-    parts, ghosts, owners, ghost = [], [], [], sum(owned)
+    parts, ghosts, owners, count = [], [], [], sum(owned)
     for m, own, entities in zip(maps, np.split(number, [owned[0]]), (corners, facets), strict=True):
         kept = _ghosts_in(m, entities)
         everywhere = la.vector(m, dtype=np.int64)
@@ -190,8 +190,8 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
         everywhere.scatter_forward()
         part = np.full(_count(m), -1, dtype=np.int32)
         part[: m.size_local] = own
-        part[m.size_local + kept] = ghost + np.arange(len(kept))
-        ghost += len(kept)
+        part[m.size_local + kept] = count + np.arange(len(kept))
+        count += len(kept)
         parts.append(part)
         ghosts.append(everywhere.array[m.size_local + kept])
         owners.append(m.owners[kept])
@@ -199,11 +199,12 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
         mesh.comm, sum(owned), np.concatenate(ghosts), np.concatenate(owners)
     )
     corner, middle = parts
-    return _Vertices(index_map, corner, middle, _coordinates(mesh, corners, corner, middle))
+    x = _coordinates(mesh, corners, corner, middle, count)
+    return _Vertices(index_map, corner, middle, x)
 
 
 def _coordinates(
-    mesh: Mesh, corners: IntArray, corner: IntArray, middle: IntArray
+    mesh: Mesh, corners: IntArray, corner: IntArray, middle: IntArray, count: int
 ) -> npt.NDArray[np.floating]:
     """Where the fine vertices are.
 
@@ -212,12 +213,12 @@ def _coordinates(
         corners: Coarse vertices of the coarse cells, shape (cells, 3).
         corner: Number of every coarse vertex, −1 for ghosts that are left behind.
         middle: Number of every coarse facet's midpoint, likewise.
+        count: How many numbers there are.
     """
     node = np.zeros(len(corner), dtype=np.int32)
     node[corners] = compat.cell_nodes(mesh)[: len(corners)]
     x_coarse = mesh.geometry.x[:, : mesh.geometry.dim].take(node, axis=0)
     ends = mesh.topology.connectivity(1, 0).array.reshape(-1, 2)
-    count = max(corner.max(initial=-1), middle.max(initial=-1)) + 1
     x = np.empty((count + 1, mesh.geometry.dim), dtype=x_coarse.dtype)  # the last one is for −1
     x[corner] = x_coarse
     x[middle] = 0.5 * (x_coarse.take(ends[:, 0], axis=0) + x_coarse.take(ends[:, 1], axis=0))
