@@ -131,9 +131,8 @@ class Trace:
         self.points, self.weights = facet_quadrature(forms.mesh, degree)
         self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
         self._corners, self._gdim = len(corners), forms.mesh.geometry.dim
-        self._constant = None
-        if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
-            self._constant = float(expression)
+        self._constant = number(expression)
+        if self._constant is not None:
             return
         at = np.vstack([corners, corners.mean(axis=0), self.points])
         self._values = compat.FacetExpression(expression, at, forms.mesh)
