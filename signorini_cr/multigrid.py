@@ -33,10 +33,12 @@ DIRECT = 2000
 """Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
 
 # Gauss-Seidel forward on the way down and backward on the way up: as symmetric as PETSc's default,
-# which goes both ways each time, and a third cheaper
+# which goes both ways each time, and a third cheaper. In one pass through all rows, not in one for
+# those of coarse points and one for the others: as many CG steps, and a third cheaper once more
 _AMG = {
     "pc_hypre_boomeramg_relax_type_down": "SOR/Jacobi",
     "pc_hypre_boomeramg_relax_type_up": "backward-SOR/Jacobi",
+    "pc_hypre_boomeramg_no_CF": True,
 }
 
 _BOTTOM = PREFIX + "bottom_"
