@@ -1,0 +1,73 @@
+"""Newton and CG steps where contact ends in random places.
+
+    container/run python3 benchmarks/random_ends.py
+
+The cases of one_solve.py on meshes that are mapped by a random shift, so that contact ends anywhere
+in its facet. Counted are the meshes from the third on, each started from the one below.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from one_solve import comm
+from tables import tabulate
+
+from signorini_cr import exact, solve_levels
+
+CASES = {"S1": exact.S1, "A": exact.A, "C 7/2": exact.root(3.5), "C 11/2": exact.root(5.5)}
+
+SQUARES = 8
+"""Squares per unit length on the coarsest mesh."""
+
+LEVELS = 6
+"""Number of meshes; the last one has 0.4 M dofs."""
+
+SHIFT = 0.35
+"""Largest shift."""
+
+FEWEST = 4
+"""Newton steps that are many: these and more are counted together."""
+
+HEAD = (
+    "case",
+    "meshes",
+    *(f"{steps} Newton" for steps in range(1, FEWEST)),
+    f"{FEWEST} or more",
+    "CG, median",
+    "CG, most",
+)
+
+
+def row(name: str, shifts: list[float]) -> list[str]:
+    """One line of the table."""
+    newton: Counter[int] = Counter()
+    linear = []
+    for shift in shifts:
+        domain = CASES[name].structured(SQUARES, comm, shift=shift)
+        for level, solution in enumerate(solve_levels(CASES[name].problem, domain, LEVELS)):
+            if level >= 2:
+                newton[min(solution.iterations.newton, FEWEST)] += 1
+                linear.append(solution.iterations.linear)
+    counts = [f"{newton[steps]}" for steps in range(1, FEWEST + 1)]
+    return [name, f"{len(linear)}", *counts, f"{np.median(linear):.0f}", f"{max(linear)}"]
+
+
+def main() -> None:
+    """Print and keep the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--draws", type=int, default=65, help="shifts of each case")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    arguments = parser.parse_args()
+    random = np.random.default_rng(arguments.seed)
+    shifts = random.uniform(-SHIFT, SHIFT, (len(CASES), arguments.draws)).tolist()
+    rows = (row(name, own) for name, own in zip(CASES, shifts, strict=True))
+    tabulate(HEAD, rows, arguments.out / "random_ends.md", comm.rank == 0)
+
+
+if __name__ == "__main__":
+    main()
