@@ -63,6 +63,8 @@ SHOWN = 4e4
 
 Coarsest = Callable[[], Domain]
 
+EXAMPLES = {"S1": exact.S1, "A": exact.A, "C 7/2": exact.root(3.5), "C 11/2": exact.root(5.5)}
+
 CROOKED = Polygon(
     [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],
     ["contact", "contact", "dirichlet", "neumann", "dirichlet"],
@@ -117,12 +119,7 @@ class Row:
 def cases(comm: MPI.Comm = comm) -> dict[str, tuple[Problem, Coarsest]]:
     """Problems and what makes their coarsest meshes, by name."""
     result: dict[str, tuple[Problem, Coarsest]] = {}
-    for name, example in (
-        ("S1", exact.S1),
-        ("A", exact.A),
-        ("C 7/2", exact.root(3.5)),
-        ("C 11/2", exact.root(5.5)),
-    ):
+    for name, example in EXAMPLES.items():
         for kind, shift in (("", 0.0), (" mapped", 0.31)):
             result[name + kind] = (
                 example.problem,

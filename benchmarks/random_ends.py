@@ -13,12 +13,10 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from one_solve import comm
+from one_solve import EXAMPLES, comm
 from tables import tabulate
 
-from signorini_cr import exact, solve_levels
-
-CASES = {"S1": exact.S1, "A": exact.A, "C 7/2": exact.root(3.5), "C 11/2": exact.root(5.5)}
+from signorini_cr import solve_levels
 
 SQUARES = 8
 """Squares per unit length on the coarsest mesh."""
@@ -47,8 +45,9 @@ def row(name: str, shifts: list[float]) -> list[str]:
     newton: Counter[int] = Counter()
     linear = []
     for shift in shifts:
-        domain = CASES[name].structured(SQUARES, comm, shift=shift)
-        for level, solution in enumerate(solve_levels(CASES[name].problem, domain, LEVELS)):
+        example = EXAMPLES[name]
+        domain = example.structured(SQUARES, comm, shift=shift)
+        for level, solution in enumerate(solve_levels(example.problem, domain, LEVELS)):
             if level >= 2:
                 newton[min(solution.iterations.newton, FEWEST)] += 1
                 linear.append(solution.iterations.linear)
@@ -64,8 +63,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
     random = np.random.default_rng(arguments.seed)
-    shifts = random.uniform(-SHIFT, SHIFT, (len(CASES), arguments.draws)).tolist()
-    rows = (row(name, own) for name, own in zip(CASES, shifts, strict=True))
+    shifts = random.uniform(-SHIFT, SHIFT, (len(EXAMPLES), arguments.draws)).tolist()
+    rows = (row(name, own) for name, own in zip(EXAMPLES, shifts, strict=True))
     tabulate(HEAD, rows, arguments.out / "random_ends.md", comm.rank == 0)
 
 
