@@ -27,14 +27,14 @@ LEVELS = 6
 SHIFT = 0.35
 """Largest shift."""
 
-FEWEST = 4
-"""Newton steps that are many: these and more are counted together."""
+MANY = 4
+"""So many Newton steps and more are counted together."""
 
 HEAD = (
     "case",
     "meshes",
-    *(f"{steps} Newton" for steps in range(1, FEWEST)),
-    f"{FEWEST} or more",
+    *(f"{steps} Newton" for steps in range(1, MANY)),
+    f"{MANY} or more",
     "CG, median",
     "CG, most",
 )
@@ -42,16 +42,16 @@ HEAD = (
 
 def row(name: str, shifts: list[float]) -> list[str]:
     """One line of the table."""
+    example = EXAMPLES[name]
     newton: Counter[int] = Counter()
     linear = []
     for shift in shifts:
-        example = EXAMPLES[name]
         domain = example.structured(SQUARES, comm, shift=shift)
         for level, solution in enumerate(solve_levels(example.problem, domain, LEVELS)):
             if level >= 2:
-                newton[min(solution.iterations.newton, FEWEST)] += 1
+                newton[min(solution.iterations.newton, MANY)] += 1
                 linear.append(solution.iterations.linear)
-    counts = [f"{newton[steps]}" for steps in range(1, FEWEST + 1)]
+    counts = [f"{newton[steps]}" for steps in range(1, MANY + 1)]
     return [name, f"{len(linear)}", *counts, f"{np.median(linear):.0f}", f"{max(linear)}"]
 
 

@@ -16,18 +16,11 @@ import ufl
 
 from . import compat
 from .cells import Cells, Side
-from .problem import Forms
+from .problem import Forms, number
 from .ranges import Range, range_of
 from .space import facet_quadrature
 
 FloatArray = npt.NDArray[np.float64]
-
-
-def number(expression: ufl.core.expr.Expr) -> float | None:
-    """The number that an expression is, or None."""
-    if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
-        return float(expression)
-    return None
 
 
 class Rule:

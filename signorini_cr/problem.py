@@ -143,7 +143,7 @@ class Forms:
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
         # UFL can't differentiate a number
-        level = self.exact is None or _is_constant(self.exact)
+        level = self.exact is None or number(self.exact) is not None
         flux = None if level else self.kappa * ufl.grad(self.exact)
         n = ufl.FacetNormal(cell)
 
@@ -199,12 +199,12 @@ class Forms:
     @property
     def uniform(self) -> bool:
         """Whether κ is a number."""
-        return _is_constant(self.kappa)
+        return number(self.kappa) is not None
 
     @property
     def loaded(self) -> bool:
         """Whether f or g is more than the number 0."""
-        return not (_is_zero(self.f) and _is_zero(self.g))
+        return number(self.f) != 0.0 or number(self.g) != 0.0
 
     @cached_property
     def chi(self) -> Kernel | None:
@@ -214,7 +214,7 @@ class Forms:
         terms = [
             data * v * measure(metadata=degree)
             for data, measure in ((self.f, self.dx), (self.g, self.ds(NEUMANN)))
-            if not _is_zero(data)
+            if number(data) != 0.0
         ]
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
@@ -281,7 +281,7 @@ class FacetData:
         corners = basix.geometry(facet)
         points, self._weights = facet_quadrature(forms.mesh, forms.problem.quadrature_degree)
         self._size = len(corners)
-        self._constant = float(expression) if _is_constant(expression) else None
+        self._constant = number(expression)
         if self._constant is None:
             self._expression = compat.FacetExpression(
                 expression, np.vstack([corners, points]), forms.mesh
@@ -307,11 +307,8 @@ class FacetData:
         return values[:, self._size :] @ self._weights, values[:, : self._size]
 
 
-def _is_zero(expression: Expr) -> bool:
-    return isinstance(expression, ufl.constantvalue.Zero) or (
-        _is_constant(expression) and float(expression) == 0.0
-    )
-
-
-def _is_constant(expression: Expr) -> bool:
-    return isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero)
+def number(expression: Expr) -> float | None:
+    """The number that an expression is, or None."""
+    if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
+        return float(expression)
+    return None
