@@ -17,7 +17,8 @@ faster, so that neither is compared with what others on the machine took from it
 turns, up to MORE times as many, until LEAST solves had the memory for both.
 
 As in one_solve.py the processes keep their memory, and the first solves of each do not count. The
-memory comes in large pages where the system has them.
+memory comes in large pages where the system has them. Every solve is kept in the folder of results,
+a case measured again replaces its own; the table and the picture are made of all of them.
 """
 
 from __future__ import annotations
@@ -28,12 +29,11 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from statistics import median
 
-from tables import tabulate
+from tables import line, tabulate
 
 FIRST, SOLVES = 2, 6
 """Solves of each process that don't count, and of those that do."""
@@ -46,7 +46,7 @@ STREAM, PASSES = 20_000_000, 4
 ENOUGH = 1.6
 """The bandwidth of two ranks over that of one from which on memory is said to be there for both."""
 
-LEAST, MORE = 6, 4
+LEAST, MORE = 8, 4
 """How many such solves there are to be, and how many times the turns that may take."""
 
 FINEST = 2.5e6
@@ -99,7 +99,8 @@ def run(name: str) -> None:
         seconds = comm.allreduce(solution.seconds["solve"], op=MPI.MAX) - sum(streaming)
         bandwidth = 3 * 8 * STREAM * PASSES / max(streaming) / 1e9
         steps = solution.iterations
-        found.append((solution.dofs, steps.newton, steps.linear, seconds, bandwidth))
+        times = round(seconds, 4), round(bandwidth, 2)
+        found.append((solution.dofs, steps.newton, steps.linear, *times))
         finest = False
         streaming.clear()
         del solution
@@ -120,7 +121,7 @@ def launched(ranks: int, name: str) -> list[Solve]:
 
 @dataclass(frozen=True)
 class Case:
-    """The solves of one case: those on one rank that count, and all on two."""
+    """The solves of one case on one rank and on two, as `launched` returns them."""
 
     name: str
     one: list[Solve]
@@ -129,28 +130,31 @@ class Case:
     @classmethod
     def measured(cls, name: str, turns: int) -> Case:
         """Let one rank and two take turns."""
-        one: list[Solve] = []
-        two: list[Solve] = []
+        case = cls(name, [], [])
         for turn in range(1, MORE * turns + 1):
-            one += launched(1, name)
-            two += launched(2, name)
-            upper = sorted(one, key=lambda solve: solve.bandwidth)[len(one) // 2 :]
-            case = cls(name, upper, two)
-            if turn >= turns and len(case.with_memory()) >= LEAST:
+            case.one.extend(launched(1, name))
+            case.two.extend(launched(2, name))
+            if turn >= turns and len(case.with_memory) >= LEAST:
                 break
         return case
 
+    @property
+    def alone(self) -> list[Solve]:
+        """The solves on one rank that count."""
+        return sorted(self.one, key=lambda solve: solve.bandwidth)[len(self.one) // 2 :]
+
+    @property
     def with_memory(self) -> list[Solve]:
         """The solves on two ranks that had the memory for both."""
         return [s for s in self.two if self.memory(s) >= ENOUGH]
 
     def faster(self, solve: Solve) -> float:
         """One rank's time over that of a solve."""
-        return median(s.seconds for s in self.one) / solve.seconds
+        return median(s.seconds for s in self.alone) / solve.seconds
 
     def memory(self, solve: Solve) -> float:
         """A solve's bandwidth over that of one rank."""
-        return solve.bandwidth / median(s.bandwidth for s in self.one)
+        return solve.bandwidth / median(s.bandwidth for s in self.alone)
 
     def group(self, solves: list[Solve]) -> list[str]:
         """The cells of some of the solves on two ranks."""
@@ -166,14 +170,14 @@ class Case:
     def row(self) -> list[str]:
         """The line of the table."""
         one, two = self.one[0], self.two[0]
-        both = self.with_memory()
+        both = self.with_memory
         return [
             self.name,
             f"{one.dofs / 1e6:.2f} M",
             f"{one.newton} / {one.cg}",
             f"{two.newton} / {two.cg}",
-            span([s.bandwidth for s in self.one], 0),
-            span([s.seconds for s in self.one]),
+            span([s.bandwidth for s in self.alone], 0),
+            span([s.seconds for s in self.alone]),
             *self.group(both),
             *self.group([s for s in self.two if s not in both]),
         ]
@@ -210,7 +214,7 @@ def picture(cases: list[Case], path: Path) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot as plt
 
-    figure, axis = plt.subplots(figsize=(6, 4.2), layout="constrained")
+    figure, axis = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
     for i, case in enumerate(cases):
         over = [case.memory(s) for s in case.two]
         faster = [case.faster(s) for s in case.two]
@@ -220,7 +224,7 @@ def picture(cases: list[Case], path: Path) -> None:
     axis.set_xlabel("streaming meanwhile: two ranks' bandwidth over one's")
     axis.set_ylabel("solve: one rank's time over two ranks'")
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
     figure.savefig(path, dpi=130)
 
 
@@ -235,15 +239,21 @@ def main() -> None:
     if arguments.run:
         run(arguments.run)
         return
-    cases: list[Case] = []
-
-    def rows() -> Iterator[list[str]]:
-        for name in arguments.cases:
-            cases.append(Case.measured(name, arguments.turns))
-            yield cases[-1].row()
-
-    tabulate(HEAD, rows(), arguments.out / "two_ranks.md")
-    picture(cases, arguments.out / "two_ranks.png")
+    kept = arguments.out / "two_ranks.json"
+    solves = json.loads(kept.read_text()) if kept.exists() else {}
+    for name in arguments.cases:
+        case = Case.measured(name, arguments.turns)
+        print(line(case.row()), flush=True)
+        solves[name] = [[astuple(solve) for solve in those] for those in (case.one, case.two)]
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps(solves) + "\n")
+    every = [
+        Case(name, *([Solve(*facts) for facts in those] for those in solves[name]))
+        for name in NAMES
+        if name in solves
+    ]
+    tabulate(HEAD, (case.row() for case in every), kept.with_suffix(".md"))
+    picture(every, kept.with_suffix(".png"))
 
 
 if __name__ == "__main__":

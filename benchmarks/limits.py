@@ -1,0 +1,139 @@
+"""CG steps where cells are thin, the coefficient jumps, or one direction counts more.
+
+    container/run python3 benchmarks/limits.py
+
+What the cases of one_solve.py leave out, each on nested meshes up to about 1.5 M dofs. Beside the
+steps on each mesh stand those of one linear solve of the finest matrix by CG and BoomerAMG, with
+PETSc's defaults to rtol 1e-8, and the time of the variational inequality over that of this solve.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import ufl
+from one_solve import PUSHED, comm, linear_solve
+from tables import tabulate
+from ufl.core.expr import Expr
+
+from signorini_cr import Polygon, Problem, exact, solve_levels
+from signorini_cr.domain import Domain
+from signorini_cr.space import ghosted_vector
+
+SQUARES = 4
+"""Squares per unit length on the coarsest mesh."""
+
+SIZE = 0.3
+"""Size of the coarsest cells of a thin corner."""
+
+DOFS = 1.5e6
+"""Of the finest mesh, about."""
+
+
+def square() -> Domain:
+    """The unit square of S1, squares cut in two."""
+    return exact.S1.structured(SQUARES, comm)
+
+
+def stretched() -> Domain:
+    """The same four times as long as high, inner vertices moved by up to a fifth of the size."""
+    domain = square()
+    x = domain.mesh.geometry.x
+    inner = ((x[:, :2] > 1e-6) & (x[:, :2] < 1 - 1e-6)).all(axis=1)
+    # as good as random, and the same on all ranks
+    moves = np.sin(1e4 * (x[:, :2] + x[:, 1::-1] ** 2))
+    x[inner, :2] += 0.2 / SQUARES * moves[inner]
+    x[:, 0] *= 4
+    return domain
+
+
+def corner(degrees: float) -> Callable[[], Domain]:
+    """A triangle with a thin corner, where contact meets Γ0."""
+    angle = np.radians(degrees)
+    vertices = [[0, 0], [1, 0], [float(np.cos(angle)), float(np.sin(angle))]]
+    polygon = Polygon(vertices, ["contact", "neumann", "dirichlet"])
+    return lambda: polygon.mesh(SIZE, comm)
+
+
+def with_coefficient(coefficient: Callable[[Expr], Expr]) -> Problem:
+    """The polygon's data with another coefficient."""
+    return replace(PUSHED, coefficient=coefficient)
+
+
+def jump(factor: float) -> Problem:
+    """A coefficient that is smaller above a line aslant to the cells; contact is below."""
+    return with_coefficient(
+        lambda x: ufl.conditional(x[1] < 0.37 + 0.3 * x[0], 1.0, 1 / factor),
+    )
+
+
+def strip(factor: float) -> Problem:
+    """A coefficient that is larger within a hundredth of that line, in parts of coarse cells."""
+    return with_coefficient(
+        lambda x: ufl.conditional(abs(x[1] - 0.37 - 0.3 * x[0]) < 0.01, factor, 1.0),
+    )
+
+
+def tensor(ratio: float, degrees: float) -> Problem:
+    """A coefficient ratio : 1, the larger in a direction so many degrees off the axis of x."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[c, -s], [s, c]])
+    kappa = turn @ np.diag([ratio, 1.0]) @ turn.T
+    return with_coefficient(lambda x: ufl.as_matrix(kappa.tolist()))
+
+
+CASES = {
+    "square": (PUSHED, square),
+    "stretched 4 : 1, moved": (PUSHED, stretched),
+    "corner of 10°": (PUSHED, corner(10)),
+    "corner of 5°": (PUSHED, corner(5)),
+    "jump of 10³": (jump(1e3), square),
+    "jump of 10⁶": (jump(1e6), square),
+    "thin strip of 10³": (strip(1e3), square),
+    "tensor 100 : 1": (tensor(100.0, 0.0), square),
+    "tensor 100 : 1, at 30°": (tensor(100.0, 30.0), square),
+    "tensor 100 : 1, at 90°": (tensor(100.0, 90.0), square),
+}
+
+HEAD = ("case", "dofs", "Newton", "CG", "CG with BoomerAMG", "VI / linear solve")
+
+
+def row(name: str, dofs: float) -> list[str]:
+    """One line of the table."""
+    problem, domain = CASES[name]
+    steps = []
+    for solution in solve_levels(problem, domain(), 99):
+        steps.append(solution.iterations)
+        if 4 * solution.dofs > 1.1 * dofs:
+            break
+    system = solution.level.system
+    b = ghosted_vector(solution.level.V, system.b.x.array)
+    seconds, linear = linear_solve(system.A, b)
+    b.destroy()
+    return [
+        name,
+        f"{solution.dofs / 1e6:.2f} M",
+        " ".join(f"{s.newton}" for s in steps),
+        " ".join(f"{s.linear}" for s in steps),
+        f"{linear}",
+        f"{solution.seconds['solve'] / seconds:.2f}",
+    ]
+
+
+def main() -> None:
+    """Print and keep the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--dofs", type=float, default=DOFS, help="of the finest mesh, about")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    arguments = parser.parse_args()
+    rows = (row(name, arguments.dofs) for name in arguments.cases)
+    tabulate(HEAD, rows, arguments.out / "limits.md", comm.rank == 0)
+
+
+if __name__ == "__main__":
+    main()
