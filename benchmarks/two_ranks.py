@@ -13,8 +13,7 @@ the memory of their own or one for both; on a virtual machine it changes while t
 the solves on two ranks are told apart, not by how fast they were but by what streaming was: where
 two ranks had at least ENOUGH times the bandwidth that one has, and where they had less. What one
 rank has and takes are the medians of that half of its solves in which its own streaming was the
-faster, so that neither is compared with what others on the machine took from it. There are more
-turns, up to MORE times as many, until LEAST solves had the memory for both.
+faster, so that neither is compared with what others on the machine took from it.
 
 As in one_solve.py the processes keep their memory, and the first solves of each do not count. The
 memory comes in large pages where the system has them. Every solve is kept in the folder of results,
@@ -45,9 +44,6 @@ STREAM, PASSES = 20_000_000, 4
 
 ENOUGH = 1.6
 """The bandwidth of two ranks over that of one from which on memory is said to be there for both."""
-
-LEAST, MORE = 8, 4
-"""How many such solves there are to be, and how many times the turns that may take."""
 
 FINEST = 2.5e6
 """The finest mesh is the first with more than about so many dofs."""
@@ -120,6 +116,14 @@ def launched(ranks: int, name: str) -> list[Solve]:
 
 
 @dataclass(frozen=True)
+class Point:
+    """A solve on two ranks: its bandwidth over one rank's, and one rank's time over its own."""
+
+    memory: float
+    faster: float
+
+
+@dataclass(frozen=True)
 class Case:
     """The solves of one case on one rank and on two, as `launched` returns them."""
 
@@ -131,11 +135,9 @@ class Case:
     def measured(cls, name: str, turns: int) -> Case:
         """Let one rank and two take turns."""
         case = cls(name, [], [])
-        for turn in range(1, MORE * turns + 1):
+        for _ in range(turns):
             case.one.extend(launched(1, name))
             case.two.extend(launched(2, name))
-            if turn >= turns and len(case.with_memory) >= LEAST:
-                break
         return case
 
     @property
@@ -143,34 +145,15 @@ class Case:
         """The solves on one rank that count."""
         return sorted(self.one, key=lambda solve: solve.bandwidth)[len(self.one) // 2 :]
 
-    @property
-    def with_memory(self) -> list[Solve]:
-        """The solves on two ranks that had the memory for both."""
-        return [s for s in self.two if self.memory(s) >= ENOUGH]
-
-    def faster(self, solve: Solve) -> float:
-        """One rank's time over that of a solve."""
-        return median(s.seconds for s in self.alone) / solve.seconds
-
-    def memory(self, solve: Solve) -> float:
-        """A solve's bandwidth over that of one rank."""
-        return solve.bandwidth / median(s.bandwidth for s in self.alone)
-
-    def group(self, solves: list[Solve]) -> list[str]:
-        """The cells of some of the solves on two ranks."""
-        if not solves:
-            return ["0", "–", "–", "–"]
-        return [
-            f"{len(solves)}",
-            f"{median(map(self.memory, solves)):.2f}",
-            f"{median(s.seconds for s in solves):.2f}",
-            f"**{span([self.faster(s) for s in solves])}**",
-        ]
+    def points(self) -> list[Point]:
+        """Each solve on two ranks against one rank."""
+        seconds = median(s.seconds for s in self.alone)
+        bandwidth = median(s.bandwidth for s in self.alone)
+        return [Point(s.bandwidth / bandwidth, seconds / s.seconds) for s in self.two]
 
     def row(self) -> list[str]:
         """The line of the table."""
         one, two = self.one[0], self.two[0]
-        both = self.with_memory
         return [
             self.name,
             f"{one.dofs / 1e6:.2f} M",
@@ -178,9 +161,20 @@ class Case:
             f"{two.newton} / {two.cg}",
             span([s.bandwidth for s in self.alone], 0),
             span([s.seconds for s in self.alone]),
-            *self.group(both),
-            *self.group([s for s in self.two if s not in both]),
+            span([s.seconds for s in self.two]),
+            *groups(self.points()),
         ]
+
+
+def groups(points: list[Point]) -> list[str]:
+    """The cells of solves that had the memory for both ranks, and of those that had not."""
+    both = [p for p in points if p.memory >= ENOUGH]
+    less = [p for p in points if p.memory < ENOUGH]
+    cells = []
+    for group in both, less:
+        memory, faster = [p.memory for p in group], [p.faster for p in group]
+        cells += [f"{len(group)}", *(span(v) if group else "–" for v in (memory, faster))]
+    return cells
 
 
 def span(values: list[float], digits: int = 2) -> str:
@@ -196,13 +190,12 @@ HEAD = (
     "two",
     "one rank, GB/s",
     "s",
+    "two ranks, s",
     "memory for both: solves",
     "bandwidth, times one's",
-    "two ranks, s",
     "faster by",
     "memory for less: solves",
     "bandwidth, times one's",
-    "two ranks, s",
     "faster by",
 )
 
@@ -216,9 +209,8 @@ def picture(cases: list[Case], path: Path) -> None:
 
     figure, axis = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
     for i, case in enumerate(cases):
-        over = [case.memory(s) for s in case.two]
-        faster = [case.faster(s) for s in case.two]
-        axis.plot(over, faster, "o", color=f"C{i}", markersize=4, alpha=0.7, label=case.name)
+        memory, faster = zip(*((p.memory, p.faster) for p in case.points()), strict=True)
+        axis.plot(memory, faster, "o", color=f"C{i}", markersize=4, alpha=0.7, label=case.name)
     axis.axhline(ENOUGH, color="black", linewidth=0.8)
     axis.axvline(ENOUGH, color="black", linewidth=0.8)
     axis.set_xlabel("streaming meanwhile: two ranks' bandwidth over one's")
@@ -252,7 +244,9 @@ def main() -> None:
         for name in NAMES
         if name in solves
     ]
-    tabulate(HEAD, (case.row() for case in every), kept.with_suffix(".md"))
+    everything = groups([point for case in every for point in case.points()])
+    total = ["all", *[""] * (len(HEAD) - 1 - len(everything)), *everything]
+    tabulate(HEAD, [*(case.row() for case in every), total], kept.with_suffix(".md"))
     picture(every, kept.with_suffix(".png"))
 
 
