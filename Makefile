@@ -35,9 +35,11 @@ lint:
 types:
 	$(run) container/tool mypy
 
+# What tools leave behind, but no results.
 clean:
-	git clean -fdX
+	git clean -fdX -e '!/out/' -e '!/demo-output/' -e '!/*-out/'
 
-# The environments too, those of other checkouts with them.
-purge: clean
-	rm -rf --one-file-system "$${XDG_CACHE_HOME:-$$HOME/.cache}/signorini_cr"
+# The environments, those of other checkouts with them.
+purge:
+	rm -rf --one-file-system "$${XDG_CACHE_HOME:-$$HOME/.cache}"/signorini_cr \
+	    "$${XDG_CACHE_HOME:-$$HOME/.cache}"/signorini_cr-tools-*

@@ -10,10 +10,10 @@ least that was found.
 
 Two cores of a machine may be anything from two whole cores to one that is shared, with a way to
 the memory of their own or one for both; on a virtual machine it changes while the program runs. So
-the solves on two ranks are told apart, not by how fast they were but by what streaming was: where
-two ranks had at least ENOUGH times the bandwidth that one has, and where they had less. What one
-rank has and takes are the medians of that half of its solves in which its own streaming was the
-faster, so that neither is compared with what others on the machine took from it.
+each solve on two ranks stands beside what streaming was meanwhile, and a second table has the
+solves of all cases sorted by that. What one rank has and takes are the medians of that half of its
+solves in which its own streaming was the faster, so that two ranks are not compared with what
+others on the machine took from one.
 
 As in one_solve.py the processes keep their memory, and the first solves of each do not count. The
 memory comes in large pages where the system has them. Every solve is kept in the folder of results,
@@ -25,12 +25,15 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import math
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import astuple, dataclass
+from itertools import pairwise
 from pathlib import Path
-from statistics import median
+from statistics import median, quantiles
 
 from tables import line, tabulate
 
@@ -42,8 +45,8 @@ LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 STREAM, PASSES = 20_000_000, 4
 """Numbers in each of three arrays, on all ranks together, and how often they are read."""
 
-ENOUGH = 1.6
-"""The bandwidth of two ranks over that of one from which on memory is said to be there for both."""
+EDGES = (1.2, 1.4, 1.6, 1.8)
+"""The solves are sorted by the bandwidth of two ranks over that of one."""
 
 FINEST = 2.5e6
 """The finest mesh is the first with more than about so many dofs."""
@@ -162,19 +165,9 @@ class Case:
             span([s.bandwidth for s in self.alone], 0),
             span([s.seconds for s in self.alone]),
             span([s.seconds for s in self.two]),
-            *groups(self.points()),
+            span([p.memory for p in self.points()]),
+            f"**{span([p.faster for p in self.points()])}**",
         ]
-
-
-def groups(points: list[Point]) -> list[str]:
-    """The cells of solves that had the memory for both ranks, and of those that had not."""
-    both = [p for p in points if p.memory >= ENOUGH]
-    less = [p for p in points if p.memory < ENOUGH]
-    cells = []
-    for group in both, less:
-        memory, faster = [p.memory for p in group], [p.faster for p in group]
-        cells += [f"{len(group)}", *(span(v) if group else "–" for v in (memory, faster))]
-    return cells
 
 
 def span(values: list[float], digits: int = 2) -> str:
@@ -191,13 +184,21 @@ HEAD = (
     "one rank, GB/s",
     "s",
     "two ranks, s",
-    "memory for both: solves",
-    "bandwidth, times one's",
-    "faster by",
-    "memory for less: solves",
     "bandwidth, times one's",
     "faster by",
 )
+BINS = ("bandwidth, times one's", "solves", "faster by")
+
+
+def by_bandwidth(points: list[Point]) -> Iterator[list[str]]:
+    """The lines of the table of all cases' solves, sorted by bandwidth."""
+    for low, high in pairwise((0.0, *EDGES, math.inf)):
+        faster = [p.faster for p in points if low <= p.memory < high]
+        if faster:
+            quarter, _, three = quantiles(faster, n=4) if len(faster) > 1 else 3 * faster
+            middle = f"**{median(faster):.2f}**, half of them {quarter:.2f}–{three:.2f}"
+            bounds = f"to {high}" if low == 0.0 else f"{low} and more" if high == math.inf else ""
+            yield [bounds or f"{low} to {high}", f"{len(faster)}", middle]
 
 
 def picture(cases: list[Case], path: Path) -> None:
@@ -211,8 +212,7 @@ def picture(cases: list[Case], path: Path) -> None:
     for i, case in enumerate(cases):
         memory, faster = zip(*((p.memory, p.faster) for p in case.points()), strict=True)
         axis.plot(memory, faster, "o", color=f"C{i}", markersize=4, alpha=0.7, label=case.name)
-    axis.axhline(ENOUGH, color="black", linewidth=0.8)
-    axis.axvline(ENOUGH, color="black", linewidth=0.8)
+    axis.axline((1.0, 1.0), slope=1.0, color="black", linewidth=0.8)
     axis.set_xlabel("streaming meanwhile: two ranks' bandwidth over one's")
     axis.set_ylabel("solve: one rank's time over two ranks'")
     axis.grid(alpha=0.3)
@@ -244,9 +244,11 @@ def main() -> None:
         for name in NAMES
         if name in solves
     ]
-    everything = groups([point for case in every for point in case.points()])
-    total = ["all", *[""] * (len(HEAD) - 1 - len(everything)), *everything]
-    tabulate(HEAD, [*(case.row() for case in every), total], kept.with_suffix(".md"))
+    table = kept.with_suffix(".md")
+    tabulate(HEAD, (case.row() for case in every), table)
+    of_cases = table.read_text()
+    tabulate(BINS, by_bandwidth([point for case in every for point in case.points()]), table)
+    table.write_text(of_cases + "\n" + table.read_text())
     picture(every, kept.with_suffix(".png"))
 
 

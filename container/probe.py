@@ -1,4 +1,4 @@
-"""Exit with 0 where this Python can run signorini_cr: DOLFINx >= 0.9, real petsc4py, gmsh.
+"""Exit with 0 where this Python can run signorini_cr: DOLFINx >= 0.9, petsc4py, gmsh.
 
 Prints the folders Python imports from, one a line: as long as none of them changes, neither does
 the answer.
@@ -28,5 +28,5 @@ except Exception as error:
     sys.exit(f"container/run: {sys.executable} has DOLFINx, but cannot load it: {error}")
 
 version = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
-if version < (0, 9) or np.issubdtype(PETSc.ScalarType, np.complexfloating):
+if version < (0, 9) or PETSc.ScalarType is not np.float64:
     sys.exit(1)

@@ -52,7 +52,8 @@ def solve_adaptive(
         The solutions, coarsest first; `Solution.certificate` has the bounds.
 
     Raises:
-        InputError: There is no bound to go by; the message says why.
+        InputError: As for `solve`; or there is no bound to go by, and the message says why; or the
+            fraction or the number of levels is out of its range.
         NotConverged: The solver stopped short on one of the meshes, or cells got too small.
     """
     if not 0.0 < fraction <= 1.0:

@@ -20,13 +20,13 @@ from .errors import InputError, raise_together
 from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .masking import numbers_of
-from .moments import Data
+from .moments import Sampled
 from .multigrid import LONG_SWEEPS, SWEEPS, Grid
 from .options import NO_INODES, defaults
 from .parents import Layout, Parents
 from .pattern import empty_matrix
 from .problem import Forms
-from .space import closure_dofs, function_space, ghosted_vector, shared_maximum
+from .space import closure_dofs, facet_entities, function_space, ghosted_vector, shared_maximum
 from .transfer import inclusion, prolongation
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ ROUNDING = 1e-5
 """Least load, in parts of what it would be from zero: A u is not known to all digits of u."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Level:
     """One mesh with everything that is assembled on it.
 
@@ -55,6 +55,8 @@ class Level:
 
     def __post_init__(self) -> None:
         """Free what levels before have left, and hold the mesh while there are objects on it."""
+        if PETSc.ScalarType is not np.float64:
+            raise InputError(f"PETSc's numbers are {PETSc.ScalarType.__name__}; float64 is needed")
         sweep(self.domain.mesh.comm)
         hold(self, self.domain.mesh)
 
@@ -78,12 +80,12 @@ class Level:
     @cached_property
     def load(self) -> Load:
         """Moments of f."""
-        return Load.of(Data.of(self.forms).f, self.cells)
+        return Load.of(Sampled.of(self.forms).f, self.cells)
 
     @cached_property
     def edge(self) -> Edge:
         """Moments of g."""
-        return Edge(Data.of(self.forms).g, self.cells)
+        return Edge(Sampled.of(self.forms).g, self.cells)
 
     def tidy(self) -> None:
         """Drop what only solution and certificate needed; it is made again if asked for."""
@@ -251,7 +253,7 @@ class System:
 def _boundary_values(
     level: Level, part: int
 ) -> tuple[npt.NDArray[np.bool_], fem.Function, FloatArray]:
-    """Data on one boundary part as the element takes them.
+    """Data on one boundary part as the element takes them: CR facet means, P1 values at vertices.
 
     Returns:
         Which dofs lie on the part, a Function with the values there, and the values at the
@@ -259,8 +261,12 @@ def _boundary_values(
     """
     V, domain = level.V, level.domain
     facets = domain.facets(part)
-    means, at_vertices = level.forms.boundary_data[part].at(domain, facets)
+    sampled = Sampled.of(level.forms)
+    trace = sampled.u_D if part == DIRICHLET else sampled.alpha
+    at_vertices, _, inside = trace.at(domain.mesh, facet_entities(domain.mesh, facets))
+    at_vertices, means = at_vertices.T, trace.weights @ inside
     dofs = closure_dofs(V, facets)
+    # Π_h K ⊂ K_h holds with facet means for any α and u_D
     of_dofs = means[:, None] if dofs.shape[1] == 1 else at_vertices
     # before the maximum over the ranks, which a NaN may lose
     key = {DIRICHLET: "dirichlet", CONTACT: "obstacle"}[part]

@@ -63,7 +63,7 @@ def poincare(tdim: int) -> float:
     return 1 / BESSEL if tdim == 2 else 1 / np.pi
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Side:
     """Boundary facets of one part, seen from their cells.
 

@@ -24,7 +24,7 @@ from .domain import CONTACT
 from .flux import equilibrate, unbalanced
 from .gap import Sums, integrate, integrate_edge
 from .loads import Load
-from .moments import Coefficient, Data
+from .moments import Coefficient, Sampled
 
 if TYPE_CHECKING:
     from .assembly import Level
@@ -36,7 +36,7 @@ SHARES = ("flux", "companion", "contact", "load", "neumann", "boundary", "solver
 """Where a bound comes from: the keys of `Certificate.parts`."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Certificate:
     """What is certain about a solution; None where nothing is, `reason` then says why.
 
@@ -65,7 +65,7 @@ class Certificate:
 
     @cached_property
     def flux(self) -> fem.Function | None:
-        """The flux y as a function in the Raviart-Thomas space of lowest order."""
+        """The flux y as a function in the Raviart-Thomas space of lowest order; collective."""
         if self._made is None:
             return None
         made = self._made
@@ -92,7 +92,7 @@ class Certificate:
 
     @cached_property
     def companion(self) -> fem.Function | None:
-        """The companion v without its lifting: quadratic on cells for d = 2, affine else."""
+        """The companion v without its lifting, of degree 2 for d = 2, affine else; collective."""
         if self._made is None:
             return None
         made = self._made
@@ -109,7 +109,7 @@ class Certificate:
         return v
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
@@ -146,7 +146,7 @@ def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = No
     level, u = base.level, base.u
     if base.element != "CR" or base.domain is not solution.domain:
         return Certificate(reason=NO_FLUX)
-    data = Data.of(level.forms)
+    data = Sampled.of(level.forms)
     if data.kappa is None:
         return Certificate(reason=TENSOR)
     cells, load, edge = level.cells, level.load, level.edge
@@ -155,7 +155,7 @@ def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = No
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
     contact_side = cells.sides[CONTACT]
-    obstacle = data.alpha.at(cells, contact_side)
+    obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
     gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
     flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
     if solution.element != "CR":
@@ -213,7 +213,7 @@ def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = No
             level=level,
             w=w,
             kappa=kappa.mean,
-            varies=any(cells.comm.allgather(kappa.values is not None)),
+            varies=kappa.values is not None,
             excess=flux.excess,
             vertices=v.vertices,
             bumps=v.bumps,

@@ -141,10 +141,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
-    from importlib.util import find_spec
-
+    from . import plots
     from .domain import PARTS
-    from .errors import on_root
     from .files import check_writable, write_files
     from .space import facet_measures
 
@@ -159,10 +157,9 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         _, lengths = facet_measures(domain.mesh, domain.facets(part))
         number, length = comm.allreduce(len(lengths)), comm.allreduce(float(lengths.sum()))
         screen.text(f"{name}: {number} facets, length {length:.6g}")
-    if on_root(comm, find_spec, "matplotlib") is None:
+    if not plots.can_draw(comm):
         screen.text("not drawn: Matplotlib is not installed")
         return DONE
-    from . import plots
 
     def draw(path: Path) -> None:
         plots.plot_mesh(domain, path, case.title)

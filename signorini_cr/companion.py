@@ -26,7 +26,7 @@ BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
 CURVED = "u_D or α is not affine on the facets: their lifting is known for d = 2 only"
 
 
-@dataclass
+@dataclass(eq=False)
 class Companion:
     """v, and what is needed of it.
 
@@ -72,7 +72,7 @@ def companion(
         sweeps: How often the bumps are improved.
     """
     fixed, contact = cells.sides[DIRICHLET], cells.sides[CONTACT]
-    on_fixed = u_D.at(cells, fixed)
+    on_fixed = u_D.at(cells.domain.mesh, fixed.entities)
     obstacle, middle, inside = on_contact
     touching = flux.touching
     v = _at_vertices(cells, w, fixed, on_fixed[0], contact, obstacle, touching)
@@ -241,7 +241,8 @@ def _miss(
     _, (a, b) = corner_points(cells, side)
     length = np.linalg.norm(b - a, axis=1)
     along = np.zeros_like(gap)
-    along += (trace.slopes(cells, side) * ((b - a) / length[:, None])).sum(axis=-1)
+    slopes = trace.slopes(cells.domain.mesh, side.entities)
+    along += (slopes * ((b - a) / length[:, None])).sum(axis=-1)
     s = trace.points
     first, second = v[side.ends]
     along = along - (second - first + 4.0 * (1.0 - 2.0 * s) * bumps[side.dofs]) / length

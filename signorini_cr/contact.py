@@ -39,7 +39,7 @@ class Kkt:
     residual: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contact:
     """Contact facets of this rank, and figures over all ranks.
 

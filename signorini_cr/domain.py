@@ -78,6 +78,10 @@ class Domain:
             contact: The value or values that stand for Γ1.
             dirichlet: The value or values that stand for Γ0.
             neumann: The value or values that stand for Γg; named so that they can be checked.
+
+        Raises:
+            InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
+                another, or leave Γ0 or Γ1 empty.
         """
         fdim = mesh.topology.dim - 1
         wanted = {
@@ -168,6 +172,9 @@ class Polygon:
         vertices: Shape (n, 2), in either orientation.
         boundary: Part of edge i, which runs from vertex i to vertex i + 1: a key of `PARTS`.
         holes: Polygons inside this one, apart from each other.
+
+    Raises:
+        InputError: An outline crosses itself or another one, or a label is not known.
     """
 
     vertices: npt.NDArray[np.float64]
@@ -203,6 +210,10 @@ class Polygon:
         Args:
             size: Facet length wanted.
             comm: The ranks that share the mesh.
+
+        Raises:
+            InputError: The size is no positive number, no edge is contact or none is Dirichlet, or
+                gmsh can't make the mesh.
         """
         if not (np.isfinite(size) and size > 0):
             raise InputError(f"size is {size}: a positive number is needed")
@@ -222,6 +233,9 @@ def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
     Args:
         path: A planar mesh of straight-sided triangles.
         comm: The ranks that share the mesh.
+
+    Raises:
+        InputError: The file can't be read, or is no such mesh; the message says where.
     """
     return _distribute(comm, gmshmesh.read, Path(path), PARTS)
 

@@ -138,6 +138,9 @@ def root(s: float, name: str = "") -> Example:
 
     At θ = π cos(sπ) = 0 and sin((s − 1)π) = 1: u vanishes there and the pressure is positive. At
     s = 5/2, 9/2, … it would be negative.
+
+    Raises:
+        ValueError: s is another number.
     """
     if s <= 0 or (s - 1.5) % 2 != 0:
         raise ValueError(f"s is {s}; it must be 3/2, 7/2, 11/2, …")
@@ -156,7 +159,11 @@ def root(s: float, name: str = "") -> Example:
 
 
 def raised(example: Example, alpha: Function) -> Example:
-    """The same contact on the obstacle α: u + α, with α given such that ∂ₙα = 0 on Γ1."""
+    """The same contact on the obstacle α: u + α, with α given such that ∂ₙα = 0 on Γ1.
+
+    Raises:
+        ValueError: The example's solution is not known.
+    """
     problem, exact = example.problem, example.problem.exact
     if exact is None:
         raise ValueError(f"the solution of {example.name} is not known")

@@ -79,6 +79,9 @@ def write_files(
         writers: What writes the file of each name to the path that it is given.
         removed: Names that shall not be there afterwards unless they are among `writers`.
         comm: The ranks that take part; all must call.
+
+    Raises:
+        InputError: The system refuses to write.
     """
     path = Path(folder)
 

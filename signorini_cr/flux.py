@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass
+@dataclass(eq=False)
 class Flux:
     """y ∈ H(div), a Raviart-Thomas field of lowest order.
 

@@ -24,7 +24,7 @@ from .moments import Coefficient
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass
+@dataclass(eq=False)
 class Sums:
     """Totals over this rank's cells.
 

@@ -309,16 +309,15 @@ def _compact(
     facets: npt.NDArray[np.int64],
     labels: npt.NDArray[np.int32],
 ) -> Triangulation:
-    """Renumber gmsh's node tags from 0, leaving out the nodes of no triangle."""
+    """Renumber gmsh's node tags from 0, leaving out the nodes of no triangle and of no facet."""
     tags, points, _ = gmsh.model.mesh.getNodes()
-    used, corners = np.unique(triangles, return_inverse=True)
+    used = np.unique(np.concatenate([triangles.ravel(), facets.ravel()]))
     order = np.argsort(tags)
     rows = order[np.searchsorted(tags, used, sorter=order)]
-    position = np.searchsorted(used, facets)
     return Triangulation(
         points.reshape(-1, 3)[rows, :2].copy(),
-        corners.reshape(triangles.shape),
-        position,
+        np.searchsorted(used, triangles),
+        np.searchsorted(used, facets),
         labels.astype(np.int32),
     )
 

@@ -39,9 +39,12 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
     Returns:
         The fine domain, without ghost cells, and the parent of every fine cell, both local
         indices: the children of cell c are 4 c, …, 4 c + 3.
+
+    Raises:
+        InputError: The mesh does not consist of straight-sided triangles.
     """
     coarse = domain.mesh
-    _check(coarse)
+    check_refinable(coarse)
     cells = coarse.topology.index_map(2).size_local
     corners = _table(coarse.topology.connectivity(2, 0))[:cells]
     facets = _table(coarse.topology.connectivity(2, 1))[:cells]
@@ -83,9 +86,12 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
     Returns:
         The fine domain, without ghost cells, and the parent of every fine cell, both local
         indices.
+
+    Raises:
+        InputError: The mesh does not consist of straight-sided triangles.
     """
     coarse = domain.mesh
-    _check(coarse)
+    check_refinable(coarse)
     owned = coarse.topology.index_map(2).size_local
     marked = np.asarray(marked_cells)
     marked = np.flatnonzero(marked) if marked.dtype == bool else marked.astype(np.int32)
@@ -131,9 +137,10 @@ def _table(links: Any) -> IntArray:
     return array.reshape(links.num_nodes, -1) if links.num_nodes else array.reshape(0, 3)
 
 
-def _check(mesh: Mesh) -> None:
+def check_refinable(mesh: Mesh) -> None:
+    """Raise InputError if a mesh can't be refined."""
     if mesh.topology.cell_type != CellType.triangle:
-        raise NotImplementedError(
+        raise InputError(
             f"the mesh consists of {mesh.topology.cell_type.name} cells: only triangles can be "
             "refined so far"
         )

@@ -14,7 +14,7 @@ from .contact import contact_facts
 from .domain import Domain
 from .errors import InputError
 from .garbage import release
-from .hierarchy import refine
+from .hierarchy import check_refinable, refine
 from .nested import nested_start
 from .problem import Forms, Problem
 from .solution import Solution
@@ -22,7 +22,8 @@ from .solver import solve_vi
 from .space import ghosted_vector
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
-"""Called on all ranks: level, step, residual norm, active dofs, linear iterations so far."""
+"""Called with level, step, residual norm, active dofs and linear iterations so far, which are the
+same on all ranks; a rank may do without one."""
 
 
 def solve(
@@ -40,7 +41,8 @@ def solve(
         monitor: Called after each step of the solver.
 
     Raises:
-        InputError: The data are not finite on the mesh.
+        InputError: The data are not finite on the mesh, of a wrong shape, or at home on another
+            mesh; there is no such element; or PETSc can't solve with the options that are set.
         NotConverged: The solver stopped short, with PETSc's name for the reason.
     """
     return _solve(Level(Forms(problem, domain.mesh, element), domain), None, monitor)
@@ -68,11 +70,14 @@ def solve_levels(
         The solutions, coarsest first.
 
     Raises:
-        InputError: The data are not finite on a mesh, or tied to one.
+        InputError: As for `solve`; or the data are tied to a mesh, or the mesh is to be refined and
+            does not consist of straight-sided triangles.
         NotConverged: The solver stopped short on one of the levels.
     """
     if levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
+    if levels > 1:
+        check_refinable(domain.mesh)
 
     def step(solution: Solution) -> tuple[Domain, npt.NDArray[np.int32]] | None:
         return refine(solution.domain) if solution.level.number + 1 < levels else None

@@ -85,7 +85,7 @@ class Edge:
         """Evaluate g."""
         self.g, self._cells = g, cells
         self.side = cells.sides[NEUMANN]
-        _, _, self.values = g.at(cells, self.side)
+        _, _, self.values = g.at(cells.domain.mesh, self.side.entities)
         self.measure = measures(cells, self.side)
         self.shares = self.measure * (g.hats.T * g.weights @ self.values)
 

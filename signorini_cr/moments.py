@@ -1,4 +1,4 @@
-"""The data of a problem as the certificate sees them: means and moments by quadrature.
+"""The data of a problem as numbers: values, means and moments by quadrature.
 
 f, g, u_D, α and κ are known by their values at quadrature points (`Problem.quadrature_degree`), and
 where they are numbers exactly.
@@ -6,21 +6,25 @@ where they are numbers exactly.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
+from ufl.core.expr import Expr
 
 from . import compat
-from .cells import Cells, Side
+from .cells import Cells
 from .problem import Forms, number
 from .ranges import Range, range_of
 from .space import facet_quadrature
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
 
 
 class Rule:
@@ -52,7 +56,7 @@ class Volume:
         rule: Where to evaluate.
     """
 
-    def __init__(self, expression: ufl.core.expr.Expr, forms: Forms, rule: Rule):
+    def __init__(self, expression: Expr, forms: Forms, rule: Rule):
         """Compile the expression, unless it is a number."""
         self.number, self.rule, self.expression = number(expression), rule, expression
         self._values = None
@@ -75,7 +79,8 @@ class Coefficient:
         mean: κ_T, shape (cells,), or () where κ is a number.
         low: Lower bound of κ, same shape.
         high: Upper bound of κ, same shape.
-        values: κ at the quadrature points, shape (q, cells); None where it is constant on cells.
+        values: κ at the quadrature points, shape (q, cells); None where it is constant on
+            each cell of all ranks.
         smallest: Lower bound of κ over all ranks.
         reason: Why there are no bounds, if there are none.
     """
@@ -96,7 +101,8 @@ class Coefficient:
                 self.low = self.high = self.mean
             else:
                 self.low, self.high = (np.broadcast_to(x, self.mean.shape) for x in found)
-            if (np.ptp(values, axis=1) > 1e-14 * np.abs(self.mean)).any():
+            varies = bool((np.ptp(values, axis=1) > 1e-14 * np.abs(self.mean)).any())
+            if cells.comm.allreduce(varies, op=MPI.LOR):  # or the bound would depend on the ranks
                 self.values = np.ascontiguousarray(values.T)
         # The same way on all ranks
         smallest = float(self.low.min(initial=np.inf)) if self.low.ndim else float(self.low)
@@ -116,52 +122,62 @@ class Trace:
         hats: Barycentric coordinates of the points, shape (q, d).
     """
 
-    def __init__(self, expression: Any, forms: Forms, degree: int, slopes: bool = True):
-        """Compile the expression, and its gradient if ``slopes`` are wanted."""
-        cell = forms.mesh.basix_cell()
-        facet = basix.cell.subentity_types(cell)[-2][0]
+    def __init__(self, expression: Expr, forms: Forms):
+        """Compile the expression, unless it is a number."""
+        self._expression, self._mesh = expression, forms.mesh
+        facet = basix.cell.subentity_types(forms.mesh.basix_cell())[-2][0]
         corners = basix.geometry(facet)
-        self.points, self.weights = facet_quadrature(forms.mesh, degree)
+        self.points, self.weights = facet_quadrature(forms.mesh, forms.problem.quadrature_degree)
         self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
-        self._corners, self._gdim = len(corners), forms.mesh.geometry.dim
+        self._corners = len(corners)
         self._constant = number(expression)
-        if self._constant is not None:
-            return
-        at = np.vstack([corners, corners.mean(axis=0), self.points])
-        self._values = compat.FacetExpression(expression, at, forms.mesh)
-        gradient = ufl.grad(expression) if slopes else None
-        self._slopes = None
-        if gradient is not None and not isinstance(gradient, ufl.constantvalue.Zero):
-            self._slopes = compat.FacetExpression(gradient, self.points, forms.mesh)
+        if self._constant is None:
+            at = np.vstack([corners, corners.mean(axis=0), self.points])
+            self._values = compat.FacetExpression(expression, at, forms.mesh)
 
     @property
     def vanishes(self) -> bool:
         """Whether it is the number 0."""
         return self._constant == 0.0
 
-    def at(self, cells: Cells, side: Side) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def at(self, mesh: Mesh, entities: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values at the vertices, the midpoint and the quadrature points of facets.
 
+        Args:
+            mesh: Where.
+            entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+
         Returns:
-            Arrays of shapes (d, n), (n,) and (q, n).
+            Arrays of shapes (d, n), (n,) and (q, n); vertices in the order of the cell's closure.
         """
-        n, k = len(side.cells), self._corners
+        n, k = len(entities), self._corners
         if self._constant is not None:
             count = len(self.weights)
             return tuple(np.full(s, self._constant) for s in ((k, n), n, (count, n)))  # type: ignore
-        values = self._values.at(cells.domain.mesh, side.entities)
-        values = np.ascontiguousarray(values[:, :, 0].T)
+        values = np.ascontiguousarray(self._values.at(mesh, entities)[:, :, 0].T)
         return values[:k], values[k], values[k + 1 :]
 
-    def slopes(self, cells: Cells, side: Side) -> FloatArray:
-        """Gradients at the quadrature points, shape (q, n, gdim)."""
-        n = len(side.cells)
-        if self._constant is not None or self._slopes is None:
-            return np.zeros((1, n, self._gdim))
-        return self._slopes.at(cells.domain.mesh, side.entities).transpose(1, 0, 2)
+    def slopes(self, mesh: Mesh, entities: IntArray) -> FloatArray:
+        """Gradients at the quadrature points, shape (q, n, gdim); collective.
+
+        Args:
+            mesh: Where.
+            entities: As for `at`.
+        """
+        if self._gradient is None:
+            return np.zeros((1, len(entities), mesh.geometry.dim))
+        return self._gradient.at(mesh, entities).transpose(1, 0, 2)
+
+    @cached_property
+    def _gradient(self) -> compat.FacetExpression | None:
+        """Compiled when it is first asked for, as only the certificate does; None if it is 0."""
+        gradient = None if self._constant is not None else ufl.grad(self._expression)
+        if gradient is None or isinstance(gradient, ufl.constantvalue.Zero):
+            return None
+        return compat.FacetExpression(gradient, self.points, self._mesh)
 
 
-class Data:
+class Sampled:
     """The data of a problem, compiled for evaluation.
 
     Attributes:
@@ -174,20 +190,19 @@ class Data:
 
     def __init__(self, forms: Forms):
         """Compile what isn't a number."""
-        degree = forms.problem.quadrature_degree
         rule = Rule(forms)
         self.f = Volume(forms.f, forms, rule)
         self.kappa = Volume(forms.kappa, forms, rule) if not ufl.shape(forms.kappa) else None
-        self.u_D = Trace(forms.dirichlet, forms, degree)
-        self.alpha = Trace(forms.obstacle, forms, degree)
-        self.g = Trace(forms.g, forms, degree, slopes=False)
+        self.u_D = Trace(forms.dirichlet, forms)
+        self.alpha = Trace(forms.obstacle, forms)
+        self.g = Trace(forms.g, forms)
 
     @classmethod
-    def of(cls, forms: Forms) -> Data:
+    def of(cls, forms: Forms) -> Sampled:
         """The data of these forms, compiled once."""
-        if forms not in _DATA:
-            _DATA[forms] = cls(forms)
-        return _DATA[forms]
+        if forms not in _SAMPLED:
+            _SAMPLED[forms] = cls(forms)
+        return _SAMPLED[forms]
 
 
-_DATA: WeakKeyDictionary[Forms, Data] = WeakKeyDictionary()
+_SAMPLED: WeakKeyDictionary[Forms, Sampled] = WeakKeyDictionary()

@@ -64,6 +64,9 @@ def distance(coarse: Solution, fine: Solution) -> float:
     Args:
         coarse: u_H, the solution that the fine one started from.
         fine: u_h.
+
+    Raises:
+        ValueError: They are not neighbours in a sequence.
     """
     parent = fine.level.parent_cell
     if parent is None or fine.level.coarser is not coarse.level:

@@ -13,7 +13,6 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import dolfinx
@@ -173,7 +172,7 @@ def write_output(
         "solution.vtu": lambda path: write_vtu(solution.u, path),
     }
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
-    if drawable and on_root(comm, lambda: find_spec("matplotlib") is not None):
+    if drawable and plots.can_draw(comm):
         writers["mesh.png"] = lambda path: plots.plot_mesh(solution.domain, path, title)
         writers["solution.png"] = lambda path: plots.plot_solution(solution, path, title)
         if solution.contact.number:

@@ -30,7 +30,7 @@ ROUNDING = 1e-6
 """Barycentric coordinates below this are 0: far from the origin few digits of a cell are left."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layout:
     """Where the dofs of CR or P1 are.
 

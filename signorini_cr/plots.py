@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 Where = str | os.PathLike[str]
 
-PARTS: dict[int, dict[str, Any]] = {
+STYLES: dict[int, dict[str, Any]] = {
     DIRICHLET: {"color": BLUE, "linewidth": 2.5, "label": r"$\Gamma_0$: Dirichlet"},
     NEUMANN: {"color": YELLOW, "linewidth": 3.5, "label": r"$\Gamma_g$: Neumann"},
     CONTACT: {"color": RED, "linewidth": 4.5, "label": r"$\Gamma_1$: contact"},
@@ -59,6 +60,11 @@ MOST_EDGES = 40_000
 """A mesh with more edges is drawn without those inside."""
 
 
+def can_draw(comm: MPI.Comm) -> bool:
+    """Whether rank 0 has Matplotlib; collective."""
+    return on_root(comm, lambda: find_spec("matplotlib") is not None)
+
+
 def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
     """Draw the mesh with Γ0, Γ1 and Γg.
 
@@ -72,12 +78,12 @@ def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
     """
     mesh = _plane(domain)
     cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
-    parts = {part: _segments(domain, part) for part in PARTS}
+    parts = {part: _segments(domain, part) for part in STYLES}
 
     def draw() -> None:
         figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2))
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
-        for part, style in PARTS.items():
+        for part, style in STYLES.items():
             if len(parts[part]):
                 draw_lines(axes, parts[part], zorder=3, capstyle="round", **style)
         legend(figure, ncols=3)
@@ -103,7 +109,7 @@ def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
     mesh = _plane(domain)
     image, box, limits = raster(solution.u)
     edges = _edges(mesh) if solution.cells <= 2000 else np.zeros((0, 2, 2))
-    boundary = np.concatenate([_segments(domain, part) for part in PARTS])
+    boundary = np.concatenate([_segments(domain, part) for part in STYLES])
     touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
 
     def draw() -> None:

@@ -9,7 +9,7 @@ with κ = 1 unless a coefficient is given.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -22,10 +22,9 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 from ufl.core.expr import Expr
 
-from . import compat
-from .domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from .domain import NEUMANN, Domain
 from .errors import InputError
-from .space import facet_entities, facet_quadrature, ufl_element
+from .space import facet_entities, ufl_element
 
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
@@ -258,53 +257,6 @@ class Forms:
         squares = np.asarray(fem.assemble_vector(form).array).reshape(-1, 2)
         h1, l2 = np.sqrt(domain.mesh.comm.allreduce(squares.sum(axis=0)))
         return float(h1), float(l2)
-
-    @cached_property
-    def boundary_data(self) -> Mapping[int, FacetData]:
-        """u_D and α as they are needed on Γ0 and Γ1, by the part's number."""
-        return {
-            DIRICHLET: FacetData(self.dirichlet, self),
-            CONTACT: FacetData(self.obstacle, self),
-        }
-
-
-class FacetData:
-    """Means over facets, or values at their vertices, of an expression.
-
-    The bounds and boundary values of CR are facet means, because Π_h K ⊂ K_h then holds for any
-    α and u_D; those of P1 are values at vertices.
-    """
-
-    def __init__(self, expression: Expr, forms: Forms):
-        cell = forms.mesh.basix_cell()
-        facet = basix.cell.subentity_types(cell)[-2][0]
-        corners = basix.geometry(facet)
-        points, self._weights = facet_quadrature(forms.mesh, forms.problem.quadrature_degree)
-        self._size = len(corners)
-        self._constant = number(expression)
-        if self._constant is None:
-            self._expression = compat.FacetExpression(
-                expression, np.vstack([corners, points]), forms.mesh
-            )
-
-    def at(self, domain: Domain, facets: npt.NDArray[np.int32]) -> tuple[Any, Any]:
-        """Evaluate on facets.
-
-        Args:
-            domain: Where.
-            facets: Local indices, shape (n,).
-
-        Returns:
-            The mean over each facet, shape (n,), and the values at its vertices in the order of
-            the cell's closure, shape (n, d).
-        """
-        if self._constant is not None:
-            return (
-                np.full(len(facets), self._constant),
-                np.full((len(facets), self._size), self._constant),
-            )
-        values = self._expression.at(domain.mesh, facet_entities(domain.mesh, facets))[:, :, 0]
-        return values[:, self._size :] @ self._weights, values[:, : self._size]
 
 
 def number(expression: Expr) -> float | None:

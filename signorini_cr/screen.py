@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import textwrap
@@ -26,6 +27,8 @@ class Screen:
         for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
             if getattr(sys, name) is None:  # closed: no other file shall get its number
                 setattr(sys, name, open(os.devnull, mode))
+        if isinstance(sys.stdout, io.TextIOWrapper):  # not all terminals know Γ
+            sys.stdout.reconfigure(errors="backslashreplace")
         self.root, self.quiet, self.verbose = root, False, False
         self.passing = 0  # width of the progress line that stands on the terminal
 

@@ -17,7 +17,7 @@ from .problem import Problem
 from .solver import Iterations
 
 
-@dataclass
+@dataclass(eq=False)
 class Solution:
     """u_h on one mesh, and what is known about it.
 
@@ -69,7 +69,7 @@ class Solution:
 
     @cached_property
     def h(self) -> float:
-        """Largest cell diameter, over all ranks."""
+        """Largest cell diameter, over all ranks; found when first asked for, collectively."""
         mesh = self.domain.mesh
         number = mesh.topology.index_map(mesh.topology.dim).size_local
         h = mesh.h(mesh.topology.dim, np.arange(number, dtype=np.int32))
@@ -77,7 +77,10 @@ class Solution:
 
     @cached_property
     def errors(self) -> tuple[float, float] | None:
-        """‖u − u_h‖_h (1.6) and ‖u − u_h‖ in L2; None where u is not known."""
+        """‖u − u_h‖_h (1.6) and ‖u − u_h‖ in L2; None where u is not known.
+
+        Computed when first asked for, collectively.
+        """
         forms = self.level.forms
         return None if forms.exact is None else forms.errors(self.domain, self.u)
 

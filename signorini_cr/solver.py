@@ -45,7 +45,8 @@ DIVERGED_NAN = -4
 """PETSc's number; its name depends on the version."""
 
 Monitor = Callable[[int, float, int, int], None]
-"""Called on all ranks after each step: step, residual norm, active dofs, linear iterations."""
+"""Called after each step, on the ranks that have one: step, residual norm, active dofs, linear
+iterations so far; the same on all ranks."""
 
 
 @dataclass(frozen=True)
@@ -120,8 +121,9 @@ def solve_vi(
     outer.getPC().setType(PETSc.PC.Type.NONE)
 
     def report(snes: PETSc.SNES, step: int, norm: float) -> None:
+        # all ranks, though there may be a monitor on one of them only
+        number = comm.tompi4py().allreduce(int(linear.active().sum()))
         if monitor is not None:
-            number = comm.tompi4py().allreduce(int(linear.active().sum()))
             monitor(step, norm, number, linear.iterations)
 
     start, for_the_set = 0.0, 0

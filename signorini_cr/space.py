@@ -72,7 +72,7 @@ def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
     """The dofs that fix a function on boundary facets.
 
     One per facet, its midpoint's, for CR; the d of its vertices for P1, in the order in which
-    `FacetData` gives values at vertices.
+    `moments.Trace` gives values at vertices.
 
     Args:
         V: CR or P1.

@@ -48,6 +48,9 @@ def facet_sets(domain: Domain, example: Example) -> npt.NDArray[np.int8]:
 
     Returns:
         BOUND, MIXED or FREE for every facet of `Domain.facets(CONTACT)`, shape (n,).
+
+    Raises:
+        ValueError: The example's u or λ is not known.
     """
     exact, pressure = example.problem.exact, example.pressure
     if exact is None or pressure is None:
@@ -171,6 +174,10 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
         solution: u_h.
         example: The problem, with u and λ known.
         degree: Degree of the quadratures.
+
+    Raises:
+        ValueError: The solution is that of another element, u or λ is not known, or the mesh has
+            ghost cells.
     """
     domain, problem = solution.domain, solution.problem
     if solution.element != "CR" or problem.exact is None:

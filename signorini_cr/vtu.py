@@ -34,6 +34,9 @@ def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
         u: The function, ghosts up to date.
         path: The file; overwritten if it is there.
         name: What ParaView calls the field.
+
+    Raises:
+        InputError: The system refuses to write.
     """
     mesh = u.function_space.mesh
     comm, tdim = mesh.comm, mesh.topology.dim

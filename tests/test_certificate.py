@@ -387,6 +387,22 @@ def test_same_figures_on_any_number_of_ranks():
     assert np.isclose(total, alone.indicators.sum(), rtol=1e-6)
 
 
+def test_a_coefficient_that_varies_on_one_rank_alone():
+    """g's oscillation counts elsewhere where κ varies in a cell: for all ranks or for none."""
+    polygon = Polygon(
+        [[-1, 0], [1, 0], [1, 1], [-1, 1]], ["contact", "neumann", "neumann", "dirichlet"]
+    )
+    problem = Problem(
+        f=-1.0,
+        g=lambda x: ufl.sin(5 * x[1]),
+        coefficient=lambda x: ufl.conditional(x[0] < -0.6, 1 + (x[0] + 0.6) ** 2, 1.0),
+    )
+    here, alone = (
+        certify(solve(problem, polygon.mesh(0.2, comm))) for comm in (WORLD, MPI.COMM_SELF)
+    )
+    assert np.isclose(here.bound_h1, alone.bound_h1, rtol=1e-6)
+
+
 def test_meshes_with_ghost_cells():
     """A user's own mesh, shared with ghost cells, and with diagonals that cross."""
     mesh = create_rectangle(

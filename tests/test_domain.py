@@ -428,6 +428,37 @@ $EndElements
     assert "the one around (2.33333, 0.333333) has no Dirichlet" in fails_alike(read_gmsh, path)
 
 
+@pytest.mark.parametrize("stray", [2, 9], ids=["among the nodes", "behind them"])
+def test_a_labelled_facet_of_no_triangle(shared_tmp_path: Path, stray: int):
+    """The node in the air is no corner of the triangle 1, 3, 4, whatever its number."""
+    path = shared_tmp_path / "stray.msh"
+    text = f"""$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+1 1 "contact"
+1 2 "dirichlet"
+$EndPhysicalNames
+$Nodes
+4
+1 0 0 0
+3 1 0 0
+4 0 1 0
+{stray} 5 5 0
+$EndNodes
+$Elements
+3
+1 1 2 1 1 1 {stray}
+2 1 2 2 2 3 4
+3 2 2 3 3 1 3 4
+$EndElements
+"""
+    on_root(COMM, lambda: path.write_text(text) and None)
+    said = fails_alike(read_gmsh, path)
+    assert "from (0, 0) to (5, 5) is labelled contact but is no side of a triangle" in said
+
+
 # users' own meshes
 
 

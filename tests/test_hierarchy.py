@@ -12,6 +12,8 @@ from signorini_cr.compat import cell_nodes
 from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain, Polygon
 from signorini_cr.errors import InputError
 from signorini_cr.hierarchy import refine, refine_marked
+from signorini_cr.levels import solve_levels
+from signorini_cr.problem import Problem
 
 COMM = MPI.COMM_WORLD
 SHAPES = {
@@ -244,8 +246,10 @@ def test_what_cannot_be_refined():
     values = np.arange(len(facets), dtype=np.int32) % 2 + 1
     domain = Domain.from_tags(mesh, dolfinx.mesh.meshtags(mesh, 2, facets, values))
     for way in (refine, lambda d: refine_marked(d, [])):
-        with pytest.raises(NotImplementedError, match="only triangles"):
+        with pytest.raises(InputError, match="only triangles"):
             way(domain)
+    with pytest.raises(InputError, match="only triangles"):  # before anything is solved
+        next(solve_levels(Problem(f=1.0), domain, 2))
 
 
 def curved_triangle() -> Domain:

@@ -64,6 +64,20 @@ def test_solvers_that_do_not_suit_are_the_users_mistake(options, name, value, wo
         solve(PROBLEM, SQUARE.mesh(0.25))
 
 
+def test_a_petsc_of_other_numbers(monkeypatch):
+    monkeypatch.setattr(PETSc, "ScalarType", np.complex128)
+    with pytest.raises(InputError, match="PETSc's numbers are complex128; float64 is needed"):
+        solve(PROBLEM, SQUARE.mesh(0.5))
+
+
+def test_one_rank_alone_may_monitor():
+    seen = []
+    monitor = (lambda *facts: seen.append(facts)) if MPI.COMM_WORLD.rank == 0 else None
+    solution = solve(PROBLEM, SQUARE.mesh(0.1), monitor=monitor)
+    steps = solution.iterations.newton + 1
+    assert len(seen) == (steps if MPI.COMM_WORLD.rank == 0 else 0)
+
+
 def test_what_a_monitor_raises_reaches_the_caller():
     class Enough(Exception):
         """Ours, and nobody else's."""
