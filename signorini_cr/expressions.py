@@ -28,6 +28,7 @@ from .formula import (
 LONGEST = 10_000  # characters
 DEEPEST = 150  # levels of nesting
 LARGEST = 10_000  # operations, definitions included
+LONGEST_CHAIN = 500  # operations, each of which needs the one before; UFL walks down by recursion
 
 RESERVED = frozenset((*VARIABLES, *CONSTANTS, *FUNCTIONS))
 
@@ -82,9 +83,19 @@ def parse(
             f"the expression has {len(line)} characters; at most {LONGEST} are allowed"
         )
     root = _Reader(line, names or {}, later).read()
-    size = sum(1 for _ in operands_first(root))
-    if size > LARGEST:
-        raise InputError(f"the expression has {size} operations; at most {LARGEST} are allowed")
+    chain: dict[int, int] = {}  # the longest that ends with an operation
+    for node in operands_first(root):
+        below = (chain[id(arg)] for arg in node.args if isinstance(arg, Node))
+        chain[id(node)] = 1 + max(below, default=0)
+    if len(chain) > LARGEST:
+        raise InputError(
+            f"the expression has {len(chain)} operations; at most {LARGEST} are allowed"
+        )
+    if chain[id(root)] > LONGEST_CHAIN:
+        raise InputError(
+            f"the expression has {chain[id(root)]} operations one upon the other; at most "
+            f"{LONGEST_CHAIN} are allowed: group long sums by parentheses, as in (a + b) + (c + d)"
+        )
     return Expression(text, root)
 
 
@@ -217,15 +228,35 @@ class _Reader:
             chain.append(first)
             first = first.left
         left = self.number(first, depth)
+        terms: list[tuple[ast.BinOp, Node]] = []  # of a sum that left is the first term of
         for link in reversed(chain):
             right = self.number(link.right, depth)
+            if isinstance(link.op, ast.Add | ast.Sub):
+                terms.append((link, right))
+                continue
+            left, terms = self.sum(left, terms), []
             if isinstance(link.op, ast.Div) and is_constant(right, 0.0):
                 self.reject(link, "this divides by zero")
             if isinstance(link.op, ast.Pow) and left.op == "const" and right.op != "const":
                 if left.args[0] <= 0.0:
                     self.reject(link, "with a varying exponent, the base must be above 0")
             left = self.finite(link, operation(_ARITHMETIC[type(link.op)], left, right))
-        return left
+        return self.sum(left, terms)
+
+    def sum(self, first: Node, terms: list[tuple[ast.BinOp, Node]]) -> Node:
+        """Add up by pairs: a - b + c - d is (a - b) + (c - d), so that long sums are not deep."""
+        signed: list[tuple[ast.BinOp | None, bool, Node]] = [(None, True, first)]
+        signed += [(link, isinstance(link.op, ast.Add), node) for link, node in terms]
+        while len(signed) > 1:
+            pairs = zip(signed[::2], signed[1::2], strict=False)
+            rest = signed[len(signed) // 2 * 2 :]
+            signed = []
+            for (before, plus, one), (link, and_plus, two) in pairs:
+                assert link is not None  # only the first has none
+                node = operation("+" if plus == and_plus else "-", one, two)
+                signed.append((before, plus, self.finite(link, node)))
+            signed += rest
+        return signed[0][2]
 
     def compare(self, tree: ast.Compare, depth: int) -> Node:
         values = [self.number(part, depth) for part in (tree.left, *tree.comparators)]

@@ -126,9 +126,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     try:
         table = parse_toml(on_root(comm, read_text, path))
         insist_known(table, "", ("title", *SECTIONS), KEYS)
-        # a file's name may hold what no text can
-        stem = path.stem.encode("utf-8", "replace").decode("utf-8")
-        title = get(table, "", "title", string, stem)
+        title = get(table, "", "title", string, path.stem)
         sections = {name: _section(table, name) for name in SECTIONS}
         if "domain" not in table:
             raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")

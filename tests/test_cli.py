@@ -591,14 +591,18 @@ def test_without_out_the_results_lie_in_the_current_folder(tmp_path: Path) -> No
 
 @pytest.mark.serial
 def test_names_that_are_no_text(tmp_path: Path, monkeypatch) -> None:
-    """A problem file in a foreign encoding, results in a folder the terminal can't spell."""
+    """Results in a folder the terminal can't spell, a problem file in a foreign encoding."""
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    name = os.fsdecode(b"\xe4.toml")
-    (tmp_path / name).write_text(with_('title = "S1"\n', ""))
-    done = process("solve", name, "--out", "Γ", cwd=tmp_path)
+    (tmp_path / "case.toml").write_text(CASE)
+    done = process("solve", "case.toml", "--out", "Γ", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\\u0393" in done.stdout
-    assert json.loads((tmp_path / "Γ" / "report.json").read_text())["title"] == "?"
+    assert (tmp_path / "Γ" / "report.json").exists()
+    name = os.fsdecode(b"\xe4.toml")
+    (tmp_path / name).write_text(CASE)
+    done = process("solve", name, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("signorini-cr: \\udce4.toml: this is no text in UTF-8")
 
 
 @pytest.mark.serial

@@ -213,6 +213,25 @@ def test_a_long_sum_is_not_deep_but_may_be_too_large() -> None:
         parse("a + " + " + ".join(["x"] * 3000), names)
 
 
+def test_ufl_takes_the_longest_sum_but_no_longer_product() -> None:
+    x = ufl.SpatialCoordinate(mesh.create_unit_square(MPI.COMM_WORLD, 2, 2))
+    for kind in ("x*y", "x*y - 1", "y - x*y"):
+        text = " + ".join([kind] * (9_000 // (len(kind) + 3)))
+        assert parse(text).ufl(x).ufl_shape == ()
+    with pytest.raises(InputError, match="501 operations one upon the other; at most 500"):
+        parse("*".join(["x"] * 501))
+
+
+def test_sums_by_pairs_keep_their_signs() -> None:
+    rng = np.random.default_rng(1)
+    for count in range(1, 20):
+        numbers, signs = rng.uniform(1, 2, count), rng.choice([-1, 1], count)
+        text = "x" + "".join(
+            f" {'-' if s < 0 else '+'} {n}*x" for s, n in zip(signs, numbers, strict=True)
+        )
+        assert parse(text).numpy([[1.0, 0.0]]) == pytest.approx(1.0 + signs @ numbers)
+
+
 @pytest.mark.parametrize("name", ["2r", "a b", "", "and", "x", "pi", "sin", "True", "a-b", "a()"])
 def test_names_that_cannot_be_used(name: str) -> None:
     with pytest.raises(InputError):
