@@ -35,7 +35,7 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median, quantiles
 
-from tables import line, tabulate
+from tables import head, line
 
 FIRST, SOLVES = 2, 6
 """Solves of each process that don't count, and of those that do."""
@@ -244,11 +244,10 @@ def main() -> None:
         for name in NAMES
         if name in solves
     ]
-    table = kept.with_suffix(".md")
-    tabulate(HEAD, (case.row() for case in every), table)
-    of_cases = table.read_text()
-    tabulate(BINS, by_bandwidth([point for case in every for point in case.points()]), table)
-    table.write_text(of_cases + "\n" + table.read_text())
+    points = [point for case in every for point in case.points()]
+    lines = [head(HEAD), *(line(case.row()) for case in every), ""]
+    lines += [head(BINS), *(line(cells) for cells in by_bandwidth(points))]
+    kept.with_suffix(".md").write_text("\n".join(lines) + "\n")
     picture(every, kept.with_suffix(".png"))
 
 

@@ -1,4 +1,4 @@
-"""Exit with 0 where this Python can run signorini_cr: DOLFINx >= 0.9, petsc4py, gmsh.
+"""Exit with 0 where this Python can run signorini_cr: DOLFINx >= 0.9, gmsh, petsc4py of float64.
 
 Prints the folders Python imports from, one a line: as long as none of them changes, neither does
 the answer.

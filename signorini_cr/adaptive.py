@@ -52,8 +52,9 @@ def solve_adaptive(
         The solutions, coarsest first; `Solution.certificate` has the bounds.
 
     Raises:
-        InputError: As for `solve`; or there is no bound to go by, and the message says why; or the
-            fraction or the number of levels is out of its range.
+        InputError: As for `solve`; or there is no bound to go by, and the message says why; or
+            a mesh of other cells than straight-sided triangles is to be refined; or the fraction or
+            the number of levels is out of its range.
         NotConverged: The solver stopped short on one of the meshes, or cells got too small.
     """
     if not 0.0 < fraction <= 1.0:

@@ -58,9 +58,9 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
     own, petsc = _split(list(argv))
     parser, commands = _parser()
     for word in argv:
-        if not word.isascii() and word != word.encode("utf-8", "replace").decode("utf-8"):
-            shown = word.encode("utf-8", "backslashreplace").decode("utf-8")
-            parser.error(f"{shown}: this is no text in UTF-8, which DOLFINx needs; rename the file")
+        shown = word.encode("utf-8", "backslashreplace").decode("utf-8")
+        if shown != word:
+            parser.error(f"{shown}: this is no text in UTF-8, which DOLFINx needs")
     first = own[0] if own else ""
     if first not in ("-h", "--help", "--version", *commands):
         near = difflib.get_close_matches(first, commands, n=1)

@@ -7,6 +7,7 @@ Python. What comes out is a graph of operations, see :mod:`signorini_cr.formula`
 import ast
 import difflib
 import math
+import sys
 import unicodedata
 import warnings
 from collections.abc import Collection, Mapping
@@ -28,7 +29,9 @@ from .formula import (
 LONGEST = 10_000  # characters
 DEEPEST = 150  # levels of nesting
 LARGEST = 10_000  # operations, definitions included
-LONGEST_CHAIN = 500  # operations, each of which needs the one before; UFL walks down by recursion
+LONGEST_CHAIN = 500  # operations, each of which needs the one before
+PLAIN = 40  # levels that are no matter to UFL, which walks down them by recursion
+FRAMES = 40  # of Python that a level takes at most
 
 RESERVED = frozenset((*VARIABLES, *CONSTANTS, *FUNCTIONS))
 
@@ -94,8 +97,10 @@ def parse(
     if chain[id(root)] > LONGEST_CHAIN:
         raise InputError(
             f"the expression has {chain[id(root)]} operations one upon the other; at most "
-            f"{LONGEST_CHAIN} are allowed: group long sums by parentheses, as in (a + b) + (c + d)"
+            f"{LONGEST_CHAIN} are allowed"
         )
+    if chain[id(root)] > PLAIN:
+        sys.setrecursionlimit(max(sys.getrecursionlimit(), FRAMES * LONGEST_CHAIN))
     return Expression(text, root)
 
 
@@ -216,10 +221,11 @@ class _Reader:
         return node
 
     def join(self, op: str, parts: list[Node]) -> Node:
-        result = parts[0]
-        for part in parts[1:]:
-            result = operation(op, result, part)
-        return result
+        """Join by pairs: what is long need not be deep."""
+        while len(parts) > 1:
+            pairs = zip(parts[::2], parts[1::2], strict=False)
+            parts = [operation(op, *pair) for pair in pairs] + parts[len(parts) // 2 * 2 :]
+        return parts[0]
 
     def arithmetic(self, tree: ast.BinOp, depth: int) -> Node:
         chain = []  # a + b + c + …, which leans to the left, is no deeper than a + b

@@ -45,6 +45,8 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
     """
     coarse = domain.mesh
     check_refinable(coarse)
+    for dims in ((2, 1), (1, 2), (1, 0)):
+        coarse.topology.create_connectivity(*dims)
     cells = coarse.topology.index_map(2).size_local
     corners = _table(coarse.topology.connectivity(2, 0))[:cells]
     facets = _table(coarse.topology.connectivity(2, 1))[:cells]
@@ -92,6 +94,8 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
     """
     coarse = domain.mesh
     check_refinable(coarse)
+    for dims in ((2, 1), (1, 2), (1, 0)):
+        coarse.topology.create_connectivity(*dims)
     owned = coarse.topology.index_map(2).size_local
     marked = np.asarray(marked_cells)
     marked = np.flatnonzero(marked) if marked.dtype == bool else marked.astype(np.int32)
@@ -146,9 +150,6 @@ def check_refinable(mesh: Mesh) -> None:
         )
     if compat.coordinate_map(mesh).degree != 1:
         raise InputError("the mesh has curved cells: only straight-sided ones can be refined")
-    mesh.topology.create_connectivity(2, 1)
-    mesh.topology.create_connectivity(1, 2)
-    mesh.topology.create_connectivity(1, 0)
 
 
 class _Vertices(NamedTuple):

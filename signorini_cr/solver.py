@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from .errors import NotConverged
@@ -121,7 +122,6 @@ def solve_vi(
     outer.getPC().setType(PETSc.PC.Type.NONE)
 
     def report(snes: PETSc.SNES, step: int, norm: float) -> None:
-        # all ranks, though there may be a monitor on one of them only
         number = comm.tompi4py().allreduce(int(linear.active().sum()))
         if monitor is not None:
             monitor(step, norm, number, linear.iterations)
@@ -147,7 +147,9 @@ def solve_vi(
         return Reason.CONVERGED_FNORM_ABS
 
     snes.setConvergenceTest(converged)
-    snes.setMonitor(report)
+    # all ranks report, though there may be a monitor on one of them only
+    if comm.tompi4py().allreduce(monitor is not None, op=MPI.LOR):
+        snes.setMonitor(report)
     with defaults(DEFAULTS):
         read(snes)
     together = comm.getSize() == 1

@@ -10,7 +10,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 
 from signorini_cr.errors import InputError
-from signorini_cr.expressions import LARGEST, check_name, parse
+from signorini_cr.expressions import DEEPEST, LARGEST, LONGEST_CHAIN, check_name, parse
 
 GOOD = [
     "2",
@@ -213,13 +213,24 @@ def test_a_long_sum_is_not_deep_but_may_be_too_large() -> None:
         parse("a + " + " + ".join(["x"] * 3000), names)
 
 
-def test_ufl_takes_the_longest_sum_but_no_longer_product() -> None:
-    x = ufl.SpatialCoordinate(mesh.create_unit_square(MPI.COMM_WORLD, 2, 2))
-    for kind in ("x*y", "x*y - 1", "y - x*y"):
-        text = " + ".join([kind] * (9_000 // (len(kind) + 3)))
-        assert parse(text).ufl(x).ufl_shape == ()
+@pytest.mark.parametrize(
+    "text",
+    [
+        " + ".join(["x*y - 1"] * 900),
+        "*".join(["x"] * LONGEST_CHAIN),
+        "sin(" * (DEEPEST - 1) + "x" + ")" * (DEEPEST - 1),
+    ],
+    ids=["sum", "product", "nested"],
+)
+def test_ufl_takes_what_is_long_or_deep(text: str) -> None:
+    square = mesh.create_unit_square(MPI.COMM_WORLD, 1, 1)
+    value = parse(text).ufl(ufl.SpatialCoordinate(square))
+    fem.form(ufl.inner(ufl.grad(value), ufl.grad(value)) * ufl.dx(square, degree=1))
+
+
+def test_what_is_too_deep_for_ufl() -> None:
     with pytest.raises(InputError, match="501 operations one upon the other; at most 500"):
-        parse("*".join(["x"] * 501))
+        parse("*".join(["x"] * (LONGEST_CHAIN + 1)))
 
 
 def test_sums_by_pairs_keep_their_signs() -> None:
