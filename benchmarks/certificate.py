@@ -11,7 +11,7 @@ import gc
 from statistics import median
 
 from mpi4py import MPI
-from one_solve import by_case, comm, meshes
+from one_solve import by_case, cases, comm, meshes
 
 CERTIFIED = ("mesh", "assemble", "solve")
 HEAD = ("case", "dofs", "mesh, s", "assembly, s", "VI, s", "certificate, s", "µs a dof", "quotient")
@@ -21,7 +21,7 @@ def row(name: str, limit: float, repeats: int) -> list[str]:
     """One line of the table; the first of the solves does not count."""
     runs: list[list[float]] = []
     for _ in range(1 + repeats):
-        for solution in meshes(name, limit):
+        for solution in meshes(*cases()[name], limit):
             pass
         dofs = solution.dofs
         times = [*(solution.seconds[phase] for phase in CERTIFIED), solution.certificate.seconds]

@@ -13,7 +13,7 @@ import gc
 from statistics import median
 
 from mpi4py import MPI
-from one_solve import by_case, comm, meshes
+from one_solve import by_case, cases, comm, meshes
 
 HEAD = ("case", "dofs", "Newton, nested", "VI, s", "Newton, cold", "VI, s")
 
@@ -25,7 +25,7 @@ def row(name: str, limit: float, repeats: int) -> list[str]:
     for _ in range(1 + repeats):
         for nested, times in seconds.items():
             dofs, newton[nested] = [], []
-            for solution in meshes(name, limit, nested):
+            for solution in meshes(*cases()[name], limit, nested):
                 dofs.append(solution.dofs)
                 newton[nested].append(solution.iterations.newton)
             times.append(comm.allreduce(solution.seconds["solve"], op=MPI.MAX))

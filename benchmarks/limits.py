@@ -18,14 +18,12 @@ from statistics import median
 
 import numpy as np
 import ufl
-from mpi4py import MPI
-from one_solve import PUSHED, comm, linear_solve
+from one_solve import PUSHED, comm, facts, meshes
 from tables import tabulate
 from ufl.core.expr import Expr
 
-from signorini_cr import Polygon, Problem, exact, solve_levels
+from signorini_cr import Polygon, Problem, exact
 from signorini_cr.domain import Domain
-from signorini_cr.space import ghosted_vector
 
 SQUARES = 4
 """Squares per unit length on the coarsest mesh."""
@@ -110,25 +108,19 @@ HEAD = ("case", "dofs", "Newton", "CG", "CG with BoomerAMG", "VI / linear solve"
 
 def row(name: str, dofs: float) -> list[str]:
     """One line of the table."""
-    problem, domain = CASES[name]
     quotients = []
     for _ in range(1 + REPEATS):
         steps = []
-        for solution in solve_levels(problem, domain(), 99):
+        for solution in meshes(*CASES[name], dofs):
             steps.append(solution.iterations)
-            if 4 * solution.dofs > 1.1 * dofs:
-                break
-        system = solution.level.system
-        b = ghosted_vector(solution.level.V, system.b.x.array)
-        seconds, linear = linear_solve(system.A, b)
-        b.destroy()
-        quotients.append(comm.allreduce(solution.seconds["solve"], op=MPI.MAX) / seconds)
+        finest = facts(solution)
+        quotients.append(finest["vi"] / finest["linear"])
     return [
         name,
-        f"{solution.dofs / 1e6:.2f} M",
+        f"{finest['dofs'] / 1e6:.2f} M",
         " ".join(f"{s.newton}" for s in steps),
         " ".join(f"{s.linear}" for s in steps),
-        f"{linear}",
+        f"{finest['linear_cg']}",
         f"{median(quotients[1:]):.2f}",
     ]
 

@@ -116,7 +116,7 @@ class Row:
     bytes: float
 
 
-def cases(comm: MPI.Comm = comm) -> dict[str, tuple[Problem, Coarsest]]:
+def cases() -> dict[str, tuple[Problem, Coarsest]]:
     """Problems and what makes their coarsest meshes, by name."""
     result: dict[str, tuple[Problem, Coarsest]] = {}
     for name, example in EXAMPLES.items():
@@ -197,10 +197,11 @@ def facts(solution: Solution) -> dict[str, float]:
     }
 
 
-def meshes(name: str, dofs: float, nested: bool = True) -> Iterator[Solution]:
+def meshes(
+    problem: Problem, coarsest: Coarsest, dofs: float, nested: bool = True
+) -> Iterator[Solution]:
     """Solve one case on meshes of up to about so many dofs."""
-    problem, domain = cases()[name]
-    for solution in solve_levels(problem, domain(), 99, nested=nested):
+    for solution in solve_levels(problem, coarsest(), 99, nested=nested):
         yield solution
         if 4 * solution.dofs > 1.1 * dofs:
             return
@@ -211,7 +212,7 @@ def measure(name: str, dofs: float, repeats: int) -> Iterator[Row]:
     before = peak()
     runs: list[list[dict[str, float]]] = []
     for _ in range(1 + repeats):
-        runs.append([facts(solution) for solution in meshes(name, dofs)])
+        runs.append([facts(solution) for solution in meshes(*cases()[name], dofs)])
         gc.collect()
     memory = [row["memory"] for row in runs.pop(0)]
     for level in range(len(memory)):

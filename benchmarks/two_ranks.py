@@ -76,7 +76,7 @@ def run(name: str) -> None:
     from signorini_cr import solve_levels
 
     comm = MPI.COMM_WORLD
-    problem, domain = one_solve.cases(comm)[name]
+    problem, domain = one_solve.cases()[name]
     a, b, c = (np.ones(STREAM // comm.size) for _ in range(3))
     streaming: list[float] = []
     finest = False

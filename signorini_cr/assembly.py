@@ -262,14 +262,16 @@ def _boundary_values(
     V, domain = level.V, level.domain
     facets = domain.facets(part)
     sampled = Sampled.of(level.forms)
-    trace = sampled.u_D if part == DIRICHLET else sampled.alpha
+    if part == DIRICHLET:
+        key, trace = "dirichlet", sampled.u_D
+    else:
+        key, trace = "obstacle", sampled.alpha
     at_vertices, _, inside = trace.at(domain.mesh, facet_entities(domain.mesh, facets))
     at_vertices, means = at_vertices.T, trace.weights @ inside
     dofs = closure_dofs(V, facets)
     # Π_h K ⊂ K_h holds with facet means for any α and u_D
     of_dofs = means[:, None] if dofs.shape[1] == 1 else at_vertices
     # before the maximum over the ranks, which a NaN may lose
-    key = {DIRICHLET: "dirichlet", CONTACT: "obstacle"}[part]
     _require_finite(V.mesh.comm, key, of_dofs)
     values = fem.Function(V)
     on_part = np.zeros_like(values.x.array)

@@ -10,8 +10,8 @@ import math
 import sys
 import unicodedata
 import warnings
-from collections.abc import Collection, Mapping
-from typing import NoReturn
+from collections.abc import Callable, Collection, Mapping
+from typing import NoReturn, TypeAlias, TypeVar
 
 from .errors import InputError
 from .formula import (
@@ -25,6 +25,8 @@ from .formula import (
     operands_first,
     operation,
 )
+
+T = TypeVar("T")
 
 LONGEST = 10_000  # characters
 DEEPEST = 150  # levels of nesting
@@ -102,6 +104,10 @@ def parse(
     if chain[id(root)] > PLAIN:
         sys.setrecursionlimit(max(sys.getrecursionlimit(), FRAMES * LONGEST_CHAIN))
     return Expression(text, root)
+
+
+_Term: TypeAlias = tuple[ast.BinOp, bool, Node]
+"""A term of a sum: where it is added, whether it is not subtracted, and its value."""
 
 
 class _Reader:
@@ -221,11 +227,7 @@ class _Reader:
         return node
 
     def join(self, op: str, parts: list[Node]) -> Node:
-        """Join by pairs: what is long need not be deep."""
-        while len(parts) > 1:
-            pairs = zip(parts[::2], parts[1::2], strict=False)
-            parts = [operation(op, *pair) for pair in pairs] + parts[len(parts) // 2 * 2 :]
-        return parts[0]
+        return _by_pairs(parts, lambda one, two: operation(op, one, two))
 
     def arithmetic(self, tree: ast.BinOp, depth: int) -> Node:
         chain = []  # a + b + c + …, which leans to the left, is no deeper than a + b
@@ -251,18 +253,16 @@ class _Reader:
 
     def sum(self, first: Node, terms: list[tuple[ast.BinOp, Node]]) -> Node:
         """Add up by pairs: a - b + c - d is (a - b) + (c - d), so that long sums are not deep."""
-        signed: list[tuple[ast.BinOp | None, bool, Node]] = [(None, True, first)]
+        if not terms:
+            return first
+        signed = [(terms[0][0], True, first)]  # the first one's link is never looked at
         signed += [(link, isinstance(link.op, ast.Add), node) for link, node in terms]
-        while len(signed) > 1:
-            pairs = zip(signed[::2], signed[1::2], strict=False)
-            rest = signed[len(signed) // 2 * 2 :]
-            signed = []
-            for (before, plus, one), (link, and_plus, two) in pairs:
-                assert link is not None  # only the first has none
-                node = operation("+" if plus == and_plus else "-", one, two)
-                signed.append((before, plus, self.finite(link, node)))
-            signed += rest
-        return signed[0][2]
+
+        def both(one: _Term, two: _Term) -> _Term:
+            op = "+" if one[1] == two[1] else "-"
+            return one[0], one[1], self.finite(two[0], operation(op, one[2], two[2]))
+
+        return _by_pairs(signed, both)[2]
 
     def compare(self, tree: ast.Compare, depth: int) -> Node:
         values = [self.number(part, depth) for part in (tree.left, *tree.comparators)]
@@ -340,6 +340,14 @@ def check_name(name: str) -> str:
     if name in RESERVED:
         raise InputError(f"{name!r} has a meaning already; another name is needed")
     return unicodedata.normalize("NFKC", name)
+
+
+def _by_pairs(parts: list[T], both: Callable[[T, T], T]) -> T:
+    """Join neighbours until there is one: what is long need not be deep."""
+    while len(parts) > 1:
+        pairs = zip(parts[::2], parts[1::2], strict=False)
+        parts = [both(one, two) for one, two in pairs] + parts[len(parts) // 2 * 2 :]
+    return parts[0]
 
 
 def _as_float(value: float) -> float:

@@ -43,10 +43,7 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
     Raises:
         InputError: The mesh does not consist of straight-sided triangles.
     """
-    coarse = domain.mesh
-    check_refinable(coarse)
-    for dims in ((2, 1), (1, 2), (1, 0)):
-        coarse.topology.create_connectivity(*dims)
+    coarse = _prepared(domain.mesh)
     cells = coarse.topology.index_map(2).size_local
     corners = _table(coarse.topology.connectivity(2, 0))[:cells]
     facets = _table(coarse.topology.connectivity(2, 1))[:cells]
@@ -92,10 +89,7 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
     Raises:
         InputError: The mesh does not consist of straight-sided triangles.
     """
-    coarse = domain.mesh
-    check_refinable(coarse)
-    for dims in ((2, 1), (1, 2), (1, 0)):
-        coarse.topology.create_connectivity(*dims)
+    coarse = _prepared(domain.mesh)
     owned = coarse.topology.index_map(2).size_local
     marked = np.asarray(marked_cells)
     marked = np.flatnonzero(marked) if marked.dtype == bool else marked.astype(np.int32)
@@ -139,6 +133,14 @@ def _table(links: Any) -> IntArray:
     """A connectivity with equally many links for each entity, as a table."""
     array: IntArray = links.array
     return array.reshape(links.num_nodes, -1) if links.num_nodes else array.reshape(0, 3)
+
+
+def _prepared(mesh: Mesh) -> Mesh:
+    """The mesh, if it can be refined, with the connectivities that takes."""
+    check_refinable(mesh)
+    for dims in ((2, 1), (1, 2), (1, 0)):
+        mesh.topology.create_connectivity(*dims)
+    return mesh
 
 
 def check_refinable(mesh: Mesh) -> None:

@@ -7,7 +7,7 @@ where they are numbers exactly.
 from __future__ import annotations
 
 from functools import cached_property
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, proxy
 
 import basix
 import numpy as np
@@ -178,28 +178,42 @@ class Trace:
 
 
 class Sampled:
-    """The data of a problem, compiled for evaluation.
-
-    Attributes:
-        f: Volume load.
-        kappa: Coefficient; None if it isn't a scalar.
-        u_D: Values on Γ0.
-        alpha: Obstacle.
-        g: Flux on Γg.
-    """
+    """The data of a problem for evaluation, each compiled when first asked for; collective."""
 
     def __init__(self, forms: Forms):
-        """Compile what isn't a number."""
-        rule = Rule(forms)
-        self.f = Volume(forms.f, forms, rule)
-        self.kappa = Volume(forms.kappa, forms, rule) if not ufl.shape(forms.kappa) else None
-        self.u_D = Trace(forms.dirichlet, forms)
-        self.alpha = Trace(forms.obstacle, forms)
-        self.g = Trace(forms.g, forms)
+        """Note whose data, weakly: `of` keeps this as long as the forms are there."""
+        self._forms: Forms = proxy(forms)
+        self._rule = Rule(forms)
+
+    @cached_property
+    def f(self) -> Volume:
+        """Volume load."""
+        return Volume(self._forms.f, self._forms, self._rule)
+
+    @cached_property
+    def kappa(self) -> Volume | None:
+        """Coefficient; None if it isn't a scalar."""
+        kappa = self._forms.kappa
+        return None if ufl.shape(kappa) else Volume(kappa, self._forms, self._rule)
+
+    @cached_property
+    def u_D(self) -> Trace:
+        """Values on Γ0."""
+        return Trace(self._forms.dirichlet, self._forms)
+
+    @cached_property
+    def alpha(self) -> Trace:
+        """Obstacle."""
+        return Trace(self._forms.obstacle, self._forms)
+
+    @cached_property
+    def g(self) -> Trace:
+        """Flux on Γg."""
+        return Trace(self._forms.g, self._forms)
 
     @classmethod
     def of(cls, forms: Forms) -> Sampled:
-        """The data of these forms, compiled once."""
+        """The data of these forms, one object for all who ask."""
         if forms not in _SAMPLED:
             _SAMPLED[forms] = cls(forms)
         return _SAMPLED[forms]

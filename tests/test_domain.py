@@ -397,34 +397,24 @@ def test_missing_files_and_folders(shared_tmp_path: Path):
     assert "directory" in fails_alike(read_gmsh, shared_tmp_path)
 
 
+def write_text_mesh(path: Path, nodes: list[str], elements: list[str]) -> None:
+    """A gmsh file with curves 1, contact, and 2, Dirichlet; elements get their numbers here."""
+    numbered = [f"{i} {element}" for i, element in enumerate(elements, start=1)]
+    sections = {
+        "MeshFormat": ["2.2 0 8"],
+        "PhysicalNames": ["2", '1 1 "contact"', '1 2 "dirichlet"'],
+        "Nodes": [f"{len(nodes)}", *nodes],
+        "Elements": [f"{len(numbered)}", *numbered],
+    }
+    lines = [x for name, rows in sections.items() for x in (f"${name}", *rows, f"$End{name}")]
+    on_root(COMM, lambda: path.write_text("\n".join(lines) + "\n") and None)
+
+
 def test_pieces_without_dirichlet_facets(shared_tmp_path: Path):
     path = shared_tmp_path / "pieces.msh"
-    text = """$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-2
-1 1 "contact"
-1 2 "dirichlet"
-$EndPhysicalNames
-$Nodes
-6
-1 0 0 0
-2 1 0 0
-3 0 1 0
-4 2 0 0
-5 3 0 0
-6 2 1 0
-$EndNodes
-$Elements
-4
-1 1 2 1 1 1 2
-2 1 2 2 2 2 3
-3 2 2 3 3 1 2 3
-4 2 2 3 3 4 5 6
-$EndElements
-"""
-    on_root(COMM, lambda: path.write_text(text) and None)
+    nodes = ["1 0 0 0", "2 1 0 0", "3 0 1 0", "4 2 0 0", "5 3 0 0", "6 2 1 0"]
+    elements = ["1 2 1 1 1 2", "1 2 2 2 2 3", "2 2 3 3 1 2 3", "2 2 3 3 4 5 6"]
+    write_text_mesh(path, nodes, elements)
     assert "the one around (2.33333, 0.333333) has no Dirichlet" in fails_alike(read_gmsh, path)
 
 
@@ -432,29 +422,9 @@ $EndElements
 def test_a_labelled_facet_of_no_triangle(shared_tmp_path: Path, stray: int):
     """The node in the air is no corner of the triangle 1, 3, 4, whatever its number."""
     path = shared_tmp_path / "stray.msh"
-    text = f"""$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-2
-1 1 "contact"
-1 2 "dirichlet"
-$EndPhysicalNames
-$Nodes
-4
-1 0 0 0
-3 1 0 0
-4 0 1 0
-{stray} 5 5 0
-$EndNodes
-$Elements
-3
-1 1 2 1 1 1 {stray}
-2 1 2 2 2 3 4
-3 2 2 3 3 1 3 4
-$EndElements
-"""
-    on_root(COMM, lambda: path.write_text(text) and None)
+    nodes = ["1 0 0 0", "3 1 0 0", "4 0 1 0", f"{stray} 5 5 0"]
+    elements = [f"1 2 1 1 1 {stray}", "1 2 2 2 3 4", "2 2 3 3 1 3 4"]
+    write_text_mesh(path, nodes, elements)
     said = fails_alike(read_gmsh, path)
     assert "from (0, 0) to (5, 5) is labelled contact but is no side of a triangle" in said
 
