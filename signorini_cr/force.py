@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from .cells import dot_rows, sum_rows
 from .domain import CONTACT, DIRICHLET
 from .errors import InputError
+from .options import AMG
 from .space import ghosted_vector, shared_sum
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def _weight(solution: Solution) -> fem.Function:
     ksp = PETSc.KSP().create(mesh.comm)
     ksp.setOperators(A)
     ksp.setType(PETSc.KSP.Type.CG)
-    ksp.getPC().setType(PETSc.PC.Type.HYPRE)
+    ksp.getPC().setType(AMG)
     ksp.setTolerances(rtol=1e-3)
     vectors = [ghosted_vector(V, function.x.array) for function in (b, phi)]
     ksp.solve(*vectors)

@@ -11,8 +11,9 @@ function that does not vanish at a fixed dof of the finer grid is fixed too, whi
 of the reduced space. Smoothing is by over-relaxed Gauss-Seidel sweeps, forward before and backward
 after the coarse correction.
 
-Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG: the
-auxiliary space method. Small bottom grids are solved directly.
+Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG, or
+to GAMG where PETSc is without hypre: the auxiliary space method. Small bottom grids are solved
+directly.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from petsc4py import PETSc
 
 from .garbage import release
 from .masking import MaskedMatrix, numbers_of
-from .options import PREFIX, defaults, read
+from .options import AMG, PREFIX, defaults, read
 from .parents import Layout
 from .smoothing import GaussSeidel
 from .transfer import Transfer
 
 DIRECT = 2000
-"""Bottom grids of up to this many dofs are factorised, on every rank; BoomerAMG has the others."""
+"""Bottom grids of up to this many dofs are factorised, on every rank; the others are left to AMG."""
 
 # Gauss-Seidel forward on the way down and backward on the way up: as symmetric as PETSc's default,
 # which goes both ways each time, and a third cheaper. In one pass through all rows, not in one for
 # those of coarse points and one for the others: as many CG steps, and a third cheaper once more
-_AMG = {
+_BOOMERAMG = {
     "pc_hypre_boomeramg_relax_type_down": "SOR/Jacobi",
     "pc_hypre_boomeramg_relax_type_up": "backward-SOR/Jacobi",
     "pc_hypre_boomeramg_no_CF": True,
@@ -249,7 +250,9 @@ class Grid:
         kind = self._bottom_type if self._bottom is None else self._bottom.getType()
         if kind != self._bottom_type:
             return f"{kind} (option -{_BOTTOM}pc_type)"
-        return "a direct solver" if self._is_small else "BoomerAMG"
+        if self._is_small:
+            return "a direct solver"
+        return "BoomerAMG" if kind == PETSc.PC.Type.HYPRE else "GAMG, as PETSc is without hypre,"
 
     @property
     def _is_small(self) -> bool:
@@ -260,7 +263,7 @@ class Grid:
     def _bottom_type(self) -> str:
         """What solves this space at the bottom unless options say otherwise."""
         if not self._is_small:
-            return PETSc.PC.Type.HYPRE
+            return AMG
         alone = self.matrix.getComm().getSize() == 1
         return PETSc.PC.Type.CHOLESKY if alone else PETSc.PC.Type.REDUNDANT
 
@@ -268,6 +271,6 @@ class Grid:
         pc = PETSc.PC().create(self.matrix.getComm())
         pc.setOptionsPrefix(_BOTTOM)
         pc.setType(self._bottom_type)
-        with defaults(_PIVOTS if self._is_small else _AMG, _BOTTOM):
+        with defaults(_PIVOTS if self._is_small else _BOOMERAMG, _BOTTOM):
             read(pc)
         return pc

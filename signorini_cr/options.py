@@ -16,6 +16,10 @@ NO_INODES = {"mat_no_inode": None}
 """PETSc joins neighbouring rows of the same pattern, which takes time to look for; few have it."""
 
 
+AMG = PETSc.PC.Type.HYPRE if PETSc.Sys.hasExternalPackage("hypre") else PETSc.PC.Type.GAMG
+"""Algebraic multigrid: hypre's BoomerAMG, or PETSc's own where it was built without hypre."""
+
+
 def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:
     """Let a solver read its options; collective.
 

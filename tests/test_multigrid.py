@@ -18,7 +18,16 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import NotConverged, Polygon, Problem, exact, garbage, solve, solve_levels
+from signorini_cr import (
+    NotConverged,
+    Polygon,
+    Problem,
+    exact,
+    garbage,
+    multigrid,
+    solve,
+    solve_levels,
+)
 from signorini_cr.assembly import Level
 from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from signorini_cr.hierarchy import refine, refine_marked
@@ -486,6 +495,18 @@ def test_a_mesh_without_a_hierarchy():
     assert one.errors[0] < 0.05
     few = solve(exact.S1.problem, exact.S1.mesh(0.1))
     assert "direct" in few.iterations.preconditioner
+
+
+def test_a_petsc_without_hypre(monkeypatch):
+    """GAMG is in every PETSc."""
+    domain = exact.S1.mesh(0.02)
+    usual = solve(exact.S1.problem, domain)
+    monkeypatch.setattr(multigrid, "AMG", PETSc.PC.Type.GAMG)
+    other = solve(exact.S1.problem, domain)
+    assert "GAMG" in other.iterations.preconditioner
+    assert other.iterations.linear <= 30
+    assert other.energy == pytest.approx(usual.energy, rel=1e-9)
+    assert other.contact.number_active == usual.contact.number_active
 
 
 @pytest.mark.parametrize("finished", [2, 3])
