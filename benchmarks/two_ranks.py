@@ -17,7 +17,8 @@ others on the machine took from one. The last column has the fastest solve of al
 
 As in one_solve.py the processes keep their memory, and the first solves of each do not count. The
 memory comes in large pages where the system has them. Every solve is kept in the folder of results,
-a case measured again replaces its own; the table and the picture are made of all of them.
+where those of further runs are added; the table and the picture are made of all of them. After
+changes to the solver remove the file and begin anew.
 """
 
 from __future__ import annotations
@@ -238,7 +239,9 @@ def main() -> None:
     for name in arguments.cases:
         case = Case.measured(name, arguments.turns)
         print(line(case.row()), flush=True)
-        solves[name] = [[astuple(solve) for solve in those] for those in (case.one, case.two)]
+        before = solves.get(name, ([], []))
+        new = ([astuple(solve) for solve in those] for those in (case.one, case.two))
+        solves[name] = [old + more for old, more in zip(before, new, strict=True)]
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_text(json.dumps(solves) + "\n")
     every = [
