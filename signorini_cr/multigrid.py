@@ -31,7 +31,7 @@ from .smoothing import GaussSeidel
 from .transfer import Transfer
 
 DIRECT = 2000
-"""Bottom grids of up to this many dofs are factorised, on every rank; the others are left to AMG."""
+"""Bottom grids of up to this many dofs are factorised, on every rank; AMG has the others."""
 
 # Gauss-Seidel forward on the way down and backward on the way up: as symmetric as PETSc's default,
 # which goes both ways each time, and a third cheaper. In one pass through all rows, not in one for
