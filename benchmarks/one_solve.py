@@ -14,7 +14,8 @@ The process keeps the memory it has once had from the system. On virtual machine
 come at a quarter of a gigabyte a second, which would be all that is measured. So there is one more
 repetition, the first, whose times do not count: after it both solvers find memory that is there.
 
-Every run adds its file to the folder of results; the table and the picture are made of all of them.
+A case measured again replaces its own rows in the folder of results; the table and the picture are
+made of all that is there.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import median
@@ -335,10 +336,10 @@ def picture(rows: list[Row], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def read(folder: Path) -> list[Row]:
-    """All results in a folder, by ranks, case and number of dofs."""
+def read(paths: Iterable[Path]) -> list[Row]:
+    """All results in some files, by ranks, case and number of dofs."""
     rows, order = [], list(cases())
-    for path in sorted(folder.glob("*.csv")):
+    for path in paths:
         with path.open(newline="") as file:
             for record in csv.DictReader(file):
                 rows.append(
@@ -350,25 +351,24 @@ def read(folder: Path) -> list[Row]:
 
 def main() -> None:
     """Measure what the command line asks for."""
-    parser = command_line(__doc__)
-    parser.add_argument("--name", help="of the file of results")
-    arguments = parser.parse_args()
-    rows: list[Row] = []
+    arguments = command_line(__doc__).parse_args()
+    path = arguments.out / f"ranks-{comm.size}.csv"
     if comm.rank == 0:
         arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.cases:
+        rows = []
         for row in measure(name, arguments.dofs, arguments.repeats):
             rows.append(row)
             if comm.rank == 0:
                 print(line(columns(row)), flush=True)
         if comm.rank == 0:
-            path = arguments.out / f"{arguments.name or f'ranks-{comm.size}'}.csv"
+            others = [row for row in read([path] if path.exists() else []) if row.case != name]
             with path.open("w", newline="") as file:
                 writer = csv.DictWriter(file, [f.name for f in fields(Row)])
                 writer.writeheader()
-                writer.writerows(vars(r) for r in rows)
+                writer.writerows(vars(row) for row in [*others, *rows])
     if comm.rank == 0:
-        everything = read(arguments.out)
+        everything = read(sorted(arguments.out.glob("ranks-*.csv")))
         (arguments.out / "table.md").write_text(table([r for r in everything if r.dofs > SHOWN]))
         picture(everything, arguments.out / "one_solve.png")
 

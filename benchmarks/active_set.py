@@ -1,0 +1,97 @@
+"""What the solver finds against direct solvers: residual, KKT figures and the active set.
+
+    container/run python3 benchmarks/active_set.py --dofs 2e5
+
+On the finest mesh of each case: the solver as it is, a cold start with a direct solver and the same
+stopping test, and one that goes on until the residual is 1e-13 of the load, whose active set is
+taken for the exact one. The last two columns have the facets that the first two have in the wrong
+set, and how much that is: the largest force (or gap times the diagonal) on any of them, in parts
+of the load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+from one_solve import by_case, cases, comm, meshes
+from petsc4py import PETSc
+
+from signorini_cr.solution import Solution
+
+HEAD = (
+    "case",
+    "dofs",
+    "Newton, LU, to the end",
+    "residual, LU",
+    "min gap, LU",
+    "min pressure, LU",
+    "complementarity, LU",
+    "facets in contact",
+    "in the wrong set",
+    "LU",
+)
+
+
+@contextmanager
+def options(**values: str) -> Iterator[None]:
+    """Set options of the solver for the time of a block."""
+    database = PETSc.Options("signorini_")
+    for name, value in values.items():
+        database.setValue(name, value)
+    try:
+        yield
+    finally:
+        for name in values:
+            database.delValue(name)
+
+
+def finest(name: str, dofs: float, nested: bool = True) -> Solution:
+    """The solution on the finest mesh."""
+    *_, solution = meshes(*cases()[name], dofs, nested)
+    return solution
+
+
+def forces(solution: Solution) -> npt.NDArray[np.float64]:
+    """Force less gap times the diagonal on the contact facets, in parts of the load."""
+    system = solution.level.system
+    dofs, diagonal = system.bounded, system.A.getDiagonal().array_r
+    gap = solution.u.x.array[dofs] - system.lower[dofs]
+    return (solution.residual.x.array[dofs] - diagonal[dofs] * gap) / system.load
+
+
+def wrong(solution: Solution, exact: Solution) -> str:
+    """How many facets are in another set than in the exact solution, and what is at stake."""
+    mine, other = forces(solution), forces(exact)
+    differ = (mine > 0.0) != (other > 0.0)
+    number = comm.allreduce(int(differ.sum()))
+    largest = max(comm.allgather(float(np.abs(mine[differ]).max(initial=0.0))))
+    return f"{number} ({largest:.0e})" if number else "0"
+
+
+def row(name: str, dofs: float, repeats: int) -> list[str]:
+    """One line of the table; there is nothing to repeat."""
+    own = finest(name, dofs)
+    with options(ksp_type="preonly", pc_type="lu", pc_factor_mat_solver_type="mumps"):
+        cold = finest(name, dofs, nested=False)
+        with options(snes_atol=f"{1e-13 * own.level.system.load}"):
+            exact = finest(name, dofs, nested=False)
+    three, both = (own, cold, exact), (own, cold)
+    return [
+        name,
+        f"{own.dofs:,}",
+        ", ".join(f"{s.iterations.newton}" for s in three),
+        ", ".join(f"{s.contact.kkt.residual:.0e}" for s in both),
+        ", ".join(f"{s.contact.kkt.min_gap:.0e}" for s in both),
+        ", ".join(f"{s.contact.kkt.min_pressure:.0e}" for s in both),
+        ", ".join(f"{s.contact.kkt.complementarity:.0e}" for s in both),
+        ", ".join(f"{s.contact.number_active}" for s in three),
+        wrong(own, exact),
+        wrong(cold, exact),
+    ]
+
+
+if __name__ == "__main__":
+    by_case(__doc__, HEAD, row, "active_set.md")
