@@ -1,6 +1,7 @@
 """The linear solver where there is no hierarchy below a mesh, as with one from a file.
 
     container/run python3 benchmarks/one_mesh.py
+    container/run mpirun -n 2 python3 benchmarks/one_mesh.py
 
 gmsh meshes of the rectangle of S1 and of a polygon with obtuse corners and a hole, as they are. One
 linear system with the matrix of the Crouzeix-Raviart element, no dof on the obstacle, is solved by
@@ -109,7 +110,8 @@ def main() -> None:
         for size in arguments.sizes
         for name, problem, polygon in cases
     )
-    tabulate(HEAD, rows, arguments.out / "one_mesh.md", comm.rank == 0)
+    name = "one_mesh.md" if comm.size == 1 else f"one_mesh-{comm.size}.md"
+    tabulate(HEAD, rows, arguments.out / name, comm.rank == 0)
 
 
 if __name__ == "__main__":
