@@ -4,9 +4,9 @@
 
 On the finest mesh of each case: the solver as it is, a cold start with a direct solver and the same
 stopping test, and one that goes on until the residual is 1e-13 of the load, whose active set is
-taken for the exact one. The last two columns have the facets that the first two have in the wrong
-set, and how much that is: the largest force (or gap times the diagonal) on any of them, in parts
-of the load.
+taken for the exact one. The residual is in parts of the load, the other figures of KKT are those of
+`Kkt`. The last two columns have the facets in the wrong set, and how much that is: the largest
+force (or gap times the diagonal) on any of them, in parts of the load.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from signorini_cr.solution import Solution
 HEAD = (
     "case",
     "dofs",
-    "Newton, LU, to the end",
-    "residual, LU",
-    "min gap, LU",
-    "min pressure, LU",
-    "complementarity, LU",
-    "facets in contact",
-    "in the wrong set",
-    "LU",
+    "Newton: solver / LU / exact",
+    "residual: solver / LU",
+    "min gap",
+    "min pressure",
+    "complementarity",
+    "in contact: solver / LU / exact",
+    "wrong: solver",
+    "wrong: LU",
 )
 
 
@@ -82,12 +82,12 @@ def row(name: str, dofs: float, repeats: int) -> list[str]:
     return [
         name,
         f"{own.dofs:,}",
-        ", ".join(f"{s.iterations.newton}" for s in three),
-        ", ".join(f"{s.contact.kkt.residual:.0e}" for s in both),
-        ", ".join(f"{s.contact.kkt.min_gap:.0e}" for s in both),
-        ", ".join(f"{s.contact.kkt.min_pressure:.0e}" for s in both),
-        ", ".join(f"{s.contact.kkt.complementarity:.0e}" for s in both),
-        ", ".join(f"{s.contact.number_active}" for s in three),
+        " / ".join(f"{s.iterations.newton}" for s in three),
+        " / ".join(f"{s.contact.kkt.residual:.0e}" for s in both),
+        " / ".join(f"{s.contact.kkt.min_gap:.0e}" for s in both),
+        " / ".join(f"{s.contact.kkt.min_pressure:.0e}" for s in both),
+        " / ".join(f"{s.contact.kkt.complementarity:.0e}" for s in both),
+        " / ".join(f"{s.contact.number_active}" for s in three),
         wrong(own, exact),
         wrong(cold, exact),
     ]

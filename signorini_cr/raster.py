@@ -13,6 +13,7 @@ from .compat import cell_nodes
 from .space import vertex_values
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int_]
 AT_ONCE = 2**20
 """Pairs of a pixel and a cell near it that are looked at in one go."""
 
@@ -36,10 +37,12 @@ def raster(
     """
     mesh = u.function_space.mesh
     comm, owned = mesh.comm, mesh.topology.index_map(2).size_local
-    corners = mesh.geometry.x[cell_nodes(mesh)[:owned, :3], :2]
-    values = vertex_values(u, slice(owned))
-    lowest = np.append(corners.min(axis=(0, 1), initial=np.inf), values.min(initial=np.inf))
-    highest = np.append(corners.max(axis=(0, 1), initial=-np.inf), values.max(initial=-np.inf))
+    # A row for each vertex of a cell: numpy is slow where rows are short
+    nodes = np.ascontiguousarray(cell_nodes(mesh)[:owned, :3].T)
+    x, y = (np.ascontiguousarray(mesh.geometry.x[:, i]).take(nodes) for i in range(2))
+    values = np.ascontiguousarray(vertex_values(u, slice(owned)).T)
+    lowest = np.array([each.min(initial=np.inf) for each in (x, y, values)])
+    highest = np.array([each.max(initial=-np.inf) for each in (x, y, values)])
     comm.Allreduce(MPI.IN_PLACE, lowest, op=MPI.MIN)
     comm.Allreduce(MPI.IN_PLACE, highest, op=MPI.MAX)
     box = np.stack([lowest[:2], highest[:2]])
@@ -47,36 +50,49 @@ def raster(
     columns, rows = np.maximum(np.rint(pixels * size / size.max()), pixels // 5).astype(int)
     image = np.full((rows, columns), -np.inf)
     # In these coordinates pixel (i, j) has its centre at (i, j)
-    _paint(image, (corners - box[0]) * (np.array([columns, rows]) / size) - 0.5, values)
+    x, y = (x - box[0, 0]) * (columns / size[0]) - 0.5, (y - box[0, 1]) * (rows / size[1]) - 0.5
+    _paint(image, x, y, values)
     comm.Reduce(MPI.IN_PLACE if comm.rank == 0 else image, image, op=MPI.MAX, root=0)
     image[np.isneginf(image)] = np.nan
     return image, box, (float(lowest[2]), float(highest[2]))
 
 
-def _paint(image: FloatArray, corners: FloatArray, values: FloatArray) -> None:
+def _paint(image: FloatArray, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
     """Paint affine functions on triangles; where they meet the greatest value wins.
 
     Args:
         image: Changed in place.
-        corners: Shape (cells, 3, 2).
-        values: At the corners, shape (cells, 3).
+        x: First coordinates of the corners, shape (3, cells).
+        y: Second coordinates.
+        values: At the corners, shape (3, cells).
     """
-    first = np.ceil(corners.min(axis=1) - 1e-9).astype(int)
-    width, height = np.maximum(np.floor(corners.max(axis=1) + 1e-9).astype(int) - first + 1, 0).T
-    before = np.cumsum(np.append(0, width * height))
-    # Barycentric coordinates 1 and 2 of a point are inverse @ (point - corner 0)
-    (ax, ay), (bx, by) = np.moveaxis(corners[:, 1:] - corners[:, :1], 0, -1)
-    inverse = np.moveaxis(np.array([[by, -bx], [-ay, ax]]) / (ax * by - ay * bx), -1, 0)
+    first_column, width = _between(x)
+    first_row, height = _between(y)
+    number = width * height
+    before = np.cumsum(np.append(0, number))
     cuts = np.searchsorted(before, np.append(np.arange(0, before[-1], AT_ONCE), before[-1]))
     for begin, end in itertools.pairwise(cuts):
-        cell = np.repeat(np.arange(begin, end), (width * height)[begin:end])
+        cell = np.repeat(np.arange(begin, end), number[begin:end])
         place = np.arange(len(cell)) + before[begin] - before[cell]
-        column = first[cell, 0] + place % width[cell]
-        row = first[cell, 1] + place // width[cell]
-        offset = np.stack([column, row], axis=1) - corners[cell, 0]
-        second, third = np.einsum("nij,nj->in", inverse[cell], offset)
+        across = width[cell]
+        row = place // across
+        column = first_column[cell] + place - row * across
+        row += first_row[cell]
+        (x0, x1, x2), (y0, y1, y2) = x[:, cell], y[:, cell]
+        # Barycentric coordinates
+        right, up = column - x0, row - y0
+        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        second = (right * (y2 - y0) - up * (x2 - x0)) / area
+        third = (up * (x1 - x0) - right * (y1 - y0)) / area
         inside = np.minimum(np.minimum(second, third), 1.0 - second - third) >= -1e-9
-        cell, second, third = cell[inside], second[inside], third[inside]
-        value = values[cell, 0] * (1 - second - third)
-        value += values[cell, 1] * second + values[cell, 2] * third
-        np.maximum.at(image, (row[inside], column[inside]), value)
+        u0, u1, u2 = values[:, cell[inside]]
+        second, third = second[inside], third[inside]
+        pixel = row[inside] * image.shape[1] + column[inside]
+        value = u0 * (1.0 - second - third) + u1 * second + u2 * third
+        np.maximum.at(image.reshape(-1), pixel, value)
+
+
+def _between(x: FloatArray) -> tuple[IntArray, IntArray]:
+    """The first whole number between the least and the greatest of each column, and how many."""
+    first = np.ceil(x.min(axis=0) - 1e-9).astype(int)
+    return first, np.maximum(np.floor(x.max(axis=0) + 1e-9).astype(int) - first + 1, 0)
