@@ -252,7 +252,7 @@ class Grid:
             return f"{kind} (option -{_BOTTOM}pc_type)"
         if self._is_small:
             return "a direct solver"
-        return "BoomerAMG" if kind == PETSc.PC.Type.HYPRE else "GAMG, as PETSc is without hypre,"
+        return "BoomerAMG" if kind == PETSc.PC.Type.HYPRE else "GAMG (PETSc is without hypre)"
 
     @property
     def _is_small(self) -> bool:
