@@ -4,6 +4,7 @@ Prints the folders Python imports from, one a line: as long as none of them chan
 the answer.
 """
 
+import contextlib
 import importlib.util
 import os
 import sys
@@ -19,6 +20,8 @@ if not all(importlib.util.find_spec(name) for name in ("dolfinx", "petsc4py", "g
     sys.exit(1)
 
 try:
+    with contextlib.suppress(ModuleNotFoundError):
+        import dolfinx_solver  # noqa: F401 (the wheels' DOLFINx wants it first)
     import dolfinx
     import dolfinx.fem.petsc
     import gmsh  # noqa: F401

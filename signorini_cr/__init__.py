@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from .problem import Problem
     from .solution import Solution
 
+# The wheels of DOLFINx find MPI only where this has loaded it before them. Its own complaints,
+# such as that of a second PETSc, are for the user to see.
+try:
+    import dolfinx_solver  # noqa: F401
+except ModuleNotFoundError:
+    pass
+
 __version__ = "0.1.0"
 
 # Loaded when first used: `signorini-cr --help` must not wait for DOLFINx
