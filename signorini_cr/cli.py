@@ -7,13 +7,22 @@ misspelt option answer at once.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .commandline import UsageError, launched, read_arguments, start_petsc, wait_for_all
+from .commandline import (
+    UsageError,
+    launched,
+    left_alone,
+    read_arguments,
+    start_petsc,
+    wait_for_all,
+)
 from .screen import Screen, wrapped
 
 if TYPE_CHECKING:
@@ -44,10 +53,37 @@ def main(argv: Sequence[str] | None = None) -> int:
         screen.complain(str(error))
         wait_for_all()
         return BAD_INPUT
-    return _run(args, screen)
+    with _interruptible() as interrupted:
+        return _run(args, screen, interrupted)
 
 
-def _run(args: argparse.Namespace, screen: Screen) -> int:
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Keep in mind that an interruption was asked for.
+
+    KeyboardInterrupt may reach us as another error: of PETSc, whose callback it was raised in, or
+    of an import.
+    """
+    asked = threading.Event()
+
+    def ask(*_: object) -> None:
+        asked.set()
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # which can't be interrupted
+        yield asked
+        return
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not where it is ignored, as in the background
+        signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked
+    finally:
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, before)
+
+
+def _run(args: argparse.Namespace, screen: Screen, interrupted: threading.Event) -> int:
     """Start PETSc and do what the command says; whatever goes wrong becomes a message."""
     try:
         start_petsc(args.petsc)
@@ -56,8 +92,15 @@ def _run(args: argparse.Namespace, screen: Screen) -> int:
         comm = MPI.COMM_WORLD
         screen.root = comm.rank == 0
         screen.quiet, screen.verbose = args.quiet, getattr(args, "verbose", False)
+        if (complaint := left_alone(comm.size)) is not None:
+            screen.complain(complaint)
+            return BAD_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED
+    except Exception:
+        if interrupted.is_set():
+            return INTERRUPTED
+        raise
     try:
         from .errors import InputError, NotConverged
 
@@ -72,13 +115,14 @@ def _run(args: argparse.Namespace, screen: Screen) -> int:
         screen.flush()
         comm.Barrier()  # mpirun ends all ranks when the first leaves with an error
         return status
-    except KeyboardInterrupt:
-        screen.complain("interrupted")
-        if comm.size > 1:
-            comm.Abort(INTERRUPTED)
-        return INTERRUPTED
-    except Exception:
+    except (Exception, KeyboardInterrupt) as error:
         # Perhaps on this rank only: the others must not wait for it
+        kept = "".join(getattr(error, "__notes__", ()))  # from _solve
+        if interrupted.is_set() or isinstance(error, KeyboardInterrupt):
+            screen.complain(f"interrupted{kept and f'; {kept}'}")
+            if comm.size > 1:
+                comm.Abort(INTERRUPTED)
+            return INTERRUPTED
         import traceback
 
         where = f" on rank {comm.rank}" if comm.size > 1 else ""
@@ -92,22 +136,56 @@ def _run(args: argparse.Namespace, screen: Screen) -> int:
 
 def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from . import output
-    from .errors import InputError, NotConverged
+    from .errors import NotConverged
     from .files import check_writable
+    from .memory import most_memory, ran_out_of_memory
 
     folder = _folder(args)
     with _named("--out"):
         check_writable(folder, output.FILES, comm)
     screen.progress("reading")
-    case, domain, seconds = _read(args, screen, comm)
     records: list[output.Record] = []
+    try:
+        return _solve_levels(args, screen, comm, folder, records)
+    except (Exception, KeyboardInterrupt) as error:
+        if not ran_out_of_memory(error):
+            error.add_note(_kept(records, folder) if records else "")
+            raise
+    failure = NotConverged(
+        f"out of memory, of which this process has had {most_memory() / 1e9:.2g} GB", len(records)
+    )
+    if comm.size > 1:  # the other ranks know nothing of it
+        screen.root = True
+    screen.complain(f"{args.file}: {_stopped(failure, records, folder)}")
+    if comm.size > 1:
+        comm.Abort(NOT_CONVERGED)
+    return NOT_CONVERGED
+
+
+def _solve_levels(
+    args: argparse.Namespace,
+    screen: Screen,
+    comm: Any,
+    folder: Path,
+    records: list[dict[str, Any]],
+) -> int:
+    """Solve, and append to `records` what is solved and safe in the folder."""
+    from . import output
+    from .errors import NotConverged
+
+    case, domain, seconds = _read(args, screen, comm)
+    element = args.element.upper()
     finest: Solution | None = None
     failure: NotConverged | None = None
     try:
-        for solution in _solutions(case, domain, args.element.upper(), screen):
+        for solution in _solutions(case, domain, element, screen):
             if not records:
                 solution.seconds["mesh"] = seconds
-            records.append(output.level_record(solution, records[-1] if records else None))
+            record = output.level_record(solution, records[-1] if records else None)
+            report = output.make_report(case.title, element, comm, [*records, record], False)
+            with _named("--out"):
+                output.write_levels(folder, report, solution)
+            records.append(record)
             finest = solution
             if screen.verbose:
                 taken = solution.iterations.preconditioner
@@ -117,16 +195,10 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
             screen.line(output.table_row(records[-1], records[0]))
     except NotConverged as error:
         failure = error
-    except MemoryError:
-        if comm.size > 1:  # the other ranks know nothing of it
-            raise
-        failure = NotConverged("out of memory", len(records))
-    except InputError as error:
-        raise InputError(f"{case.path}: {error}") from None
     failure = failure or _above_tolerance(case, records)
     screen.progress("writing")
     if finest is not None:
-        report = output.make_report(case.title, args.element.upper(), comm, records)
+        report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
             names = output.write_output(folder, report, finest)
         screen.line("")
@@ -135,7 +207,7 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
             screen.text(f"no bound of the error: {reason}")
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
-        screen.complain(f"{case.path}: {_stopped(failure, len(records), folder)}")
+        screen.complain(f"{case.path}: {_stopped(failure, records, folder)}")
         return NOT_CONVERGED
     return DONE
 
@@ -184,7 +256,8 @@ def _read(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemF
     began = time.perf_counter()
     domain = case.mesh(comm)
     seconds = time.perf_counter() - began
-    case.check(domain)
+    for doubt in case.check(domain):
+        screen.warn(f"{case.path}: {doubt}")
     return case, domain, seconds
 
 
@@ -192,25 +265,29 @@ def _solutions(
     case: ProblemFile, domain: Domain, element: str, screen: Screen
 ) -> Iterator[Solution]:
     from . import levels
+    from .adaptive import solve_adaptive
+    from .errors import InputError
 
     def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
         facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
         screen.step(f"  level {level}  {facts}")
 
     screen.progress("level 0")
-    if case.mode == "uniform":
-        return levels.solve_levels(case.problem, domain, case.levels, element, monitor)
-    from .adaptive import solve_adaptive
-
-    return solve_adaptive(
-        case.problem,
-        domain,
-        tolerance=case.tolerance,
-        levels=case.levels,
-        max_dofs=case.max_dofs,
-        element=element,
-        monitor=monitor,
-    )
+    try:
+        if case.mode == "uniform":
+            yield from levels.solve_levels(case.problem, domain, case.levels, element, monitor)
+        else:
+            yield from solve_adaptive(
+                case.problem,
+                domain,
+                tolerance=case.tolerance,
+                levels=case.levels,
+                max_dofs=case.max_dofs,
+                element=element,
+                monitor=monitor,
+            )
+    except InputError as error:
+        raise InputError(f"{case.path}: {error}") from None
 
 
 def _facts(record: dict[str, Any]) -> str:
@@ -248,13 +325,17 @@ def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotCon
     )
 
 
-def _stopped(failure: Any, finished: int, folder: Path) -> str:
-    kept = {
-        0: "no level was finished, nothing was written",
-        1: f"level 0 is finished and kept in {folder}",
-    }.get(finished, f"levels 0 to {finished - 1} are finished and kept in {folder}")
-    level = finished if failure.level is None else failure.level
-    return f"stopped on level {level}: {failure.reason}\n{kept}"
+def _stopped(failure: NotConverged, records: list[dict[str, Any]], folder: Path) -> str:
+    level = len(records) if failure.level is None else failure.level
+    return f"stopped on level {level}: {failure.reason}\n{_kept(records, folder)}"
+
+
+def _kept(records: list[dict[str, Any]], folder: Path) -> str:
+    if not records:
+        return "no level was finished, nothing was written"
+    if len(records) == 1:
+        return f"level 0 is finished and kept in {folder}"
+    return f"levels 0 to {len(records) - 1} are finished and kept in {folder}"
 
 
 @contextmanager

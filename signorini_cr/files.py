@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import tempfile
@@ -52,7 +53,8 @@ def check_writable(
         except OSError as error:  # a name that is too long, for one
             raise InputError(f"cannot write to {path}: {error.strerror}") from error
         try:  # permissions don't tell all, of /proc for one
-            os.rmdir(tempfile.mkdtemp(prefix=STAGE, dir=anchor))
+            _clear(anchor)
+            _leave(*_enter(anchor))
         except OSError as error:
             raise InputError(
                 f"cannot write to {path}: {anchor} is not writable ({error.strerror})"
@@ -72,11 +74,14 @@ def write_files(
 ) -> None:
     """Put files into a folder: all of them or, if a writer raises, none.
 
-    They are written into a hidden folder on the same file system and renamed into place.
+    They are written into a hidden folder on the same file system and renamed into place. Where the
+    process is killed before it has taken that folder away, the next `check_writable` does.
 
     Args:
         folder: Made if it is not there. Other files in it are left alone.
-        writers: What writes the file of each name to the path that it is given.
+        writers: What writes the file of each name to the path that it is given. The first file
+            vouches for the others: it goes before any of `removed` and comes last, so that
+            wherever it is found, there is nothing of a former run beside it.
         removed: Names that shall not be there afterwards unless they are among `writers`.
         comm: The ranks that take part; all must call.
 
@@ -85,17 +90,25 @@ def write_files(
     """
     path = Path(folder)
 
+    held: list[int] = []
+
     def prepare() -> str:
         with disk_errors(path):
-            return tempfile.mkdtemp(prefix=STAGE, dir=_nearest(path))
+            stage, lock = _enter(_nearest(path))
+        held.append(lock)
+        return str(stage)
 
     def publish() -> None:
+        first, *others = writers
+        obsolete = [path / name for name in set(removed) - set(writers)]
         with disk_errors(path):
             path.mkdir(parents=True, exist_ok=True)
-            for name in writers:
+            if any(map(os.path.lexists, obsolete)):
+                (path / first).unlink(missing_ok=True)
+                for each in obsolete:
+                    each.unlink(missing_ok=True)
+            for name in (*others, first):
                 os.replace(stage / name, path / name)
-            for name in set(removed) - set(writers):
-                (path / name).unlink(missing_ok=True)
 
     stage = Path(on_root(comm, prepare))
     try:
@@ -104,7 +117,44 @@ def write_files(
         on_root(comm, publish)
     finally:
         if comm.rank == 0:
+            _leave(stage, *held)
+
+
+def _enter(folder: Path) -> tuple[Path, int]:
+    """Make a hidden folder, and the lock that says that its process is alive."""
+    while True:
+        stage = Path(tempfile.mkdtemp(prefix=STAGE, dir=folder))
+        lock = os.open(stage, os.O_RDONLY)
+        _locks(lock)
+        if stage.exists():  # another run can take it away before it is locked
+            return stage, lock
+        os.close(lock)
+
+
+def _leave(stage: Path, lock: int) -> None:
+    shutil.rmtree(stage, ignore_errors=True)
+    os.close(lock)
+
+
+def _locks(lock: int) -> bool:
+    """Lock a folder unless another process holds it or the file system knows no locks."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _clear(folder: Path) -> None:
+    """Remove the hidden folders that processes which were killed have left behind."""
+    for stage in folder.glob(STAGE + "*"):
+        try:
+            lock = os.open(stage, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:  # not ours, or gone meanwhile
+            continue
+        if _locks(lock):
             shutil.rmtree(stage, ignore_errors=True)
+        os.close(lock)
 
 
 def write_text(path: Path, make: Callable[[], str]) -> None:

@@ -1,19 +1,24 @@
-"""What needs gmsh: triangulating polygons and reading mesh files, on one rank, into arrays.
+"""Triangulating polygons with gmsh, and taking what gmsh has written, on one rank, into arrays.
 
 gmsh is loaded on first use, so a mesh of the user's own works without it.
 """
 
 from __future__ import annotations
 
+import difflib
+import signal
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from signorini_cr import mshfile
 from signorini_cr.errors import InputError
+from signorini_cr.mshfile import KINDS, MshFile
+from signorini_cr.planar import overlap, pieces
 
 _MOST_TRIANGLES = 2e7
 _MOST_FACETS = 1e5  # on the boundary
@@ -53,14 +58,26 @@ class Triangulation(NamedTuple):
     labels: npt.NDArray[np.int32]
 
 
+def _keep_sigpipe() -> None:
+    """Handle SIGPIPE as Python does again: under some gmsh a closed pipe ends the process."""
+    handler = signal.getsignal(signal.SIGPIPE)
+    if handler is not None:
+        with suppress(ValueError):  # not the main thread, whose business signals are
+            signal.signal(signal.SIGPIPE, handler)
+
+
 @contextmanager
 def _session() -> Iterator[Any]:
     """A silent gmsh with an empty model; a session of the user's own is left as it was."""
-    import gmsh
+    try:
+        import gmsh
+    except (ImportError, OSError) as error:  # the wheel wants libraries of the system
+        raise InputError(f"this needs gmsh, which cannot be loaded: {error}") from None
 
     ours = not gmsh.isInitialized()
     if ours:
         gmsh.initialize(argv=[], readConfigFiles=False, interruptible=False)
+        _keep_sigpipe()
         current = None
         before = {}
     else:
@@ -125,8 +142,10 @@ def triangulate(
         except Exception as error:
             raise InputError(f"gmsh could not triangulate the polygon: {error}") from error
         found = [_elements(gmsh, 1, _LINE, curve) for curve in curves]
+        tags, points, _ = gmsh.model.mesh.getNodes()
         return _compact(
-            gmsh,
+            tags,
+            points,
             _elements(gmsh, 2, _TRIANGLE),
             np.concatenate(found),
             np.repeat(labels, [len(ends) for ends in found]),
@@ -155,78 +174,102 @@ def read(path: Path, parts: dict[str, int]) -> Triangulation:
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
     """
-    _check_header(path)
-    with _session() as gmsh:
-        try:
-            gmsh.merge(str(path))
-        except UnicodeDecodeError:  # gmsh quotes what it could not read
-            raise InputError(f"{path}: damaged gmsh file") from None
-        except Exception as error:
-            raise InputError(f"{path}: gmsh cannot read it: {error}") from error
-        _check_cells(gmsh, path)
-        names = [
-            (tag, gmsh.model.getPhysicalName(dim, tag))
-            for dim, tag in gmsh.model.getPhysicalGroups(1)
-        ]
-        found: dict[str, list[npt.NDArray[np.int64]]] = {name: [] for name in parts}
-        for tag, name in names:
-            if (key := name.strip().lower()) in parts:
-                for curve in gmsh.model.getEntitiesForPhysicalGroup(1, tag):
-                    found[key].append(_elements(gmsh, 1, _LINE, curve))
-        for needed in ("contact", "dirichlet"):
-            if not sum(map(len, found[needed])):
-                there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
-                raise InputError(
-                    f"{path}: no physical curve is named {needed!r}; the physical curves there "
-                    f"are: {there}"
-                )
-        facets = np.concatenate([part for key in parts for part in found[key]])
-        labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])
-        raw = _compact(gmsh, _elements(gmsh, 2, _TRIANGLE), facets, labels)
+    file = mshfile.load(path)
+    _check_cells(file, path)
+    names = [(tag, file.names.get((1, tag), "")) for tag in file.groups(1)]
+    found: dict[str, list[npt.NDArray[np.int64]]] = {name: [] for name in parts}
+    others: dict[str, list[npt.NDArray[np.int64]]] = {}
+    for tag, name in names:
+        key = name.strip().lower()
+        group = found[key] if key in parts else others.setdefault(name or f"{tag}", [])
+        group.append(file.elements(_LINE, tag))
+    for needed in ("contact", "dirichlet"):
+        if not sum(map(len, found[needed])):
+            there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
+            raise InputError(
+                f"{path}: no physical curve is named {needed!r}; the physical curves there "
+                f"are: {there}"
+            )
+    facets = np.concatenate([part for key in parts for part in found[key]])
+    labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])
+    triangles = file.elements(_TRIANGLE)
+    raw = _compact(file.tags, file.points, triangles, facets, labels)
+    _check_names(triangles, facets, others, path, tuple(parts))
     _check_facets(raw, path, {label: name for name, label in parts.items()})
     return raw
 
 
-def _check_header(path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    before, mark, after = head.partition(b"$MeshFormat")
-    version = after.split(maxsplit=1)[0].decode("ascii", "replace") if after.split() else ""
-    if not mark or (before.strip() and not before.lstrip().startswith(b"$Comments")):
-        raise InputError(f"{path}: not a gmsh mesh file (formats 2.2 and 4.1 are read)")
-    if version.split(".")[0] not in ("2", "4"):
-        raise InputError(f"{path}: gmsh format {version}: formats 2.2 and 4.1 are read")
+def _check_names(
+    triangles: npt.NDArray[np.int64],
+    labelled: npt.NDArray[np.int64],
+    others: dict[str, list[npt.NDArray[np.int64]]],
+    path: Path,
+    allowed: Sequence[str],
+) -> None:
+    """Refuse physical curves of other names where they would become Neumann facets unasked.
+
+    They may lie inside the domain, and on facets that one of the allowed names has, too.
+
+    Args:
+        triangles: Node tags, shape (triangles, 3).
+        labelled: Node tags of the facets of allowed names, shape (facets, 2).
+        others: Node tags of the facets of each other name.
+        path: For the message.
+        allowed: The names.
+    """
+    curves = {name: np.concatenate(group) for name, group in others.items() if group}
+    if not curves:
+        return
+
+    def keys(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return ends.min(axis=-1) * (int(triangles.max()) + 1) + ends.max(axis=-1)
+
+    sides, cells = np.unique(keys(triangles[:, [[1, 2], [0, 2], [0, 1]]]), return_counts=True)
+    loose = np.setdiff1d(sides[cells == 1], keys(labelled))
+    for name, ends in curves.items():
+        number = np.count_nonzero(np.isin(keys(ends), loose))
+        if number:
+            near = [part for part in allowed if part in name.lower()]
+            near += difflib.get_close_matches(name.strip().lower(), allowed, n=1)
+            what = (
+                f"the physical curve {name!r}"
+                if not name.isdigit()
+                else (f"the physical curve with the number {name} and no name")
+            )
+            hint = f"did you mean {near[0]}? Allowed there" if near else "allowed there"
+            raise InputError(
+                f"{path}: {what} has {number} facets on the boundary; {hint} are"
+                f" {', '.join(allowed)}; a curve without a physical group is neumann"
+            )
 
 
-def _check_cells(gmsh: Any, path: Path) -> None:
+def _check_cells(file: MshFile, path: Path) -> None:
     """Insist on triangles in the x-y plane, with straight sides, and nothing else."""
-    kinds = gmsh.model.mesh.getElementTypes()
-    properties = [gmsh.model.mesh.getElementProperties(kind) for kind in kinds]
-    wrong = [p[0] for p in properties if p[1] == 3]
+    kinds = sorted({block.kind for block in file.blocks if len(block.nodes)})
+    properties = [(kind, *KINDS[kind][:2]) for kind in kinds]
+    wrong = [name for _, name, dim in properties if dim == 3]
     if wrong:
         raise InputError(f"{path}: a mesh in three dimensions ({wrong[0]}): a planar one is needed")
-    plane = [(kind, p[0]) for kind, p in zip(kinds, properties) if p[1] == 2]
+    plane = [(kind, name) for kind, name, dim in properties if dim == 2]
     if not plane:
         raise InputError(
             f"{path}: no triangles: gmsh saves what has a physical group, so that the surface "
             "needs one as soon as the curves have one"
         )
-    for kind, name in plane:
-        if kind != _TRIANGLE:
+    lines = [(kind, name) for kind, name, dim in properties if dim == 1]
+    for kind, name in plane + lines:
+        if kind not in (_TRIANGLE, _LINE):
             raise InputError(
                 f"{path}: it contains cells of the kind {name!r}: only straight-sided triangles "
                 "are possible"
             )
-    z = gmsh.model.mesh.getNodes()[1][2::3]
-    if np.ptp(z) > 0:
+    used = np.concatenate([block.nodes.ravel() for block in file.blocks])
+    if np.ptp(file.points[np.searchsorted(file.tags, used), 2]) > 0:
         raise InputError(f"{path}: the mesh does not lie in the x-y plane: z takes several values")
 
 
 def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None:
-    """Insist on labels of exterior facets, one each, and on a Dirichlet facet in every piece."""
+    """Insist on labels of exterior facets, one each, and on something that holds every piece."""
     count = len(raw.points)
     u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
     area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
@@ -264,9 +307,12 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
         )
     if cells.max() > 2:
         raise InputError(f"{path}: {cells.max()} triangles meet in one facet: at most 2 can")
+    piece = pieces(where, len(edges))
+    if (found := overlap(raw.points, raw.triangles, where, cells, piece)) is not None:
+        raise InputError(f"{path}: {found}")
+    holding = [number for number, name in names.items() if name in ("dirichlet", "contact")]
     fixed = np.zeros(len(edges), dtype=bool)
-    fixed[position[raw.labels == next(k for k, v in names.items() if v == "dirichlet")]] = True
-    piece = _pieces(where, len(edges))
+    fixed[position[np.isin(raw.labels, holding)]] = True
     held = np.zeros(len(raw.triangles), dtype=bool)
     held[piece[fixed[where].any(axis=1)]] = True
     loose = np.flatnonzero(~held[piece])
@@ -274,27 +320,8 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
         x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
         raise InputError(
             f"{path}: the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
-            "Dirichlet facet"
+            "Dirichlet facet and no contact facet"
         )
-
-
-def _pieces(sides: npt.NDArray[np.int64], edges: int) -> npt.NDArray[np.int64]:
-    """Number of the piece of every triangle: the lowest triangle it is connected with.
-
-    Args:
-        sides: Edges of every triangle, shape (triangles, 3).
-        edges: How many edges there are.
-    """
-    piece = np.arange(len(sides))
-    while True:
-        lowest = np.full(edges, len(sides))
-        np.minimum.at(lowest, sides, piece[:, None])
-        new = np.minimum(piece, lowest[sides].min(axis=1))
-        np.minimum.at(new, piece, new.copy())
-        new = new[new]
-        if np.array_equal(new, piece):
-            return piece
-        piece = new
 
 
 def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> npt.NDArray[np.int64]:
@@ -304,13 +331,13 @@ def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> npt.NDArray[n
 
 
 def _compact(
-    gmsh: Any,
+    tags: npt.NDArray[np.int64],
+    points: npt.NDArray[np.float64],
     triangles: npt.NDArray[np.int64],
     facets: npt.NDArray[np.int64],
     labels: npt.NDArray[np.int32],
 ) -> Triangulation:
     """Renumber gmsh's node tags from 0, leaving out the nodes of no triangle and of no facet."""
-    tags, points, _ = gmsh.model.mesh.getNodes()
     used = np.unique(np.concatenate([triangles.ravel(), facets.ravel()]))
     order = np.argsort(tags)
     rows = order[np.searchsorted(tags, used, sorter=order)]

@@ -1,12 +1,13 @@
 """What a run leaves behind: the report, the tables, the fields and the pictures.
 
 `level_record` turns a solution into numbers, `table_header` and `table_row` show them on a
-terminal, `write_output` fills a folder. Nothing here prints. Functions that take a solution
-or a communicator are collective: every rank calls them.
+terminal, `write_levels` keeps what is finished, `write_output` fills a folder. Nothing here prints.
+Functions that take a solution or a communicator are collective: every rank calls them.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import math
@@ -84,6 +85,7 @@ def level_record(
                 "min_pressure": kkt.min_pressure,
                 "complementarity": kkt.complementarity,
                 "residual": kkt.residual,
+                "force_error": kkt.force_error,
             },
             "contact": {
                 "facets": contact.number,
@@ -108,8 +110,18 @@ def level_record(
     )
 
 
-def make_report(title: str, element: str, comm: MPI.Comm, records: Sequence[Record]) -> Record:
-    """The whole of report.json from the records of its levels."""
+def make_report(
+    title: str, element: str, comm: MPI.Comm, records: Sequence[Record], complete: bool = True
+) -> Record:
+    """The whole of report.json from the records of its levels.
+
+    Args:
+        title: The problem's.
+        element: "CR" or "P1".
+        comm: The ranks that solved it.
+        records: From `level_record`, coarsest level first.
+        complete: Whether these are all the levels that were asked for.
+    """
     versions = {
         "signorini_cr": __version__,
         "dolfinx": dolfinx.__version__,
@@ -121,6 +133,7 @@ def make_report(title: str, element: str, comm: MPI.Comm, records: Sequence[Reco
         "element": element,
         "ranks": comm.size,
         "versions": versions,
+        "complete": complete,
         "levels": list(records),
     }
 
@@ -136,6 +149,30 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value
+
+
+def write_levels(folder: str | os.PathLike[str], report: Record, solution: Solution) -> list[str]:
+    """Write what costs next to nothing, so that it outlives whatever ends the run; collective.
+
+    These are the report, the tables, and contact.csv. Fields and pictures of a former run are
+    removed.
+
+    Args:
+        folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
+            touched.
+        report: From `make_report`.
+        solution: The finest level so far.
+
+    Returns:
+        The names of the files written.
+
+    Raises:
+        InputError: The folder can't be written to.
+    """
+    comm = solution.domain.mesh.comm
+    writers = _texts(report, solution)
+    write_files(folder, writers, removed=FILES, comm=comm)
+    return list(writers)
 
 
 def write_output(
@@ -159,18 +196,8 @@ def write_output(
         InputError: The folder can't be written to.
     """
     comm, title, records = solution.domain.mesh.comm, report["title"], report["levels"]
-    table = solution.contact.table()
-
-    def text(make: Callable[[], str]) -> Writer:
-        return lambda path: on_root(comm, write_text, path, make)
-
-    writers: dict[str, Writer] = {
-        "report.json": text(lambda: report_json(report)),
-        "levels.csv": text(lambda: levels_csv(records)),
-        "levels.md": text(lambda: markdown_table(records)),
-        "contact.csv": text(lambda: contact_csv(table or {})),
-        "solution.vtu": lambda path: write_vtu(solution.u, path),
-    }
+    writers = _texts(report, solution)
+    writers["solution.vtu"] = lambda path: write_vtu(solution.u, path)
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
     if drawable and plots.can_draw(comm):
         writers["mesh.png"] = lambda path: plots.plot_mesh(solution.domain, path, title)
@@ -183,6 +210,22 @@ def write_output(
             )
     write_files(folder, writers, removed=FILES, comm=comm)
     return list(writers)
+
+
+def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
+    """The report, which vouches for what lies beside it, and the tables; collective."""
+    comm, records = solution.domain.mesh.comm, report["levels"]
+    table = solution.contact.table()
+
+    def text(make: Callable[[], str]) -> Writer:
+        return lambda path: on_root(comm, write_text, path, make)
+
+    return {
+        "report.json": text(lambda: report_json(report)),
+        "levels.csv": text(lambda: levels_csv(records)),
+        "levels.md": text(lambda: markdown_table(records)),
+        "contact.csv": text(lambda: contact_csv(table or {})),
+    }
 
 
 def report_json(report: Mapping[str, Any]) -> str:
@@ -209,6 +252,7 @@ def _rate(
     return math.log(value / before) / finer if finer else None
 
 
+@functools.cache  # looking takes longer than writing the report of a level
 def _version(package: str) -> str | None:
     """The installed version, None if it can't be told."""
     module = sys.modules.get(package)

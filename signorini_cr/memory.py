@@ -1,0 +1,30 @@
+"""Memory: how much of it there has been, and whether it was at an end."""
+
+from __future__ import annotations
+
+import errno
+import resource
+
+from petsc4py import PETSc
+
+_PETSC_ERR_MEM = 55
+_WORDS = ("std::bad_alloc", "Cannot allocate memory")
+
+
+def ran_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or what it was raised from, says that no memory is left."""
+    while error is not None:
+        if (
+            isinstance(error, MemoryError)
+            or (isinstance(error, PETSc.Error) and error.ierr == _PETSC_ERR_MEM)
+            or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+            or any(words in str(error) for words in _WORDS)
+        ):
+            return True
+        error = error.__cause__
+    return False
+
+
+def most_memory() -> float:
+    """The most memory, in bytes, that this process has held at a time."""
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

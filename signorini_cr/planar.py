@@ -1,0 +1,205 @@
+"""Whether triangles lie side by side in the plane: none over another, no vertex inside a side.
+
+Take all triangles counterclockwise. Where two share a side they must run through it in opposite
+directions, and around a vertex they must not overlap. Then a point is covered as often as the
+boundary winds around it. If no two sides of the boundary cross or run along each other, each of its
+loops is simple, and winds once around what lies in it: to the left the outer one of each piece, and
+to the right all others, as the angles along the boundary add up to 2π times the Euler
+characteristic. So a piece covers no point twice, and pieces must not lie on one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_NEAR = 1e-12
+"""Distance from a line, in parts of the lengths at hand, that counts as none."""
+
+_DIRECTION = np.array([0.8090, 0.5878])
+"""In which sides are ordered; few domains have many sides across it."""
+
+_AT_A_TIME = 1_000_000
+"""Pairs of sides looked at together."""
+
+
+def overlap(
+    points: FloatArray, triangles: IntArray, sides: IntArray, count: IntArray, piece: IntArray
+) -> str | None:
+    """Say where triangles overlap or do not meet side to side, if they do.
+
+    Args:
+        points: Coordinates, shape (points, 2).
+        triangles: Corners, each triangle with an area, shape (triangles, 3).
+        sides: Number of the side opposite each corner, shape (triangles, 3).
+        count: How many triangles, one or two, have the side, shape (sides,).
+        piece: Which of the pieces that hang together by sides the triangle belongs to, shape
+            (triangles,).
+    """
+    u, v = np.diff(points[triangles], axis=1).swapaxes(0, 1)
+    turned = u[:, 0] * v[:, 1] < u[:, 1] * v[:, 0]
+    ends = triangles[:, [[1, 2], [2, 0], [0, 1]]]
+    up = (ends[:, :, 0] < ends[:, :, 1]) != turned[:, None]
+    ups = np.bincount(sides.ravel(), up.ravel(), len(count))
+    alike = ((count == 2) & (ups != 1))[sides]
+    if alike.any():
+        a, b = points[ends[alike][0]]
+        return f"triangles overlap at the facet from {_point(a)} to {_point(b)}"
+    angles = np.bincount(triangles.ravel(), _angles(points[triangles]).ravel(), len(points))
+    if len(bad := np.flatnonzero(angles > 2 * np.pi + 1e-6)):
+        return f"triangles overlap around {_point(points[bad[0]])}"
+    outer = count[sides] == 1
+    rim = np.where(turned[:, None, None], ends[:, :, ::-1], ends)[outer]
+    owner = np.broadcast_to(piece[:, None], sides.shape)[outer]
+    ccw = np.where(turned[:, None], triangles[:, ::-1], triangles)
+    for vertex in np.flatnonzero(np.bincount(rim[:, 0], minlength=len(points)) > 1):
+        if _crowded(points, ccw, vertex):
+            return f"triangles overlap around {_point(points[vertex])}"
+    return _crossing(points, rim) or _nested(points, triangles, piece, rim, owner)
+
+
+def _angles(corners: FloatArray) -> FloatArray:
+    """The angle at each corner of triangles, shape (triangles, 3)."""
+    u, v = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    cross = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return np.arctan2(np.abs(cross), (u * v).sum(axis=-1))
+
+
+def _crowded(points: FloatArray, ccw: IntArray, vertex: int) -> bool:
+    """Whether two triangles that have a vertex in common overlap around it."""
+    cell, corner = np.nonzero(ccw == vertex)
+    first, last = points[ccw[cell, (corner + 1) % 3]], points[ccw[cell, (corner + 2) % 3]]
+    apex = np.broadcast_to(points[vertex], first.shape)
+    begin = np.stack([apex, first], axis=1)
+    for i in range(len(cell) - 1):
+        later = slice(i + 1, None)
+        one = np.broadcast_to(begin[i], begin[later].shape)
+        inside = (_turn(one, first[later]) >= 0) & (_turn(begin[later], last[i]) > 0)
+        around = (_turn(begin[later], first[i]) >= 0) & (_turn(one, last[later]) > 0)
+        if np.any(inside | around):
+            return True
+    return False
+
+
+def _crossing(points: FloatArray, sides: IntArray) -> str | None:
+    """Say which two sides of the boundary cross, touch or run along each other, if any do."""
+    for i, j in _close(points[sides] @ _DIRECTION):
+        one, two = points[sides[i]], points[sides[j]]  # shape (pairs, 2 ends, 2)
+        faults = [
+            (_cross(one, two), "crosses", one, two),
+            (_run_along(one, two), "overlaps", one, two),
+            (_touched(one, two), "ends in", two, one),
+            (_touched(two, one), "ends in", one, two),
+        ]
+        for found, word, first, second in faults:
+            if len(k := np.flatnonzero(found)):
+                return (
+                    f"the facet {_side(first[k[0]])} {word} that {_side(second[k[0]])}: facets may"
+                    " meet at their ends only"
+                )
+    return None
+
+
+def _close(along: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of sides of which neither lies before the other.
+
+    Args:
+        along: Position of the ends of every side, shape (sides, 2).
+    """
+    low, high = along.min(axis=1), along.max(axis=1)
+    order = np.argsort(low)
+    last = np.searchsorted(low[order], high[order], side="right")
+    count = last - np.arange(len(order)) - 1
+    begin, total = 0, np.cumsum(count)
+    while begin < len(order):
+        done = total[begin - 1] if begin else 0
+        end = max(begin + 1, int(np.searchsorted(total, done + _AT_A_TIME, side="right")))
+        first = np.repeat(np.arange(begin, end), count[begin:end])
+        offset = np.arange(len(first)) - np.repeat(
+            total[begin:end] - count[begin:end] - done, count[begin:end]
+        )
+        yield order[first], order[first + 1 + offset]
+        begin = end
+
+
+def _turn(side: FloatArray, x: FloatArray) -> FloatArray:
+    """On which side of a line a point lies: 1 left, -1 right, 0 on it; shape (pairs,)."""
+    u, v = side[:, 1] - side[:, 0], x - side[:, 0]
+    left, right = u[:, 0] * v[:, 1], u[:, 1] * v[:, 0]
+    scale = np.abs(left) + np.abs(right) + np.hypot(*u.T) * np.hypot(*v.T)
+    return np.where(np.abs(left - right) > _NEAR * scale, np.sign(left - right), 0.0)
+
+
+def _cross(one: FloatArray, two: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether two sides have a point inside both in common, and no more."""
+    return (_turn(one, two[:, 0]) * _turn(one, two[:, 1]) < 0) & (
+        _turn(two, one[:, 0]) * _turn(two, one[:, 1]) < 0
+    )
+
+
+def _touched(side: FloatArray, other: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether an end of the other lies inside the side."""
+    u = side[:, 1] - side[:, 0]
+    length = np.hypot(*u.T)
+    found = np.zeros(len(side), dtype=bool)
+    for end in (0, 1):
+        t = ((other[:, end] - side[:, 0]) * u).sum(axis=1) / length**2
+        x = side[:, 0] + t[:, None] * u
+        on = np.hypot(*(x - other[:, end]).T) <= _NEAR * length
+        found |= on & (t > 1e-6) & (t < 1 - 1e-6)
+    return found
+
+
+def _run_along(one: FloatArray, two: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether two sides are the same and have the mesh on the same hand."""
+    length = np.hypot(*(one[:, 1] - one[:, 0]).T)
+    return (np.hypot(*(one - two).transpose(2, 0, 1)) <= _NEAR * length[:, None]).all(axis=1)
+
+
+def _nested(
+    points: FloatArray, triangles: IntArray, piece: IntArray, sides: IntArray, owner: IntArray
+) -> str | None:
+    """Say which piece of the mesh lies on another one, if any does."""
+    pieces = np.unique(piece)
+    a, b = points[sides[:, 0]], points[sides[:, 1]]
+    for number in pieces if len(pieces) > 1 else ():
+        x = points[triangles[number]].mean(axis=0)
+        spans = ((a[:, 1] > x[1]) != (b[:, 1] > x[1])) & (owner != number)
+        p, q = a[spans], b[spans]
+        hit = p[:, 0] + (x[1] - p[:, 1]) / (q[:, 1] - p[:, 1]) * (q[:, 0] - p[:, 0])
+        right = owner[spans][hit > x[0]]
+        if np.any(np.bincount(right) % 2):
+            return f"a piece of the mesh lies on another one at {_point(x)}"
+    return None
+
+
+def _point(x: FloatArray) -> str:
+    return f"({x[0]:g}, {x[1]:g})"
+
+
+def _side(ends: FloatArray) -> str:
+    return f"from {_point(ends[0])} to {_point(ends[1])}"
+
+
+def pieces(sides: npt.NDArray[np.integer], edges: int) -> npt.NDArray[np.int64]:
+    """Number of the piece of every cell: the lowest cell it is connected with.
+
+    Args:
+        sides: What connects cells, edges as a rule, of every cell, shape (cells, n).
+        edges: How many of them there are.
+    """
+    piece = np.arange(len(sides))
+    while True:
+        lowest = np.full(edges, len(sides))
+        np.minimum.at(lowest, sides, piece[:, None])
+        new = np.minimum(piece, lowest[sides].min(axis=1, initial=len(sides)))
+        np.minimum.at(new, piece, new.copy())
+        new = new[new]
+        if np.array_equal(new, piece):
+            return piece
+        piece = new

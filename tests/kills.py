@@ -1,0 +1,201 @@
+"""Runs that are ended from outside, each from a seed, and a look at what they leave.
+
+    container/run python3 tests/kills.py --count 60 --seed 0
+
+prints for each kind of end how many runs there were and with which status they ended, and the seeds
+of those that left anything but whole files of one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from signorini_cr.files import STAGE, check_writable
+from signorini_cr.output import FILES
+
+CASE = """[domain]
+vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
+boundary = ["contact", "dirichlet", "dirichlet", "dirichlet"]
+size = 0.25
+[data]
+f = -3
+obstacle = "0.1*x - 0.2"
+[refine]
+levels = 9
+"""
+PATIENCE = 5.0
+"""Seconds until all processes of a run are gone."""
+
+
+class End(NamedTuple):
+    """How a run ended.
+
+    Attributes:
+        kind: Ranks, signal, and who got it.
+        status: Of mpirun or of the one process.
+        levels: How many levels the report has; -1 where the results of the former run are left.
+        faults: What should not have been.
+    """
+
+    kind: str
+    status: int
+    levels: int
+    faults: list[str]
+
+
+def family(pid: int) -> list[int]:
+    """A process and all its descendants."""
+    found = [pid]
+    for parent in found:
+        try:
+            for task in Path(f"/proc/{parent}/task").iterdir():
+                found += [int(word) for word in (task / "children").read_text().split()]
+        except OSError:
+            pass
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def ranks_of(pids: list[int]) -> list[int]:
+    """Those of the processes that run the command."""
+    found = []
+    for pid in pids:
+        try:
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"signorini_cr" in words and b"mpirun" not in words[0] and b"prte" not in words[0]:
+            found.append(pid)
+    return found
+
+
+def levels_in(out: Path) -> int:
+    """How many levels the report has."""
+    try:
+        return len(json.loads((out / "report.json").read_text())["levels"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
+
+
+def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
+    """Start a run, end it at a random moment, look around."""
+    random = np.random.default_rng(seed)
+    ranks = int(random.integers(1, most_ranks + 1))
+    number = signal.Signals(random.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
+    target = "one" if ranks == 1 else str(random.choice(["mpirun", "one rank", "all ranks"]))
+    moment = float(random.uniform(0, 3)) if random.random() < 0.3 else None
+    wanted, more = int(random.integers(1, 8)), float(random.uniform(0, 0.2))
+    out, case = folder / f"out-{seed}", folder / "case.toml"
+    case.write_text(CASE)
+    out.mkdir()
+    for name in FILES:
+        (out / name).write_text("former")
+    launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "PMI" not in k}
+    run = subprocess.Popen(
+        [*launch, sys.executable, "-m", "signorini_cr", "solve", str(case), "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=clean,
+        start_new_session=True,
+    )
+    began = time.monotonic()
+    while run.poll() is None and time.monotonic() - began < 60:
+        late = time.monotonic() - began > moment if moment is not None else False
+        if late or (moment is None and levels_in(out) >= wanted):
+            break
+        time.sleep(0.01)
+    time.sleep(more)
+    everyone = family(run.pid)
+    own = ranks_of(everyone)
+    hit = {"one rank": own[-1:], "all ranks": own}.get(target, [run.pid]) or [run.pid]
+    for pid in hit:
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            pass
+    sent, faults = time.monotonic(), []
+    while any(map(alive, everyone)) and time.monotonic() - sent < PATIENCE:
+        time.sleep(0.01)
+    for pid in filter(alive, everyone):
+        what = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+        faults.append(f"process {pid} is still there: {what}")
+        os.kill(pid, signal.SIGKILL)
+    said = run.communicate(timeout=30)[0]
+    if number == signal.SIGINT and target != "mpirun" and "Traceback" in said and own:
+        faults.append(f"traceback: {said[-600:]}")
+    levels, more_faults = _left(out)
+    return End(f"{ranks} {number.name} {target}", run.returncode, levels, faults + more_faults)
+
+
+def _left(out: Path) -> tuple[int, list[str]]:
+    """How many levels are kept, and what is wrong with the folder."""
+    faults = []
+    check_writable(out)  # as the next run does
+    there = {path.name for path in out.iterdir()}
+    if strange := sorted(there - set(FILES)):
+        faults.append(f"left over: {strange}")
+    if any(path.name.startswith(STAGE) for path in out.parent.iterdir()):
+        faults.append("left over beside the folder")
+    former = {name for name in there & set(FILES) if (out / name).read_bytes() == b"former"}
+    if former == set(FILES):
+        return -1, faults
+    if former and "report.json" in there:
+        faults.append(f"of a former run: {sorted(former)}")
+    if "report.json" not in there:
+        return 0, [*faults, "no report"]
+    report = json.loads((out / "report.json").read_text())
+    with (out / "levels.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    if not len(report["levels"]) <= len(rows) <= len(report["levels"]) + 1:
+        faults.append(f"{len(report['levels'])} levels in the report, {len(rows)} in the table")
+    if (out / "solution.vtu").exists() and not report["complete"]:
+        faults.append("a field beside a report that is not complete")
+    return len(report["levels"]), faults
+
+
+def main() -> None:
+    """Count the ends and show those that are wrong."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ranks", type=int, default=2, help="most ranks of a run")
+    arguments = parser.parse_args()
+    counts: Counter[tuple[str, int]] = Counter()
+    wrong = kept = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in range(arguments.seed, arguments.seed + arguments.count):
+            end = killed(Path(folder), seed, arguments.ranks)
+            counts[end.kind, end.status] += 1
+            kept += end.levels > 0
+            if end.faults:
+                wrong += 1
+                print(f"seed {seed} ({end.kind}): {'; '.join(end.faults)}", flush=True)
+    for (kind, status), count in sorted(counts.items()):
+        print(f"{kind:24} status {status:4} {count:5}")
+    print(f"{arguments.count} runs, {kept} with levels kept, {wrong} wrong")
+
+
+if __name__ == "__main__":
+    main()

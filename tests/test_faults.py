@@ -1,0 +1,191 @@
+"""What is left where a run is ended from outside, or by lack of memory."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import kills
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from test_cli import process
+
+from signorini_cr import cli, files
+from signorini_cr.errors import InputError
+from signorini_cr.memory import ran_out_of_memory
+from signorini_cr.output import FILES
+
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("seed", [0, 3, 9])
+def test_a_run_that_is_ended_leaves_whole_files_of_one_run(seed: int, tmp_path: Path) -> None:
+    """Seeds of one and two ranks; `python3 tests/kills.py` has as many as one likes."""
+    end = kills.killed(tmp_path, seed)
+    assert end.faults == [], f"{end.kind}: {end.faults}"
+    one = end.kind.startswith("1 ")
+    assert end.status in ((130, -2, -9, -15, 0) if one else (1, 130, 137, 143, -2, -9, -15, 0))
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from signorini_cr import cli
+line, rows = cli.Screen.line, []
+
+def limited(self, text):
+    line(self, text)
+    rows.append(text)
+    if len(rows) == 4 and (LONE_RANK is None or self.root == (LONE_RANK == 0)):
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        most = pages * resource.getpagesize() + 20_000_000
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+cli.Screen.line = limited
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks, lone", [(1, None), (2, 1)])
+def test_where_memory_ends_the_levels_before_are_kept(ranks, lone, tmp_path: Path) -> None:
+    """The limit comes after level 2, and bites when the arrays have become large enough."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    (tmp_path / "run.py").write_text(LIMITED.replace("LONE_RANK", repr(lone)))
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = process(*argv, ranks=ranks, program=[tmp_path / "run.py"])
+    assert done.returncode == cli.NOT_CONVERGED, done.stderr
+    words = " ".join(done.stderr.split())
+    level = int(words.split("stopped on level ")[1].split(":")[0])
+    assert level >= 3
+    assert f"stopped on level {level}: out of memory, of which this process has had 0." in words
+    assert f"levels 0 to {level - 1} are finished and kept in" in words
+    assert "Traceback" not in done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [each["level"] for each in report["levels"]] == list(range(level))
+    assert report["complete"] is False
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"report.json", "levels.csv", "levels.md", "contact.csv"}
+
+
+def test_errors_that_mean_memory() -> None:
+    for error in (MemoryError(), PETSc.Error(55), OSError(12, "Cannot allocate memory")):
+        assert ran_out_of_memory(error)
+    assert not ran_out_of_memory(PETSc.Error(71))
+    wrapped = RuntimeError("in a callback")
+    wrapped.__cause__ = MemoryError()
+    assert ran_out_of_memory(wrapped)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 1000  # kB, as memory.py has it
+
+
+def test_the_report_goes_first_and_comes_last(shared_tmp_path: Path, monkeypatch) -> None:
+    """So that wherever it is found, nothing of a former run is beside it."""
+    seen: list[set[str]] = []
+    replace, unlink = os.replace, Path.unlink
+
+    def look(path: Path) -> None:
+        seen.append({each.name for each in path.iterdir() if each.is_file()})
+
+    def replaced(source: Path, target: Path) -> None:
+        replace(source, target)
+        look(Path(target).parent)
+
+    def unlinked(path: Path, *args: bool, **kwargs: bool) -> None:
+        unlink(path, *args, **kwargs)
+        look(path.parent)
+
+    if COMM.rank == 0:
+        for name in FILES:
+            (shared_tmp_path / name).write_text("former")
+    COMM.Barrier()
+    monkeypatch.setattr(os, "replace", replaced)
+    monkeypatch.setattr(Path, "unlink", unlinked)
+
+    def write(path: Path) -> None:
+        if COMM.rank == 0:
+            path.write_text("new")
+
+    names = ["report.json", "levels.csv", "levels.md"]
+    files.write_files(shared_tmp_path, dict.fromkeys(names, write), removed=FILES)
+    if COMM.rank == 0:
+        assert [("report.json" in there) for there in seen] == [False] * (len(seen) - 1) + [True]
+        assert seen[-1] == set(names)
+        assert all((shared_tmp_path / name).read_text() == "new" for name in names)
+
+
+@pytest.mark.serial
+def test_what_a_killed_run_leaves_the_next_one_removes(tmp_path: Path) -> None:
+    """But not what a living one is writing, nor anything else that is hidden."""
+    stale, alien = tmp_path / (files.STAGE + "stale"), tmp_path / ".signorini"
+    stale.mkdir()
+    (stale / "solution.vtu").write_text("half")
+    alien.mkdir()
+    program = (
+        "import sys, time\nfrom pathlib import Path\nfrom signorini_cr.files import _enter\n"
+        f"print(_enter(Path({str(tmp_path)!r}))[0], flush=True)\ntime.sleep(60)"
+    )
+    other = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert other.stdout is not None
+    living = Path(other.stdout.readline().strip())
+    files.check_writable(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted([alien, living])
+    other.send_signal(signal.SIGKILL)
+    other.communicate()
+    files.check_writable(tmp_path)
+    assert list(tmp_path.iterdir()) == [alien]
+
+
+def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypatch) -> None:
+    from signorini_cr import output
+
+    (shared_tmp_path / "case.toml").write_text(kills.CASE.replace("9", "3"))
+    COMM.Barrier()
+    write_levels = output.write_levels
+
+    def full(folder, report, solution):
+        if len(report["levels"]) > 2:
+            raise InputError("cannot write levels.csv: No space left on device")
+        return write_levels(folder, report, solution)
+
+    monkeypatch.setattr(output, "write_levels", full)
+    out = shared_tmp_path / "out"
+    argv = ["solve", str(shared_tmp_path / "case.toml"), "--out", str(out), "-q"]
+    assert cli.main(argv) == cli.BAD_INPUT
+    COMM.Barrier()
+    assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
+
+
+@pytest.mark.serial
+def test_an_interruption_inside_a_callback_is_one(tmp_path: Path, monkeypatch, capsys) -> None:
+    """In the midst of PETSc, which makes an error of its own of it; two levels are done."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    step = cli.Screen.step
+
+    def interrupted(self: cli.Screen, text: str) -> None:
+        step(self, text)
+        if "level 2" in text:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(cli.Screen, "step", interrupted)
+    out = tmp_path / "out"
+    status = cli.main(["solve", str(tmp_path / "case.toml"), "--out", str(out), "-q"])
+    words = " ".join(capsys.readouterr().err.split())
+    assert status == cli.INTERRUPTED
+    assert words == f"signorini-cr: interrupted; levels 0 to 1 are finished and kept in {out}"
+    assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.serial
+def test_a_rank_without_the_others_does_not_solve_alone(tmp_path: Path, monkeypatch) -> None:
+    """As where mpirun was killed while the ranks were starting, or belongs to another MPI."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    monkeypatch.setenv("PMI_SIZE", "2")
+    status = cli.main(["solve", str(tmp_path / "case.toml"), "--out", str(tmp_path / "out")])
+    assert status == cli.BAD_INPUT
+    assert not (tmp_path / "out").exists()
