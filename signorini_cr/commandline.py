@@ -22,8 +22,9 @@ PETSC_NOTE = (
     " (-options_left shows those that nothing used)."
 )
 EXIT_NOTE = (
-    "Exit status: 0 solved, every level converged; 2 bad input, nothing written; 3 not converged or"
-    " stopped by a limit, the levels finished before are kept."
+    "Exit status: 0 solved, every level converged; 2 bad input, nothing written; 3 not converged,"
+    " out of memory, or stopped by a limit; 130 interrupted; 143 terminated. Report and tables of a"
+    " level are kept as soon as it is finished, whatever ends the run then."
 )
 
 
@@ -216,6 +217,24 @@ def launched() -> tuple[int, int]:
             number = os.environ.get(size, "")
             return int(os.environ[rank]), int(number) if number.isdigit() else 1
     return 0, 1
+
+
+def left_alone(size: int) -> str | None:
+    """Say so where a launcher has started more processes than MPI knows of.
+
+    Each would solve the whole problem, and all would write into the same folder.
+
+    Args:
+        size: How many MPI knows of.
+    """
+    for variable in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE"):  # Slurm's is set without srun, too
+        number = os.environ.get(variable, "")
+        if number.isdigit() and int(number) > size:
+            return (
+                f"launched as one of {number} processes, but MPI knows of {size}: mpirun belongs"
+                " to another MPI than mpi4py, or has ended"
+            )
+    return None
 
 
 def wait_for_all() -> None:

@@ -12,10 +12,9 @@ from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
 from .domain import CONTACT, DIRICHLET, NEUMANN, Domain, part_name
 from .errors import InputError
-from .expressions import Expression, parse
+from .expressions import Expression
 
 Array = npt.NDArray[np.float64]
-_ZERO = parse("0")
 
 USED_ON: dict[str, int | None] = {
     "data.coefficient": None,
@@ -69,37 +68,6 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     )
 
 
-def check_meeting_points(expressions: Mapping[str, Expression], domain: Domain) -> None:
-    """Insist on α ≤ u_D where Γ0 meets Γ1, or else K would be empty; collective.
-
-    Args:
-        expressions: The data by key; what is left out is 0, or comes from ``exact.u``.
-        domain: Mesh and boundary parts.
-
-    Raises:
-        InputError: The message names the point and both values.
-    """
-    comm = domain.mesh.comm
-    u_D = expressions.get("data.dirichlet", expressions.get("exact.u", _ZERO))
-    alpha = expressions.get("data.obstacle", _ZERO)
-    facets, fixed = domain.facets(CONTACT), domain.facets(DIRICHLET)
-    nodes = _vertices(domain, facets)
-    others = comm.allgather(_global(domain, _vertices(domain, fixed)))
-    shared = nodes[np.isin(_global(domain, nodes), np.concatenate(others))]
-    points = domain.mesh.geometry.x[shared]
-    above, below = alpha.numpy(points), u_D.numpy(points)
-    on_contact = alpha.numpy(domain.mesh.geometry.x[nodes])
-    scale = max(comm.allgather(np.abs([*on_contact, *below]).max(initial=0.0)))
-    found = np.column_stack([points[:, :2], above, below])[above - below > 1e-9 * scale]
-    bad = min(comm.allgather(min(found.tolist(), default=[math.inf])))
-    if len(bad) > 1:
-        raise InputError(
-            f"data.obstacle: at {_point(bad[:2])}, where contact and dirichlet meet, the"
-            f" obstacle is {bad[2]:.10g} but the dirichlet value is only {bad[3]:.10g};"
-            " the obstacle must not be above it"
-        )
-
-
 def _points(domain: Domain, part: int | None, digits: int) -> Array:
     """Vertices and midpoints of the cells, or of the facets of one part, shape (n, 3).
 
@@ -124,10 +92,6 @@ def _vertices(domain: Domain, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.i
     if len(facets) == 0:
         return np.empty(0, dtype=np.int32)
     return np.unique(entities_to_geometry(mesh, mesh.topology.dim - 1, facets))
-
-
-def _global(domain: Domain, nodes: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-    return domain.mesh.geometry.index_map().local_to_global(nodes.astype(np.int32))
 
 
 def _point(x: Collection[float]) -> str:

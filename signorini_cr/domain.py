@@ -70,7 +70,9 @@ class Domain:
         """Take a mesh and facet tags of the user's own; collective.
 
         Exterior facets that are neither contact nor Dirichlet are Neumann facets, the weak
-        form's natural condition. Other values on interior facets are ignored.
+        form's natural condition. Other values on interior facets are ignored. Each contact
+        and Dirichlet value must be there; and where Neumann values are given, they must be all that
+        is left, but for facets without a tag or with the value 0.
 
         Args:
             mesh: Triangles or tetrahedra, straight-sided, any ghost mode.
@@ -81,7 +83,7 @@ class Domain:
 
         Raises:
             InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
-                another, or leave Γ0 or Γ1 empty.
+                another, are not all there, or leave Γ0 or Γ1 empty.
         """
         fdim = mesh.topology.dim - 1
         wanted = {
@@ -115,15 +117,25 @@ class Domain:
                     "inside the domain: only exterior facets can be tagged"
                 )
         raise_together(mesh.comm, complaint)
-        domain = cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
-        for part in (CONTACT, DIRICHLET):
-            if mesh.comm.allreduce(len(domain.facets(part))) == 0:
-                there = set().union(*mesh.comm.allgather(set(facet_tags.values.tolist())))
+        at = exterior[exterior < owned]
+        mine = set(facet_tags.values[np.isin(facet_tags.indices, at)].tolist())
+        there = set().union(*mesh.comm.allgather(mine))
+        known = {0}
+        for part, numbers in wanted.items():
+            known.update(int(value) for value in numbers)
+            missing = [int(value) for value in numbers if value not in there]
+            if part != NEUMANN and (missing or not len(numbers)):
                 raise InputError(
-                    f"no exterior facet is tagged {part_name(part)} (value {_list(wanted[part])}): "
-                    f"the values there are {_list(sorted(there))}"
+                    f"no exterior facet is tagged {part_name(part)} (value {_list(missing)}): the"
+                    f" values there are {_list(sorted(there))}"
                 )
-        return domain
+        if neumann is not None and (left := sorted(there - known)):
+            raise InputError(
+                f"exterior facets are tagged {_list(left)}, which stands for nothing: contact is"
+                f" {_list(wanted[CONTACT])}, dirichlet {_list(wanted[DIRICHLET])} and neumann"
+                f" {_list(wanted[NEUMANN])}"
+            )
+        return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
 
 
 def part_name(part: int) -> str:
@@ -201,6 +213,11 @@ class Polygon:
                     f"dirichlet part, found {_list(sorted(labels))}"
                 )
 
+    @property
+    def diameter(self) -> float:
+        """Largest distance between two points."""
+        return max(float(np.hypot(*(self.vertices - x).T).max()) for x in self.vertices)
+
     def mesh(self, size: float, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Triangulate with facets of about the length `size`; collective.
 
@@ -208,7 +225,7 @@ class Polygon:
         `size`. The same polygon and size give the same mesh.
 
         Args:
-            size: Facet length wanted.
+            size: Facet length wanted; from the diameter upwards, the mesh is as coarse as can be.
             comm: The ranks that share the mesh.
 
         Raises:
@@ -228,7 +245,8 @@ def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
     """Read a gmsh file (2.2 or 4.1, ASCII or binary) with named physical curves; collective.
 
     The physical curves named dirichlet, contact and neumann (in any case) are Γ0, Γ1 and Γg.
-    Exterior facets in none of them are Neumann facets, the weak form's natural condition.
+    Exterior facets in no physical curve are Neumann facets, the weak form's natural condition;
+    curves of other names may lie inside the domain.
 
     Args:
         path: A planar mesh of straight-sided triangles.

@@ -31,13 +31,14 @@ T = TypeVar("T")
 LONGEST = 10_000  # characters
 DEEPEST = 150  # levels of nesting
 LARGEST = 10_000  # operations, definitions included
-LONGEST_CHAIN = 500  # operations, each of which needs the one before
+LONGEST_CHAIN = 250  # operations, each of which needs the one before; at 500 UFL 2026.1 gives up
 PLAIN = 40  # levels that are no matter to UFL, which walks down them by recursion
 FRAMES = 40  # of Python that a level takes at most
 
 RESERVED = frozenset((*VARIABLES, *CONSTANTS, *FUNCTIONS))
 
 _ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
+_BY_PAIRS = {ast.Add: "+", ast.Sub: "+", ast.Mult: "*"}
 _COMPARISONS = {
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
 }  # fmt: skip
@@ -107,7 +108,7 @@ def parse(
 
 
 _Term: TypeAlias = tuple[ast.BinOp, bool, Node]
-"""A term of a sum: where it is added, whether it is not subtracted, and its value."""
+"""A term or a factor: where it is joined, whether it is not subtracted, and its value."""
 
 
 class _Reader:
@@ -236,33 +237,35 @@ class _Reader:
             chain.append(first)
             first = first.left
         left = self.number(first, depth)
-        terms: list[tuple[ast.BinOp, Node]] = []  # of a sum that left is the first term of
+        run: list[_Term] = []  # of a sum or a product that left is the first of
+        joined_by = ""
         for link in reversed(chain):
             right = self.number(link.right, depth)
-            if isinstance(link.op, ast.Add | ast.Sub):
-                terms.append((link, right))
+            op = _BY_PAIRS.get(type(link.op), "")
+            if op != joined_by:
+                left, run, joined_by = self.balanced(joined_by, left, run), [], op
+            if op:
+                run.append((link, not isinstance(link.op, ast.Sub), right))
                 continue
-            left, terms = self.sum(left, terms), []
             if isinstance(link.op, ast.Div) and is_constant(right, 0.0):
                 self.reject(link, "this divides by zero")
             if isinstance(link.op, ast.Pow) and left.op == "const" and right.op != "const":
                 if left.args[0] <= 0.0:
                     self.reject(link, "with a varying exponent, the base must be above 0")
             left = self.finite(link, operation(_ARITHMETIC[type(link.op)], left, right))
-        return self.sum(left, terms)
+        return self.balanced(joined_by, left, run)
 
-    def sum(self, first: Node, terms: list[tuple[ast.BinOp, Node]]) -> Node:
-        """Add up by pairs: a - b + c - d is (a - b) + (c - d), so that long sums are not deep."""
-        if not terms:
+    def balanced(self, op: str, first: Node, others: list[_Term]) -> Node:
+        """Join by pairs: a - b + c - d is (a - b) + (c - d), so that what is long is not deep."""
+        if not others:
             return first
-        signed = [(terms[0][0], True, first)]  # the first one's link is never looked at
-        signed += [(link, isinstance(link.op, ast.Add), node) for link, node in terms]
 
         def both(one: _Term, two: _Term) -> _Term:
-            op = "+" if one[1] == two[1] else "-"
-            return one[0], one[1], self.finite(two[0], operation(op, one[2], two[2]))
+            joined = operation(op if one[1] == two[1] else "-", one[2], two[2])
+            return one[0], one[1], self.finite(two[0], joined)
 
-        return _by_pairs(signed, both)[2]
+        # The first one's link is never looked at
+        return _by_pairs([(others[0][0], True, first), *others], both)[2]
 
     def compare(self, tree: ast.Compare, depth: int) -> Node:
         values = [self.number(part, depth) for part in (tree.left, *tree.comparators)]

@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from petsc4py import PETSc
 
 from .errors import InputError
+from .memory import ran_out_of_memory
 
 PREFIX = "signorini_"
 """Prefix of the PETSc options that reach the solver, as in ``-signorini_snes_atol 1e-12``."""
 
 NO_INODES = {"mat_no_inode": None}
 """PETSc joins neighbouring rows of the same pattern, which takes time to look for; few have it."""
-
 
 AMG = PETSc.PC.Type.HYPRE if PETSc.Sys.hasExternalPackage("hypre") else PETSc.PC.Type.GAMG
 """Algebraic multigrid: hypre's BoomerAMG, or PETSc's own where it was built without hypre."""
@@ -67,7 +67,7 @@ def explained() -> Iterator[None]:
         if not isinstance(origin, PETSc.Error):
             raise origin from origin.__cause__
         options = PETSc.Options(PREFIX).getAll()
-        if not options:
+        if not options or ran_out_of_memory(error):
             raise
         given = ", ".join(f"-{PREFIX}{name} {value}".rstrip() for name, value in options.items())
         raise InputError(f"PETSc can't solve with {given}: {_words(origin)}") from error

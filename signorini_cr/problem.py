@@ -155,6 +155,7 @@ class Forms:
         self.g = given(problem.g, lambda: ufl.dot(flux, n))
         boundary = self.exact if problem.dirichlet is None else problem.dirichlet
         self.dirichlet = as_expression(0.0 if boundary is None else boundary, self.x)
+        self.source = "exact.u" if boundary is self.exact is not None else "data.dirichlet"
         self.obstacle = as_expression(problem.obstacle, self.x)
         d = mesh.geometry.dim
         for key, data in self._data.items():

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from .datacheck import USED_ON, check_meeting_points, check_values
+from .admissible import check_data
+from .consistency import doubts
+from .datacheck import USED_ON, check_values
 from .domain import PARTS, Domain, Polygon, read_gmsh
 from .errors import InputError, on_root
 from .expressions import Expression, check_name, parse
@@ -34,7 +36,7 @@ from .keys import (
     string,
     whole,
 )
-from .problem import Problem
+from .problem import Forms, Problem
 
 KEYS = {
     "domain": ("vertices", "boundary", "size", "holes", "mesh"),
@@ -90,16 +92,19 @@ class ProblemFile:
         except InputError as error:
             raise InputError(f"{self.path}: {key}: {error}") from None
 
-    def check(self, domain: Domain) -> None:
+    def check(self, domain: Domain) -> list[str]:
         """Try the data out on the coarsest mesh; collective.
 
         Args:
             domain: From :meth:`mesh`.
 
+        Returns:
+            What contradicts itself in data that can be solved with, a sentence each.
+
         Raises:
             InputError: An expression is not finite where it is needed, the coefficient is not
-                positive, the obstacle lies above u_D where Γ0 meets Γ1, or the last mesh of the
-                sequence would be absurdly large.
+                positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, or the last mesh
+                of the sequence would be absurdly large.
         """
         topology = domain.mesh.topology
         cells = topology.index_map(topology.dim).size_global
@@ -107,7 +112,9 @@ class ProblemFile:
             if self.mode == "uniform":
                 _few_enough(self.levels, cells, topology.dim)
             check_values(self.expressions, domain)
-            check_meeting_points(self.expressions, domain)
+            forms = Forms(self.problem, domain.mesh)
+            check_data(forms, domain)
+            return doubts(forms, domain)
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from None
 
@@ -204,9 +211,14 @@ def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, flo
         outline = (polygon.vertices, polygon.boundary)
         polygon = named("domain.holes", Polygon, *outline, tuple(holes), rule=apart)
     named("domain.boundary", polygon.check_parts)
-    return polygon, get(
-        table, "domain", "size", positive, needed="a number above 0, the length of a facet,"
-    )
+    size = get(table, "domain", "size", positive, needed="a number above 0, the length of a facet,")
+    # From the longest edge on, facets grow inside only; none is longer than the diameter
+    if size > polygon.diameter * (1 + 1e-9):
+        raise InputError(
+            f"domain.size: {size:g} is longer than the domain, whose largest extent is"
+            f" {polygon.diameter:.6g}; the length of a facet is needed, no more than that"
+        )
+    return polygon, size
 
 
 def _polygon(table: Mapping[str, Any], section: str) -> Polygon:

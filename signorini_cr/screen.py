@@ -69,6 +69,11 @@ class Screen:
             self.flush()
             self._put(sys.stderr, wrapped(message, "signorini-cr: ") + "\n")
 
+    def warn(self, message: str) -> None:
+        """Say what is strange, but no reason to stop."""
+        if not self.quiet:
+            self.complain(f"warning: {message}")
+
     def flush(self) -> None:
         """Bring out what was printed, and take away the progress line."""
         self.clear()

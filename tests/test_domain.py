@@ -1,6 +1,7 @@
 """Polygons, gmsh files and users' own meshes: right lengths and areas, clear complaints."""
 
 import itertools
+import sys
 from pathlib import Path
 
 import basix.ufl
@@ -455,7 +456,7 @@ def test_own_tags(mode, neumann):
 
 def test_own_tags_by_several_values():
     mesh, tags = tagged_rectangle(dolfinx.mesh.GhostMode.none)
-    domain = Domain.from_tags(mesh, tags, contact=[7, 8], dirichlet=(5, 9))
+    domain = Domain.from_tags(mesh, tags, contact=[7], dirichlet=(5, 9))
     assert lengths(domain) == pytest.approx([2, 4, 0])
 
 
@@ -505,3 +506,9 @@ def test_own_surfaces_in_space():
     mesh.topology.create_entities(1)
     tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
     assert "3 dimensions" in fails_alike(lambda: Domain.from_tags(mesh, tags))
+
+
+def test_no_gmsh(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "gmsh", None)
+    with pytest.raises(InputError, match="this needs gmsh, which cannot be loaded: "):
+        Polygon([(0, 0), (1, 0), (0, 1)], ["contact", "dirichlet", "neumann"]).mesh(0.5)

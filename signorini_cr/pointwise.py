@@ -1,0 +1,223 @@
+"""Values of UFL expressions at points, each with a bound of what rounding may have done to it.
+
+The bound follows the operations (running error analysis): every one of them adds its own rounding
+to what its operands bring along, and the coordinates bring along what they are not known by. Where
+a value is the difference of large numbers, or belongs to a steep function, the bound says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from ufl import classes
+from ufl.algorithms import expand_indices
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
+from ufl.corealg.traversal import unique_post_traversal
+
+FloatArray = npt.NDArray[np.float64]
+Value: TypeAlias = tuple[Any, Any]
+"""A number and the bound of its error; of a condition, the truth and 0."""
+
+EPS = float(np.finfo(np.float64).eps)
+
+
+class _Unknown(Exception):
+    """An operator that is not known here."""
+
+
+def evaluate(
+    expression: ufl.core.expr.Expr,
+    points: FloatArray,
+    uncertainty: float = 0.0,
+    cells: npt.NDArray[np.int32] | None = None,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Evaluate an expression and bound the error of its values.
+
+    Args:
+        expression: A scalar, a vector or a matrix.
+        points: Coordinates, shape (n, 3).
+        uncertainty: By how much each coordinate may be wrong.
+        cells: Local cells that hold the points, for Functions, shape (n,).
+
+    Returns:
+        Values and bounds, shapes (n, *shape of the expression); None if there is an operator in the
+        expression that is not known here.
+    """
+    reader = _Reader(points, uncertainty, cells)
+    shape = (len(points), *expression.ufl_shape)
+    values, bounds = np.empty(shape), np.empty(shape)
+    with np.errstate(all="ignore"):
+        for index in np.ndindex(*expression.ufl_shape):
+            at: tuple[Any, ...] = (slice(None), *index)
+            component = expression[index] if index else expression
+            try:
+                try:
+                    found = reader.read(component)
+                except _Unknown:
+                    plain = apply_derivatives(apply_algebra_lowering(component))
+                    found = reader.read(expand_indices(plain))
+            except _Unknown:
+                return None
+            values[at], bounds[at] = found
+    return values, bounds
+
+
+class _Reader:
+    """The points and what is known of them."""
+
+    def __init__(
+        self, points: FloatArray, uncertainty: float, cells: npt.NDArray[np.int32] | None
+    ) -> None:
+        self.points, self.uncertainty, self.cells = points, uncertainty, cells
+
+    def read(self, expression: Any) -> Any:
+        values: dict[Any, Any] = {}
+        for node in unique_post_traversal(expression):
+            values[node] = self._node(node, [values[operand] for operand in node.ufl_operands])
+        return values[expression]
+
+    def _node(self, node: Any, operands: list[Any]) -> Any:
+        """A pair, a tuple of them for a vector, or a tuple of such tuples for a matrix."""
+        if isinstance(node, classes.MultiIndex):
+            return None
+        if isinstance(node, classes.Zero):
+            return _filled(node.ufl_shape, lambda _: (0.0, 0.0))
+        if isinstance(node, classes.ScalarValue):
+            value = float(node)
+            return value, 0.0 if value.is_integer() else EPS * abs(value)
+        if isinstance(node, classes.Identity):
+            return _filled(node.ufl_shape, lambda index: (float(index[0] == index[1]), 0.0))
+        if isinstance(node, classes.SpatialCoordinate):
+            return tuple((self.points[:, i], self.uncertainty) for i in range(node.ufl_shape[0]))
+        if isinstance(node, fem.Constant):
+            found = np.asarray(node.value, dtype=np.float64)
+            return _filled(node.ufl_shape, lambda index: (found[index], EPS * abs(found[index])))
+        if isinstance(node, fem.Function):
+            return self._function(node)
+        if isinstance(node, classes.ListTensor):
+            return tuple(operands)
+        if isinstance(node, classes.Indexed):
+            part = operands[0]
+            for index in node.ufl_operands[1]:
+                if not isinstance(index, classes.FixedIndex):
+                    raise _Unknown("free index")
+                part = part[int(index)]
+            return part
+        if isinstance(node, classes.Variable):
+            return operands[0]
+        if node.ufl_shape == ():
+            for kind, rule in _RULES.items():
+                if isinstance(node, kind):
+                    return rule(*operands)
+        raise _Unknown(type(node).__name__)
+
+    def _function(self, function: fem.Function) -> Any:
+        if self.cells is None or len(function.ufl_shape) > 1:
+            raise _Unknown(function.name)
+        values = np.zeros((len(self.points), max((1, *function.ufl_shape))))
+        if len(values):
+            values[:] = np.reshape(function.eval(self.points, self.cells), values.shape)
+        error = 16 * EPS * float(np.abs(function.x.array).max(initial=0.0))
+        return _filled(function.ufl_shape, lambda i: (values[:, i[0] if i else 0], error))
+
+
+def _filled(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Value]) -> Any:
+    """Nested tuples of a shape."""
+
+    def fill(index: tuple[int, ...]) -> Any:
+        if len(index) == len(shape):
+            return value(index)
+        return tuple(fill((*index, i)) for i in range(shape[len(index)]))
+
+    return fill(())
+
+
+def _sum(a: Value, b: Value) -> Value:
+    value = a[0] + b[0]
+    return value, a[1] + b[1] + EPS * np.abs(value)
+
+
+def _product(a: Value, b: Value) -> Value:
+    value = a[0] * b[0]
+    error = np.abs(a[0]) * b[1] + np.abs(b[0]) * a[1] + a[1] * b[1]
+    return value, error + EPS * np.abs(value)
+
+
+def _quotient(a: Value, b: Value) -> Value:
+    value = np.divide(a[0], b[0])
+    return value, (a[1] + np.abs(value) * b[1]) / np.abs(b[0]) + EPS * np.abs(value)
+
+
+def _function_of(function: Callable[..., Any], period: float = np.inf) -> Callable[..., Value]:
+    """A function of NumPy's: how far it moves when its arguments do.
+
+    Args:
+        function: Of one argument or more.
+        period: A jump by so much is none.
+    """
+
+    def rule(*arguments: Value) -> Value:
+        here = [argument[0] for argument in arguments]
+        value = function(*here)
+        total = 2 * EPS * np.abs(value)
+        for i, (at, error) in enumerate(arguments):
+            moves = [0.0 * value]
+            for moved in (at - error, at + error):
+                change = np.abs(function(*here[:i], moved, *here[i + 1 :]) - value)
+                moves.append(np.fmin(change, np.abs(period - change)))
+            total = total + np.fmax(moves[0], np.fmax(moves[1], moves[2]))
+        return value, total
+
+    return rule
+
+
+def _choice(condition: Value, a: Value, b: Value) -> Value:
+    return np.where(condition[0], a[0], b[0]), np.where(condition[0], a[1], b[1])
+
+
+def _extreme(function: Callable[..., Any]) -> Callable[[Value, Value], Value]:
+    return lambda a, b: (function(a[0], b[0]), np.maximum(a[1], b[1]))
+
+
+def _truth(function: Callable[..., Any]) -> Callable[..., Value]:
+    return lambda *operands: (function(*(operand[0] for operand in operands)), 0.0)
+
+
+_RULES: dict[type, Callable[..., Value]] = {
+    classes.Sum: _sum,
+    classes.Product: _product,
+    classes.Division: _quotient,
+    classes.Power: _function_of(lambda a, p: np.power(np.asarray(a, dtype=np.float64), p)),
+    classes.Abs: lambda a: (np.abs(a[0]), a[1]),
+    classes.Sqrt: _function_of(np.sqrt),
+    classes.Exp: _function_of(np.exp),
+    classes.Ln: _function_of(np.log),
+    classes.Sin: _function_of(np.sin),
+    classes.Cos: _function_of(np.cos),
+    classes.Tan: _function_of(np.tan),
+    classes.Asin: _function_of(np.arcsin),
+    classes.Acos: _function_of(np.arccos),
+    classes.Atan: _function_of(np.arctan),
+    classes.Atan2: _function_of(np.arctan2, 2 * np.pi),
+    classes.Sinh: _function_of(np.sinh),
+    classes.Cosh: _function_of(np.cosh),
+    classes.Tanh: _function_of(np.tanh),
+    classes.MinValue: _extreme(np.minimum),
+    classes.MaxValue: _extreme(np.maximum),
+    classes.Conditional: _choice,
+    classes.LT: _truth(np.less),
+    classes.LE: _truth(np.less_equal),
+    classes.GT: _truth(np.greater),
+    classes.GE: _truth(np.greater_equal),
+    classes.EQ: _truth(np.equal),
+    classes.NE: _truth(np.not_equal),
+    classes.AndCondition: _truth(np.logical_and),
+    classes.OrCondition: _truth(np.logical_or),
+    classes.NotCondition: _truth(np.logical_not),
+}
