@@ -21,10 +21,11 @@ from .garbage import hold, release, sweep
 from .loads import Edge, Load, chi
 from .masking import numbers_of
 from .moments import Sampled
-from .multigrid import LONG_SWEEPS, SWEEPS, Grid
+from .multigrid import LONG_SWEEPS, SWEEPS, Grid, Patience
 from .options import NO_INODES, defaults
 from .parents import Layout, Parents
 from .pattern import empty_matrix
+from .pieces import Loose
 from .problem import Forms
 from .space import closure_dofs, facet_entities, function_space, ghosted_vector, shared_maximum
 from .transfer import inclusion, prolongation
@@ -98,22 +99,41 @@ class Level:
         return System(self)
 
     @cached_property
+    def loose(self) -> Loose | None:
+        """Pieces without a Dirichlet facet; None if there are none, which refinement keeps."""
+        if self.coarser is not None and self.coarser.loose is None:
+            return None
+        found = Loose.of(self.V, self.system.dirichlet)
+        return found if found.count else None
+
+    @cached_property
+    def patience(self) -> Patience:
+        """Whether multigrid is given up, as it is above a mesh where it was."""
+        lost = self.coarser is not None and self.coarser.patience.lost
+        return Patience(lost, inherited=lost)
+
+    @cached_property
     @defaults(NO_INODES, prefix="")
     def grid(self) -> Grid:
         """The multigrid that starts with the discrete space."""
         system, dofs = self.system, Layout.of_space(self.V)
         own = system.A, dofs, self._owned_dirichlet, system.bounded
+        if self.patience.lost:
+            return Grid(*own, patience=self.patience)
         if self._below is not None:
             coarse, coarse_dofs, parents = self._below
             transfer = prolongation(coarse_dofs, dofs, parents)
             if not (self.forms.uniform or coarse.is_product(system.A, transfer)):
                 coarse = coarse.projected(system.A, transfer)
                 self._below = coarse, coarse_dofs, parents  # P1 on this mesh shall have them, too
-            return Grid(*own, transfer, coarse, LONG_SWEEPS if dofs.cr else SWEEPS)
+            sweeps = LONG_SWEEPS if dofs.cr else SWEEPS
+            return Grid(*own, transfer, coarse, sweeps, patience=self.patience)
         if dofs.cr:
             coarse, p1 = self.conforming
-            return Grid(*own, inclusion(p1, dofs), coarse, on_same_mesh=True)
-        return Grid(*own)
+            return Grid(
+                *own, inclusion(p1, dofs), coarse, on_same_mesh=True, patience=self.patience
+            )
+        return Grid(*own, patience=self.patience)
 
     @cached_property
     @defaults(NO_INODES, prefix="")
@@ -185,7 +205,7 @@ class System:
         owned = V.dofmap.index_map.size_local
         self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
         bc = fem.dirichletbc(self.u_D, self.dirichlet)
-        a = forms.a.on(domain, [V, V])
+        self._a = a = forms.a.on(domain, [V, V])
         with defaults(NO_INODES, prefix=""):
             if forms.element == "CR":
                 self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
@@ -230,6 +250,16 @@ class System:
         if not np.isfinite(load):
             raise InputError("data: so large that their squares overflow; choose other units")
         return load
+
+    def row_sums(self) -> FloatArray:
+        """Sum up the owned rows of A: 0 where no neighbour is on Γ0, whose columns A is without."""
+        ones, sums = (fem.Function(self.u_D.function_space) for _ in range(2))
+        ones.x.array[:] = 1.0
+        bc = fem.dirichletbc(ones, self.dirichlet)
+        fem.apply_lifting(sums.x.array, [self._a], [[bc]])
+        sums.x.scatter_reverse(InsertMode.add)
+        sums.x.array[self.dirichlet] = 1.0
+        return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
     def start(self) -> fem.Function:
         """The function that is u_D on Γ0 and 0 elsewhere."""

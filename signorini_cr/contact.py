@@ -16,7 +16,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .domain import CONTACT, Domain
+from .solver import Iterations
 from .space import closure_dofs, facet_corners, facet_entities, facet_measures, vertex_values
+from .stopping import NOISE
 from .walk import along_boundary
 
 FloatArray = npt.NDArray[np.float64]
@@ -28,15 +30,21 @@ class Kkt:
 
     Attributes:
         min_gap: Smallest u_h − α at a contact dof; 0 or above when feasible.
-        min_pressure: Smallest λ_h at a contact dof; 0 or above, up to the solver's tolerance.
+        min_pressure: Smallest λ_h at a contact dof on its bound; 0 or above, up to the solver's
+            tolerance.
         complementarity: Σ |λ_h (u_h − α)| over the contact dofs, weighted by their facets' measure.
-        residual: Norm of what is left of the equations, relative to the load.
+        residual: Norm of what is left of the equations, relative to the load; or to what the rows
+            are made of, in the class of stiffness where that is larger (`stopping`). Rounding of
+            A u_h does not count.
+        force_error: What the solver left wrong with the contact forces, summed up without regard
+            to sign, relative to their sum, as measured by the solver.
     """
 
     min_gap: float
     min_pressure: float
     complementarity: float
     residual: float
+    force_error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +57,12 @@ class Contact:
         measure: Their length, shape (n,).
         obstacle: Bound on the facet, the mean of α for CR, shape (n,).
         u: u_h at the facet's midpoint, shape (n,).
-        pressure: λ_h, shape (n,); for P1 the mean of the pressures at the vertices.
+        pressure: λ_h, shape (n,), 0 off the bound, where r is what the solver left of an equation,
+            and where r is rounding alone; for P1 the mean of the pressures at the vertices.
         active: Whether the facet is in contact, shape (n,).
         gap_at_vertices: u_h − α at the facet's vertices, shape (n, d); negative in places even for
             a feasible CR function, which respects the bound at midpoints only.
-        force: Σ r over Γ1, the total contact force (per unit depth).
+        force: Σ r over the dofs in contact, the total contact force (per unit depth).
         length: Total length of the active facets.
         number: Number of contact facets.
         number_active: Number of active ones.
@@ -100,6 +109,8 @@ def contact_facts(
     lower: FloatArray,
     obstacle_at_vertices: FloatArray,
     load: float,
+    rounding: FloatArray,
+    iterations: Iterations,
 ) -> Contact:
     """Read the state of Γ1 off a solution.
 
@@ -107,10 +118,12 @@ def contact_facts(
         domain: Mesh and boundary parts.
         u: u_h, ghosts up to date.
         residual: r = A u_h − b, ghosts up to date.
-        diagonal: Diagonal of A, owned dofs with a bound only.
+        diagonal: Diagonal of A, owned dofs.
         lower: Bound of each dof, `PETSc.NINFINITY` where there is none, ghosts included.
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: What the residual is measured against.
+        rounding: What rounding makes of r, owned dofs with a bound only.
+        iterations: What the solver says about its errors.
     """
     V = u.function_space
     mesh, facets = domain.mesh, domain.facets(CONTACT)
@@ -132,15 +145,19 @@ def contact_facts(
         return work.x.array[dofs]
 
     gap = u.x.array[bounded] - lower[bounded]
-    force = residual.x.array[bounded]
-    pressure = force / weight
-    stiff_gap = diagonal * gap
+    raw = residual.x.array[bounded]
+    force, stiff_gap = np.where(np.abs(raw) > rounding, raw, 0.0), diagonal[bounded] * gap
     # The primal-dual criterion: it tells gap from pressure also where both are nearly zero
-    state = on_facets(np.where(force > stiff_gap, 1.0, -1.0))
+    in_contact = force > stiff_gap
+    state = on_facets(np.where(in_contact, 1.0, -1.0))
+    # Off the bound r is what is left of an equation; on it, a pull is a pressure of wrong sign
+    force = np.where(in_contact | (gap <= 0.0), force, 0.0)
+    pressure = force / weight
     is_active: npt.NDArray[np.bool_] = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
     # What is left of the equations: all of r off Γ1, min(r, a_ii gap) on it
     left = residual.x.array[:owned].copy()
-    left[bounded] = np.minimum(force, stiff_gap)
+    left[bounded] = np.minimum(raw, stiff_gap)
+    left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[:owned])] = 0.0
 
     local = _cells_values(u, facets)
     total = _Totals(comm)
@@ -148,7 +165,8 @@ def contact_facts(
         min_gap=total.min(gap),
         min_pressure=total.min(pressure),
         complementarity=total.sum(np.abs(force * gap)),
-        residual=float(np.sqrt(total.sum(left @ left))) / (load or 1.0),
+        residual=max(float(np.sqrt(total.sum(left @ left))) / (load or 1.0), iterations.imbalance),
+        force_error=iterations.force_error,
     )
     fields: dict[str, npt.NDArray] = {
         "vertices": vertices,

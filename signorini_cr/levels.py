@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
+from .admissible import check_data
 from .assembly import Level
 from .contact import contact_facts
 from .domain import Domain
@@ -20,6 +21,7 @@ from .problem import Forms, Problem
 from .solution import Solution
 from .solver import solve_vi
 from .space import ghosted_vector
+from .stopping import NOISE
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
 """Called with level, step, residual norm, active dofs and linear iterations so far, which are the
@@ -42,10 +44,15 @@ def solve(
 
     Raises:
         InputError: The data are not finite on the mesh, of a wrong shape, or at home on another
-            mesh; there is no such element; or PETSc can't solve with the options that are set.
-        NotConverged: The solver stopped short, with PETSc's name for the reason.
+            mesh; u_D jumps, or lies below α where Γ0 meets Γ1; κ is not symmetric and positive
+            definite; there is no such element; a piece of the domain has no Dirichlet facet and
+            is not pressed onto the obstacle; or PETSc can't solve with the options that are set.
+        NotConverged: The solver stopped short, with PETSc's name for the reason; or the contact
+            forces, or the equations of a part, are lost in rounding.
     """
-    return _solve(Level(Forms(problem, domain.mesh, element), domain), None, monitor)
+    forms = Forms(problem, domain.mesh, element)
+    check_data(forms, domain)
+    return _solve(Level(forms, domain), None, monitor)
 
 
 def solve_levels(
@@ -107,7 +114,9 @@ def solve_sequence(
     Yields:
         The solutions, coarsest first.
     """
-    level = Level(Forms(problem, domain.mesh, element), domain)
+    forms = Forms(problem, domain.mesh, element)
+    check_data(forms, domain)
+    level = Level(forms, domain)
     solution = _solve(level, None, monitor)
     while True:
         yield solution
@@ -131,12 +140,16 @@ def _solve(
     clock = time.perf_counter()
     system = level.system
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
+    if level.loose is not None:
+        level.loose.check(level)
     u, residual = system.start(), fem.Function(level.V)
     arrays = system.b.x.array, system.lower, u.x.array, residual.x.array
     vectors = [ghosted_vector(level.V, array) for array in arrays]
     if coarser is not None:
         nested_start(coarser, level, u)
-    diagonal = level.grid.operator.diagonal
+    if level.loose is not None:
+        level.loose.hold(system, u)
+    operator, bounded = level.grid.operator, system.bounded
     try:
         iterations = solve_vi(
             level.grid,
@@ -144,7 +157,12 @@ def _solve(
             load=system.load,
             monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
             level=level.number,
+            row_sums=system.row_sums,
         )
+        entries = system.A.getDiagonal()
+        diagonal = entries.array_r.copy()
+        release(entries)
+        terms = operator.magnitude(vectors[2]) + np.abs(system.b.x.array[bounded])
     finally:
         if level.forms.element != "P1":
             level.grid.free()  # the next level needs P1 alone
@@ -161,6 +179,8 @@ def _solve(
         lower=system.lower,
         obstacle_at_vertices=system.obstacle_at_vertices,
         load=system.load,
+        rounding=NOISE * terms,
+        iterations=iterations,
     )
     owned = level.V.dofmap.index_map.size_local
     comm = level.domain.mesh.comm

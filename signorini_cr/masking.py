@@ -100,6 +100,17 @@ class MaskedMatrix:
         self._rows.mult(x, self._part)
         return self._part.array_r.copy()
 
+    def magnitude(self, x: PETSc.Vec) -> FloatArray:
+        """|A| |x| in the dofs that can be taken out, shape (n,): what a row of A x is made of."""
+        rows, sizes = self._rows.duplicate(copy=True), x.duplicate()
+        start, column, value = rows.getValuesCSR()
+        rows.setValuesCSR(start, column, np.abs(value))
+        rows.assemble()
+        sizes.array[:] = np.abs(x.array_r)
+        rows.mult(sizes, self._part)
+        release(rows, sizes)
+        return self._part.array_r.copy()
+
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = A x, whatever is taken out."""
         self.masked.mult(x, y)

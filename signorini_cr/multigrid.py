@@ -14,9 +14,21 @@ after the coarse correction.
 Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG, or
 to GAMG where PETSc is without hypre: the auxiliary space method. Small bottom grids are solved
 directly.
+
+Thin cells and strong anisotropy are too much for that cycle. Functions of CR that on no cell vary
+in the strong direction cost next to nothing, there are as many of them as vertices, and P1 has
+hardly any. No cheap figure of the mesh tells beforehand how many steps CG will take; CG does. Where
+it has taken `PATIENCE` of them on one mesh, and takes many for one linear system, the chain is
+given up, there and on all finer meshes, for the finest matrix alone. If that has no positive
+off-diagonal entries to speak of, as where cells are aligned with the strong direction, BoomerAMG
+needs a handful of steps. On other cells it would need hundreds: there the matrix is factorised.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +55,30 @@ _BOOMERAMG = {
 }
 
 _BOTTOM = PREFIX + "bottom_"
+_ALONE = PREFIX + "alone_"
+
+PATIENCE = 40
+"""CG steps on one mesh after which the chain is given up in a linear system that takes many.
+
+A factorisation takes as long as 30 steps of the cycle at 0.02 to 0.3 M dofs and 55 at 1.2 M.
+"""
+
+SLOW = 14
+"""CG steps that are many for one linear system; two thirds of that are usual at most."""
+
+FACTORISED = {2: 4_000_000, 3: 20_000}
+"""Largest matrices that are factorised instead, by the mesh's dimension; AMG has the others.
+
+In the plane that takes about as long as four linear solves with BoomerAMG of plain cells at 1 M
+dofs, and 0.6 kB a dof; in space it is far more.
+"""
+
+POSITIVE = 0.25
+"""Part of the diagonal up to which positive off-diagonal entries of a row do no harm to AMG."""
+
+# Minimum degree takes least time for matrices of plane meshes, on two ranks as well
+_MUMPS = {"pc_factor_mat_solver_type": "mumps", "mat_mumps_icntl_7": 0}
+HAS_MUMPS = PETSc.Sys.hasExternalPackage("mumps")
 
 # PETSc's smallest pivot is absolute and would refuse coefficients of small magnitude
 _PIVOTS = {"pc_factor_zeropivot": 1e-300, "redundant_pc_factor_zeropivot": 1e-300}
@@ -55,6 +91,19 @@ SWEEPS = 2
 
 LONG_SWEEPS = 3
 """The same between CR and P1 of the mesh below, where there is more to smooth."""
+
+
+@dataclass
+class Patience:
+    """Whether the chain of a mesh has been given up; what finer meshes ask for.
+
+    Attributes:
+        lost: Whether it has.
+        inherited: Whether that was on a coarser mesh.
+    """
+
+    lost: bool = False
+    inherited: bool = False
 
 
 class Grid:
@@ -77,6 +126,7 @@ class Grid:
         coarser: Grid | None = None,
         sweeps: int = SWEEPS,
         on_same_mesh: bool = False,
+        patience: Patience | None = None,
     ):
         """Join a space to the chain.
 
@@ -89,11 +139,13 @@ class Grid:
             coarser: The next space.
             sweeps: Number of Gauss-Seidel sweeps before and after.
             on_same_mesh: Whether the next space lives on the same mesh, not on a coarser one.
+            patience: Tells whether there is a chain, and is told when it is given up.
         """
         self.meshes: int = (coarser.meshes if coarser else 0) + (not on_same_mesh)
         self.operator, self.coarser = MaskedMatrix(matrix, bounded), coarser
         self._transfer, self._dofs, self._sweeps = transfer, dofs, sweeps
         self._dirichlet = dirichlet
+        self._patience = patience or Patience()
         self._silent = dirichlet
         self._changed = True
         self._bottom: PETSc.PC | None = None
@@ -108,6 +160,31 @@ class Grid:
     def matrix(self) -> PETSc.Mat:
         """The matrix as it is now, without what `fix` has taken out."""
         return self.operator.masked
+
+    @property
+    def may_give_up(self) -> bool:
+        """Whether there is something else to try than this chain; the same on all ranks."""
+        if self._patience.lost:
+            return False
+        return self.coarser is not None or not self._is_small
+
+    def give_up(self) -> None:
+        """Leave the coarser spaces alone from now on, for BoomerAMG or a factorisation."""
+        release(self._bottom, *self._vectors)
+        for part in (self._transfer, self._smoother):
+            if part is not None:
+                part.free()
+        if self.coarser is not None:
+            self.coarser.restore()
+        self._bottom, self._vectors = None, []
+        self._transfer, self._smoother, self.coarser = None, None, None
+        self._changed, self.meshes = True, 1
+        self._patience.lost = True
+
+    @property
+    def dirichlet(self) -> npt.NDArray[np.int32]:
+        """Owned dofs on Γ0, local numbers."""
+        return self._dirichlet
 
     def is_product(self, finer: PETSc.Mat, transfer: Transfer) -> bool:
         """Whether the whole matrix is, nearly, the Galerkin product of a finer space's.
@@ -238,39 +315,74 @@ class Grid:
             self._bottom = self._bottom_solver()
         if self._changed:
             self._bottom.setOperators(self.matrix)
-            with defaults(_PIVOTS, _BOTTOM):
+            with defaults(self._bottom_defaults, self._bottom_prefix):
                 self._bottom.setUp()
             self._changed = False
         self._bottom.apply(b, x)
 
     def _bottom_words(self) -> str:
-        """What solves the space at the bottom."""
+        """What solves the space at the bottom, and why where that is not its size."""
         if self.coarser is not None:
             return self.coarser._bottom_words()
         kind = self._bottom_type if self._bottom is None else self._bottom.getType()
         if kind != self._bottom_type:
-            return f"{kind} (option -{_BOTTOM}pc_type)"
-        if self._is_small:
-            return "a direct solver"
-        return "BoomerAMG" if kind == PETSc.PC.Type.HYPRE else "GAMG (PETSc is without hypre)"
+            return f"{kind} (option -{self._bottom_prefix}pc_type)"
+        if kind == PETSc.PC.Type.HYPRE:
+            words = "BoomerAMG"
+        elif kind == PETSc.PC.Type.GAMG:
+            words = "GAMG (PETSc is without hypre)"
+        else:
+            words = "a direct solver"
+        if self._patience.lost:
+            where = " on a coarser mesh" if self._patience.inherited else ""
+            words += f", as multigrid took {PATIENCE} CG steps{where}"
+        return words
 
     @property
     def _is_small(self) -> bool:
         """Whether this space, at the bottom, is to be factorised."""
         return self.matrix.getSize()[0] <= DIRECT
 
+    @cached_property
+    def _suits_amg(self) -> bool:
+        """Whether the matrix is, nearly, an M-matrix: what BoomerAMG was made for; collective."""
+        if AMG != PETSc.PC.Type.HYPRE:
+            return False
+        start, column, value = self.matrix.getValuesCSR()
+        row = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        off = column != row + self.matrix.getOwnershipRange()[0]
+        positive = np.bincount(row, np.where(off, value, 0.0).clip(0.0), len(start) - 1)
+        largest = float((positive / value[~off]).max(initial=0.0))
+        return self.matrix.getComm().tompi4py().allreduce(largest, op=MPI.MAX) <= POSITIVE
+
+    @property
+    def _bottom_prefix(self) -> str:
+        """What options of the solver at the bottom begin with."""
+        return _ALONE if self._patience.lost else _BOTTOM
+
     @property
     def _bottom_type(self) -> str:
         """What solves this space at the bottom unless options say otherwise."""
         if not self._is_small:
-            return AMG
+            most = FACTORISED[self._dofs.cells.shape[1] - 1]
+            if not self._patience.lost or self.matrix.getSize()[0] > most or self._suits_amg:
+                return AMG
+            if HAS_MUMPS:
+                return PETSc.PC.Type.CHOLESKY
         alone = self.matrix.getComm().getSize() == 1
         return PETSc.PC.Type.CHOLESKY if alone else PETSc.PC.Type.REDUNDANT
 
+    @property
+    def _bottom_defaults(self) -> Mapping[str, object]:
+        """Options of that solver; some are read when it is made, some when it is set up."""
+        if self._bottom_type == AMG:
+            return _BOOMERAMG
+        return _PIVOTS if self._is_small or not HAS_MUMPS else _MUMPS
+
     def _bottom_solver(self) -> PETSc.PC:
         pc = PETSc.PC().create(self.matrix.getComm())
-        pc.setOptionsPrefix(_BOTTOM)
+        pc.setOptionsPrefix(self._bottom_prefix)
         pc.setType(self._bottom_type)
-        with defaults(_PIVOTS if self._is_small else _BOOMERAMG, _BOTTOM):
+        with defaults(self._bottom_defaults, self._bottom_prefix):
             read(pc)
         return pc

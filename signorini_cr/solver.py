@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -23,7 +24,8 @@ from .errors import NotConverged
 from .garbage import release
 from .multigrid import Grid
 from .options import PREFIX, defaults, explained, read, read_number
-from .reduced import LINEAR_SHARE, MaskedSolver
+from .reduced import LINEAR_SHARE, SET_SHARE, MaskedSolver
+from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, Stiffness
 
 # What can be set through options only. Full steps are the primal-dual active set method: PETSc's
 # usual line search tests a norm that may rightly rise. A contact dof counts as active within the
@@ -39,11 +41,16 @@ SET_STEPS = 2
 One less after as many steps: what takes long has been looked at often.
 """
 
-NOISE = 4.0 * 2.0**-53
-"""A residual below this times the diagonal times x is rounding; measured are 1 to 2 of these 4."""
+PASSES = 6
+"""Newton steps in an active set that does not change any more; they refine the solution."""
 
-DIVERGED_NAN = -4
-"""PETSc's number; its name depends on the version."""
+GAIN = 0.5
+"""What a refinement must take away of what is wrong, or rounding is at work."""
+
+DIVERGED_NAN, DIVERGED_ROUNDING = -4, -5
+"""PETSc's number for what is not finite, whose name depends on the version, and for "no gain"."""
+
+FloatArray = npt.NDArray[np.float64]
 
 Monitor = Callable[[int, float, int, int], None]
 """Called after each step, on the ranks that have one: step, residual norm, active dofs, linear
@@ -52,11 +59,23 @@ iterations so far; the same on all ranks."""
 
 @dataclass(frozen=True)
 class Iterations:
-    """What the solver did: Newton steps, linear (CG) iterations, and the preconditioner taken."""
+    """What the solver did.
+
+    Attributes:
+        newton: Newton steps.
+        linear: Linear (CG) iterations.
+        preconditioner: The one taken, in words.
+        force_error: What may be wrong with the contact forces, in parts of their sum: the largest
+            of all classes of stiffness.
+        imbalance: Largest residual of a class of stiffness in parts of its flows; 0 where there is
+            one class only.
+    """
 
     newton: int
     linear: int
     preconditioner: str
+    force_error: float = 0.0
+    imbalance: float = 0.0
 
 
 def solve_vi(
@@ -70,6 +89,7 @@ def solve_vi(
     tolerance: float = 1e-8,
     monitor: Monitor | None = None,
     level: int | None = None,
+    row_sums: Callable[[], FloatArray] | None = None,
 ) -> Iterations:
     """Solve the variational inequality in place.
 
@@ -81,14 +101,15 @@ def solve_vi(
         x: On entry the start, with the Dirichlet values in place; on exit the solution.
         residual: On exit A x − b.
         load: Norm that the residual is measured against, `System.load`; the same for all starts.
-        tolerance: The solve ends when the residual's norm is below ``tolerance * load``, and what
-            is due to the choice of the active set far below; or when it is lost in rounding, as it
-            can be where the coefficient varies by many orders of magnitude.
+        tolerance: The solve ends when the residual's norm is below ``tolerance * load``, or lost
+            in rounding, and what is due to the choice of the active set far below; and the contact
+            forces and each class of stiffness are converged for themselves, see `stopping`.
         monitor: Called after each step.
         level: Named in the error.
+        row_sums: `System.row_sums`; without them all equations are of one class of stiffness.
 
     Raises:
-        NotConverged: With the name PETSc gives to the reason.
+        NotConverged: With the name PETSc gives to the reason, or what is lost in rounding.
         InputError: PETSc can't solve with the options that are set. On several ranks the grid's
             matrices are then left as they are, without the dofs taken out last.
     """
@@ -101,12 +122,15 @@ def solve_vi(
     snes.setOptionsPrefix(PREFIX)
     snes.setType(PETSc.SNES.Type.VINEWTONRSLS)
 
+    stiffness = Stiffness(grid, row_sums)
+
     def function(_: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        operator.mult(x, f)
-        f.axpy(-1.0, b)
+        stiffness.residual(x, b, f)
 
     snes.setFunction(function, residual)
-    linear = MaskedSolver(grid, bounds, x, residual, LINEAR_SHARE * wanted)
+    linear = MaskedSolver(
+        grid, bounds, x, residual, LINEAR_SHARE * wanted, stiffness, max(1.0, wanted / target)
+    )
     jacobian = PETSc.Mat().createPython(grid.matrix.getSizes(), linear, comm=comm)
     jacobian.setUp()
     snes.setJacobian(lambda *_: None, jacobian)
@@ -126,25 +150,10 @@ def solve_vi(
         if monitor is not None:
             monitor(step, norm, number, linear.iterations)
 
-    start, for_the_set = 0.0, 0
+    test = _Test(grid, b, linear, stiffness, target)
 
     def converged(snes: PETSc.SNES, step: int, norms: tuple[float, float, float]) -> int:
-        nonlocal start, for_the_set
-        rtol, atol, _, _ = snes.getTolerances()
-        norm, Reason = norms[2], PETSc.SNES.ConvergedReason
-        if step == 0:
-            start = norm
-        if not np.isfinite(norm):
-            return DIVERGED_NAN
-        small = max(atol, rtol * start)
-        if norm > small:
-            lost = step > 1 and norm <= NOISE * grid.rounding(snes.getSolution())
-            return Reason.CONVERGED_FNORM_ABS if lost else Reason.ITERATING
-        allowed = SET_STEPS if step <= SET_STEPS else 1
-        if step > 0 and for_the_set < allowed and linear.disputed() > SET_TOLERANCE * small:
-            for_the_set += 1
-            return Reason.ITERATING
-        return Reason.CONVERGED_FNORM_ABS
+        return test(snes, step, norms[2])
 
     snes.setConvergenceTest(converged)
     # all ranks report, though there may be a monitor on one of them only
@@ -158,22 +167,137 @@ def solve_vi(
             snes.solve(None, x)
         together = True
         reason, linear_reason = snes.getConvergedReason(), linear.ksp.getConvergedReason()
-        iterations = Iterations(snes.getIterationNumber(), linear.iterations, linear.describe())
+        iterations = Iterations(
+            snes.getIterationNumber(),
+            linear.iterations,
+            linear.describe(),
+            test.force_error,
+            test.imbalance,
+        )
     finally:
         if together:  # a monitor may raise on one rank alone, which must not wait for the others
             grid.restore()
         release(outer, snes, jacobian, upper)
         linear.free()
+        stiffness.free()
     if reason < 0:
         words = _name(PETSc.SNES.ConvergedReason, reason)
         if linear_reason < 0:
             words += f" (KSP {_name(PETSc.KSP.ConvergedReason, linear_reason)})"
+        words = f"SNES stopped with {words}" if test.failure is None else f"{test.failure}; stopped"
         raise NotConverged(
-            f"SNES stopped with {words} after {iterations.newton} Newton steps "
+            f"{words} after {iterations.newton} Newton steps "
             f"and {iterations.linear} linear iterations",
             level,
         )
     return iterations
+
+
+class _Test:
+    """Whether SNES may stop; see `stopping`.
+
+    Attributes:
+        force_error: What may be wrong with the contact forces, in parts of their sum.
+        imbalance: Largest residual of a class of stiffness in parts of its flows.
+        failure: Why it can't be done, if it can't.
+    """
+
+    def __init__(
+        self, grid: Grid, b: PETSc.Vec, linear: MaskedSolver, stiffness: Stiffness, target: float
+    ):
+        """Start the tests; target is what the residual may be unless options say otherwise."""
+        self._grid, self._b, self._target = grid, b, target
+        self._linear, self._stiffness = linear, stiffness
+        self._start = np.inf
+        self._for_the_set = self._passes = 0
+        self._forces = linear.forces()
+        self.force_error = self.imbalance = np.inf
+        self.failure: str | None = None
+
+    def __call__(self, snes: PETSc.SNES, step: int, norm: float) -> int:
+        """Decide; the same on all ranks."""
+        Reason, linear, x = PETSc.SNES.ConvergedReason, self._linear, snes.getSolution()
+        if not np.isfinite(norm):
+            return DIVERGED_NAN
+        if step == 0:
+            self._start = norm
+        rtol, atol, _, _ = snes.getTolerances()
+        small = max(atol, rtol * self._start)
+        before, self._forces = self._forces, linear.forces()
+        loose = max(1.0, small / self._target)  # who sets a tolerance sets them all
+        if step == 0:
+            enough = norm == 0.0 or (loose > 1.0 and norm <= small)
+            if enough:
+                self.force_error = self.imbalance = 0.0
+            return Reason.CONVERGED_FNORM_ABS if enough else Reason.ITERATING
+        disputed, total, moved, in_dispute = self._sums(before)
+        known, solved = self.force_error, self.imbalance
+        self.force_error = self.imbalance = np.inf  # what was known of another set says nothing
+        if norm > small and (step == 1 or norm > NOISE * self._grid.rounding(x)):
+            return Reason.ITERATING
+        allowed = SET_STEPS if step <= SET_STEPS else 1
+        if self._for_the_set < allowed and disputed > SET_TOLERANCE * small:
+            self._for_the_set += 1
+            return Reason.ITERATING
+        # the linear solver knows what it left, unless rounding has added to the residual; a dof
+        # in the wrong set has its force there, its neighbours as much, and so may other forces
+        sure = norm <= 2.0 * (linear.reached + disputed) and np.isfinite(linear.force_errors).all()
+        errors = (linear.force_errors if sure else moved) + 2.0 * in_dispute
+        errors += STORED * self._stiffness.magnitude(x, linear.active())
+        noise = np.zeros_like(total)
+        if (errors > loose * FORCES * total).any():
+            noise = LOST * NOISE * self._stiffness.magnitude(x)
+            errors = np.where((errors <= noise) & (total <= noise), 0.0, errors)
+        self.force_error = float(np.max(errors / np.maximum(total, 1e-300), initial=0.0))
+        self.imbalance = self._stiffness.imbalance(x, self._b, snes.getFunction()[0])
+        if self.force_error <= loose * FORCES and self.imbalance <= loose * FLOWS:
+            return Reason.CONVERGED_FNORM_ABS
+        if (in_dispute > np.maximum(loose * FORCES * total, noise)).any():
+            self.force_error = self.imbalance = np.inf  # of another set
+            return Reason.ITERATING
+        self._passes += 1
+        figures = (self.force_error, known, FORCES), (self.imbalance, solved, FLOWS)
+        gains = any(loose * limit < now <= GAIN * last for now, last, limit in figures)
+        if gains and self._passes < PASSES:
+            linear.reduction = SET_SHARE * min(1.0, loose * FLOWS / max(self.imbalance, 1e-300))
+            return Reason.ITERATING
+        if max(self.force_error, self.imbalance) <= loose * ROUNDED:
+            return Reason.CONVERGED_FNORM_ABS
+        self.failure = self._lost_in_rounding(float(x.norm(PETSc.NormType.INFINITY)))
+        return DIVERGED_ROUNDING
+
+    def _lost_in_rounding(self, largest: float) -> str:
+        """What to say to users; u_h is as large as given."""
+        if self.force_error >= self.imbalance:
+            known = f"the contact forces are known to {self.force_error:.1e} of their sum only"
+        else:
+            known = f"equations hold to {self.imbalance:.1e} of what they are made of only"
+        return (
+            f"{known}, {ROUNDED:.0e} is wanted. The rest is lost in rounding, as the stiffness "
+            f"varies by a factor of {self._stiffness.contrast:.1e} and u_h is as large as "
+            f"{largest:.1e}"
+        )
+
+    def _sums(self, before: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        """Sum up contact forces.
+
+        Returns:
+            The norm of the residual in the dofs in dispute; and for each class of stiffness the
+            forces, what they have changed by since ``before``, and those in dispute.
+        """
+        forces, linear = self._forces, self._linear
+        active, disputed = linear.active(), linear.disputed()
+        facts = [
+            self._stiffness.sums(np.where(which, values, 0.0))
+            for which, values in (
+                (disputed, forces**2),
+                (active, forces),
+                (active, np.abs(forces - before)),
+                (disputed, np.abs(forces)),
+            )
+        ]
+        sums = self._grid.matrix.getComm().tompi4py().allreduce(np.array(facts))
+        return float(np.sqrt(sums[0].sum())), sums[1], sums[2], sums[3]
 
 
 def _name(reasons: type, value: int) -> str:

@@ -34,6 +34,7 @@ from signorini_cr.hierarchy import refine, refine_marked
 from signorini_cr.masking import MaskedMatrix
 from signorini_cr.multigrid import Grid
 from signorini_cr.nested import nested_start
+from signorini_cr.options import AMG
 from signorini_cr.parents import Layout, Parents
 from signorini_cr.problem import Forms
 from signorini_cr.solver import solve_vi
@@ -388,7 +389,7 @@ def test_a_coefficient_that_jumps_inside_coarse_cells(element, jump, options):
     assert coarse.is_product(level.system.A, transfer)
     assert not level.coarser.conforming[0].is_product(level.system.A, transfer)
 
-    options("pc_type", "hypre")
+    options("pc_type", AMG)
     options("snes_atol", 1e-12 * level.system.load)
     other = last(disc, domain, 6, element=element)
     assert other.energy == pytest.approx(solutions[-1].energy, rel=1e-9)
@@ -438,7 +439,7 @@ def test_a_constant_added_to_the_data_changes_nothing():
     def shifted(c):
         problem = Problem(
             f=lambda x: 5 * ufl.sin(9 * x[0] + 5 * x[1]),
-            obstacle=lambda x: c + 0.02 * x[1],
+            obstacle=lambda x: c + 0.2 * x[1] * (1 - x[1]),
             dirichlet=c,
         )
         square = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact"] * 3 + ["dirichlet"])
@@ -495,9 +496,9 @@ def test_the_figures_do_not_depend_on_the_ranks():
 
 
 def test_a_mesh_without_a_hierarchy():
-    """Fine enough for BoomerAMG to take the P1 part over."""
+    """Fine enough for algebraic multigrid to take the P1 part over."""
     one = solve(exact.S1.problem, exact.S1.mesh(0.02))
-    assert "BoomerAMG" in one.iterations.preconditioner
+    assert ("BoomerAMG" if AMG == "hypre" else "GAMG") in one.iterations.preconditioner
     assert one.iterations.linear <= 25
     assert one.errors[0] < 0.05
     few = solve(exact.S1.problem, exact.S1.mesh(0.1))

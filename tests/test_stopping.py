@@ -1,0 +1,353 @@
+"""Contact forces and sets against an independent solution, whatever the coefficient does.
+
+The reference is made here from nothing but the mesh: Crouzeix-Raviart matrices in NumPy's long
+doubles, the primal-dual active set method with sparse direct solves, and refinement of each with
+residuals in long doubles, so that it is right where a residual in doubles is lost in rounding.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import basix
+import basix.ufl
+import numpy as np
+import numpy.typing as npt
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+import ufl
+from dolfinx.mesh import compute_midpoints, create_mesh, exterior_facet_indices, meshtags
+from mpi4py import MPI
+
+from signorini_cr import Domain, InputError, NotConverged, Polygon, Problem, Solution, solve_levels
+from signorini_cr.compat import cell_nodes
+from signorini_cr.hierarchy import refine
+
+LONG = np.longdouble
+Function = Callable[..., object]  # of x, y and numpy or ufl
+
+
+@dataclass
+class Data:
+    """A problem for both: each function takes x, y and the module that it shall use."""
+
+    coefficient: Function = lambda x, y, on: 1.0
+    f: Function = lambda x, y, on: -3.0
+    g: Function = lambda x, y, on: 0.0
+    obstacle: Function = lambda x, y, on: -0.3 + 0.1 * on.cos(9 * x)
+    dirichlet: Function = lambda x, y, on: 0.0
+
+    def problem(self) -> Problem:
+        def of(function):
+            return lambda x: function(x[0], x[1], ufl) + 0.0 * x[0]
+
+        names = ("coefficient", "f", "g", "obstacle", "dirichlet")
+        return Problem(**{name: of(getattr(self, name)) for name in names})
+
+
+@dataclass
+class Reference:
+    """Midpoints of the contact facets, their forces (0 where there is no contact)."""
+
+    midpoints: npt.NDArray[np.float64]
+    forces: npt.NDArray[np.float64]
+
+
+def where(on, condition, a, b):
+    return np.where(condition, a, b) if on is np else ufl.conditional(condition, a, b)
+
+
+def reference(domain: Domain, part: Callable[[npt.NDArray], npt.NDArray], data: Data) -> Reference:
+    """Solve on the mesh of a domain that lives on one process.
+
+    Args:
+        domain: Mesh.
+        part: The letter c, d or n for midpoints of boundary facets, shape (n, 2).
+        data: The problem.
+    """
+    mesh = domain.mesh
+    points, cells = mesh.geometry.x[:, :2], np.asarray(cell_nodes(mesh))
+    on_cell, weights = basix.make_quadrature(basix.CellType.triangle, 4)
+    on_facet, facet_weights = basix.make_quadrature(basix.CellType.interval, 4)
+    weights, facet_weights = 2 * weights, facet_weights
+    hats = np.vstack([1 - on_cell.sum(axis=1), on_cell.T])
+    corners = points[cells]
+    sides = np.stack([corners[:, i - 1] - corners[:, i - 2] for i in range(3)], 1).astype(LONG)
+    area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]) / 2
+    x, y = np.moveaxis(np.einsum("iq,mic->mqc", hats, corners), 2, 0)
+    kappa = (data.coefficient(x, y, np) + 0 * x) @ weights
+    local = np.einsum("mic,mjc->mij", sides, sides) * (kappa / area)[:, None, None]
+    loads = ((data.f(x, y, np) + 0 * x)[:, None] * (1 - 2 * hats) * weights).sum(axis=2)
+    pairs = np.sort([cells[:, [i - 2, i - 1]] for i in range(3)], axis=2)
+    ends, dofs, count = np.unique(
+        pairs.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True
+    )
+    dofs, number = dofs.reshape(3, -1).T, len(ends)
+    b = np.zeros(number, LONG)
+    np.add.at(b, dofs, loads * area[:, None])
+    midpoints = points[ends].mean(axis=1)
+    parts = np.full(number, "i")
+    parts[count == 1] = part(midpoints[count == 1])
+    first, second = points[ends[:, 0]], points[ends[:, 1]]
+    x, y = np.moveaxis(first[:, None] + on_facet * (second - first)[:, None], 2, 0)
+    means = {
+        name: (getattr(data, name)(x, y, np) + 0 * x) @ facet_weights
+        for name in ("g", "obstacle", "dirichlet")
+    }
+    length = np.hypot(*(second - first).T)
+    b += np.where(parts == "n", means["g"] * length, 0)
+    fixed, contact = parts == "d", np.flatnonzero(parts == "c")
+
+    row, column = np.repeat(dofs, 3, axis=1).ravel(), np.tile(dofs, (1, 3)).ravel()
+    A = scipy.sparse.csc_matrix((local.ravel().astype(float), (row, column)), (number, number))
+    diagonal = A.diagonal()
+
+    order = np.argsort(row, kind="stable")
+    begins = np.searchsorted(row[order], np.arange(number))
+    value, columns = local.ravel()[order], column[order]
+
+    def residual(u):  # rows add up to zero
+        return np.add.reduceat(value * (u[columns] - u[row[order]]), begins) - b
+
+    u = np.where(fixed, means["dirichlet"], 0).astype(LONG)
+    active = np.zeros(len(contact), dtype=bool)
+    for _ in range(60):
+        held = fixed.copy()
+        held[contact[active]] = True
+        u[contact[active]] = means["obstacle"][contact[active]]
+        free = np.flatnonzero(~held)
+        scale = 1 / np.sqrt(diagonal[free])
+        D = scipy.sparse.diags(scale)
+        lu = scipy.sparse.linalg.splu((D @ A[free][:, free] @ D).tocsc())
+        for _ in range(60):
+            r = residual(u)[free]
+            size = np.abs(r).max() or LONG(1)
+            step = size * scale * lu.solve((scale * r / size).astype(float))
+            u[free] -= step
+            if np.abs(step).max() <= 1e-16 * np.abs(u).max():
+                break
+        else:
+            raise AssertionError("the reference's refinement does not converge")
+        force = residual(u)[contact]
+        indicator = force - diagonal[contact] * (u[contact] - means["obstacle"][contact])
+        if np.array_equal(indicator > 0, active):
+            return Reference(midpoints[contact], np.where(active, force, 0).astype(float))
+        active = indicator > 0
+    raise AssertionError("the reference's active set does not settle")
+
+
+RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
+SIDES = ["contact", "neumann", "dirichlet", "neumann"]
+
+
+def rectangle_part(x):
+    return np.where(x[:, 1] == 0, "c", np.where(x[:, 1] == 1, "d", "n"))
+
+
+def halves(contrast: float) -> Data:
+    """Stiff on the left, where u_D varies, and contact on the right alone."""
+    return Data(
+        coefficient=lambda x, y, on: where(on, x < 0.05 - 0.13 * y, contrast, 1.0),
+        dirichlet=lambda x, y, on: x / 5,
+    )
+
+
+def disc(contrast: float) -> Data:
+    """A stiff disc that nothing but the soft part around it holds."""
+    return Data(
+        coefficient=lambda x, y, on: where(
+            on, (x - 0.1) ** 2 + (y - 0.45) ** 2 < 0.09, contrast, 1.0
+        ),
+        dirichlet=lambda x, y, on: x / 5,
+    )
+
+
+def board(contrast: float) -> Data:
+    """Squares like those of a board, contact in both kinds."""
+    return Data(
+        coefficient=lambda x, y, on: where(
+            on, on.sin(2 * np.pi * (x + 0.07)) * on.sin(2 * np.pi * (y + 0.03)) > 0, contrast, 1.0
+        ),
+        f=lambda x, y, on: -20 + 10 * on.sin(3 * x),
+    )
+
+
+def bottom(contrast: float) -> Data:
+    """A stiff strip that lies on the obstacle."""
+    return Data(
+        coefficient=lambda x, y, on: where(on, y < 0.2 + 0.05 * x, contrast, 1.0),
+        f=lambda x, y, on: -9.0,
+        obstacle=lambda x, y, on: -0.3 - 0.01 * x**2,
+    )
+
+
+def compare(solution: Solution, expected: Reference) -> float:
+    """The forces' errors, summed up, in parts of their sum; the sets must be the same."""
+    contact, comm = solution.contact, MPI.COMM_WORLD
+    middle = contact.midpoints[:, None, :2]
+    nearest = np.linalg.norm(middle - expected.midpoints, axis=2).argmin(axis=1)
+    forces = expected.forces[nearest]
+    assert np.array_equal(contact.active, forces > 0)
+    assert comm.allreduce(len(forces)) == len(expected.forces)
+    wrong = comm.allreduce(float(np.abs(contact.pressure * contact.measure - forces).sum()))
+    total = expected.forces.sum()
+    assert contact.force == pytest.approx(total, rel=1e-6)
+    return wrong / total
+
+
+def solutions(data: Data, levels: int, **options) -> list[Solution]:
+    return list(solve_levels(data.problem(), coarsest(), levels, **options))
+
+
+@cache
+def coarsest() -> Domain:
+    return Polygon(RECTANGLE, SIDES).mesh(0.25)
+
+
+@cache
+def mesh_alone(levels: int) -> Domain:
+    """The same mesh as in `solutions`, on each process whole."""
+    domain = Polygon(RECTANGLE, SIDES).mesh(0.25, MPI.COMM_SELF)
+    for _ in range(1, levels):
+        domain, _ = refine(domain)
+    return domain
+
+
+@cache
+def expected(data: Callable[[float], Data], contrast: float) -> Reference:
+    """The reference on the third mesh."""
+    return reference(mesh_alone(3), rectangle_part, data(contrast))
+
+
+CASES = [(halves, 10.0**k) for k in (2, 4, 6, 7, 8)]
+CASES += [(data, contrast) for data in (disc, board, bottom) for contrast in (1e4, 1e8)]
+BEYOND = [(data, contrast) for data in (halves, disc, board, bottom) for contrast in (1e10, 1e12)]
+
+
+@pytest.mark.parametrize("nested", [True, False], ids=["nested", "cold"])
+@pytest.mark.parametrize(("data", "contrast"), CASES)
+def test_forces_are_right_whatever_the_contrast(data, contrast, nested):
+    solution = solutions(data(contrast), 3, nested=nested)[-1]
+    assert compare(solution, expected(data, contrast)) < 1e-6
+    assert solution.contact.kkt.force_error < 1e-6
+    assert solution.contact.kkt.residual < 1e-8
+
+
+@pytest.mark.parametrize(("data", "contrast"), BEYOND)
+def test_beyond_they_are_right_or_refused(data, contrast):
+    try:
+        solution = solutions(data(contrast), 3)[-1]
+    except NotConverged as error:
+        assert "lost in rounding" in error.reason
+        assert (data, contrast) in ((board, 1e12), (bottom, 1e12), (board, 1e10))
+        return
+    assert compare(solution, expected(data, contrast)) < 1e-6
+
+
+def test_nothing_touches():
+    """No contact: no force and no pressure, not even rounding; the gap is the reference's."""
+    data = Data(
+        coefficient=lambda x, y, on: where(on, x < 0.05, 1e6, 1.0),
+        obstacle=lambda x, y, on: -5.0,
+        dirichlet=lambda x, y, on: x / 5,
+    )
+    contact = solutions(data, 3)[-1].contact
+    assert contact.force == 0.0 and contact.number_active == 0
+    assert np.all(contact.pressure == 0.0)
+    kkt = contact.kkt
+    assert kkt.min_pressure == kkt.complementarity == kkt.force_error == 0.0
+    assert kkt.min_gap > 2.0
+
+
+def test_touching_without_a_force():
+    """u = x solves the equations and lies on the obstacle everywhere: all signs are rounding."""
+    data = Data(
+        f=lambda x, y, on: 0.0,
+        g=lambda x, y, on: where(on, x > 0, 1.0, -1.0),
+        obstacle=lambda x, y, on: x,
+        dirichlet=lambda x, y, on: x,
+    )
+    for solution in solutions(data, 3):
+        assert abs(solution.contact.force) < 1e-12
+        assert np.abs(solution.contact.pressure).max(initial=0.0) < 1e-12
+        assert solution.iterations.newton <= 3
+
+
+@pytest.mark.parametrize(
+    ("size", "stiff", "shift"),
+    [(1.0, 1e12, 0.0), (1.0, 1e-12, 0.0), (1e6, 1.0, 0.0), (1e-6, 1.0, 0.0), (1.0, 1.0, 1e2)],
+)
+def test_units_make_no_difference(size, stiff, shift):
+    """κ and f by one factor, the geometry by another, and a constant added to u_D and α."""
+    plain = halves(1e4)
+    data = Data(
+        coefficient=lambda x, y, on: stiff * plain.coefficient(x / size, y / size, on),
+        f=lambda x, y, on: -3.0 * stiff / size**2,
+        obstacle=lambda x, y, on: shift + plain.obstacle(x / size, y / size, on),
+        dirichlet=lambda x, y, on: shift + x / size / 5,
+    )
+    domain = Polygon(RECTANGLE, SIDES).mesh(0.25)
+    domain.mesh.geometry.x[:] *= size
+    *_, solution = solve_levels(data.problem(), domain, 3)
+    of = expected(halves, 1e4)
+    assert compare(solution, Reference(size * of.midpoints, stiff * of.forces)) < 1e-6
+
+
+def test_who_loosens_the_tolerance_gets_it(options):
+    """Forces are then known as roughly as the rest, and the report says so."""
+    usual = solutions(halves(1.0), 3)[-1]
+    options("snes_atol", 1e-2 * usual.level.system.load)
+    rough = solutions(halves(1.0), 3)[-1]
+    assert rough.iterations.linear < usual.iterations.linear
+    assert usual.contact.kkt.residual < 1e-8 < rough.contact.kkt.residual < 1e-1
+
+
+def two_squares():
+    """The one to the right has no Dirichlet facet; contact is below."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [2, 0], [3, 0], [3, 1], [2, 1]], float)
+    cells = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int64)
+    comm = MPI.COMM_WORLD
+    if comm.rank > 0:
+        corners, cells = corners[:0], cells[:0]
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
+    mesh = create_mesh(comm, cells, x=corners, e=element)
+    mesh.topology.create_connectivity(1, 2)
+    exterior = exterior_facet_indices(mesh.topology)
+    x, y, _ = compute_midpoints(mesh, 1, exterior).T
+    values = np.where(y == 0.0, 1, np.where((y == 1.0) & (x < 1.5), 2, 3)).astype(np.int32)
+    return Domain.from_tags(mesh, meshtags(mesh, 1, exterior, values))
+
+
+@pytest.mark.parametrize("f", [0.0, 1.0], ids=["no net force", "pulled away"])
+def test_a_piece_that_nothing_holds_is_named(f):
+    with pytest.raises(InputError, match=r"around \(2\.\d+, 0\.\d+\) has no Dirichlet facet and a"):
+        list(solve_levels(Problem(f=f, obstacle=-0.1), two_squares(), 3))
+
+
+@pytest.mark.parametrize("nested", [True, False])
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("slope", [0.0, 0.5, -3.0])
+def test_a_piece_pressed_onto_the_obstacle(slope, element, nested):
+    """Its weight, 2, is what the obstacle bears, be it flat or touched at one end."""
+    problem = Problem(
+        f=lambda x: ufl.conditional(x[0] > 1.5, -2.0, 0.0),
+        obstacle=lambda x: ufl.conditional(x[0] > 1.5, 5.0 + slope * x[0], -1.0),
+    )
+    for solution in solve_levels(problem, two_squares(), 4, element, nested=nested):
+        contact = solution.contact
+        assert contact.force == pytest.approx(2.0, rel=1e-7)
+        assert contact.kkt.min_gap >= 0.0 and contact.kkt.min_pressure >= -1e-7
+        assert contact.kkt.residual < 1e-7
+    of_piece = contact.number // 2
+    if slope == 0.0:  # u = 5 + y² − 2 y
+        assert contact.number_active == of_piece
+        far = np.abs(contact.pressure[contact.active] - 2.0).max(initial=0.0)
+        assert far < (1e-6 if element == "CR" else 0.2)
+        energy = -2.0 / 3.0 * 2.0 + 2.0 * 5.0 + 2.0 / 3.0  # ∫ 2 u + ½ ∫ |u'|²
+        assert solution.energy == pytest.approx(energy, rel=1e-2)
+    if slope == -3.0:
+        assert 0 < contact.number_active < of_piece
+        assert contact.midpoints[contact.active, 0].max(initial=2.0) < 2.6
+    if element == "CR":
+        assert "Γ0" in solution.certificate.reason
