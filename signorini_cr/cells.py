@@ -208,6 +208,13 @@ class Cells:
         )
         return self.share(total) if shared else total
 
+    def over_vertices(self, values: FloatArray) -> FloatArray:
+        """Add up local values, shape (d + 1, cells), for each vertex, ghosts included."""
+        index_map = self.domain.mesh.topology.index_map(0)
+        size = index_map.size_local + index_map.num_ghosts
+        total = np.bincount(self.vertices.ravel(), values.ravel(), minlength=size)
+        return self.share(total.astype(np.float64, copy=False), 0)
+
     def share(self, values: FloatArray, dim: int | None = None) -> FloatArray:
         """Sum the ranks' shares of facet dofs, or of vertices (``dim`` = 0), in place."""
         topology = self.domain.mesh.topology
@@ -247,11 +254,15 @@ class Cells:
         """Number of facet dofs this rank owns."""
         return self.V.dofmap.index_map.size_local
 
+    def owned_vertices(self) -> int:
+        """Number of vertices this rank owns."""
+        return self.domain.mesh.topology.index_map(0).size_local
+
     def total(self, *values: float | np.floating | FloatArray) -> FloatArray:
         """Sum over all ranks."""
         return self.comm.allreduce(np.array(values, dtype=np.float64))
 
-    def apply(self, c: FloatArray, part: slice) -> FloatArray:
+    def apply(self, c: FloatArray, part: slice | IntArray) -> FloatArray:
         """|T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
         out = np.zeros_like(c)
         for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
@@ -265,6 +276,14 @@ class Cells:
         out = np.zeros(len(side.cells))
         for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
             out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
+        return out
+
+    def squares(self, part: slice) -> FloatArray:
+        """|T| |∇λ_i|², shape (d + 1, cells in the part)."""
+        out = np.zeros((self.tdim + 1, len(self.volume[part])))
+        for (i, j), s in zip(self.pairs, self.stiffness[:, part], strict=True):
+            out[i] -= s
+            out[j] -= s
         return out
 
     def trace(self, part: slice) -> FloatArray:

@@ -18,12 +18,13 @@ import ufl
 from dolfinx import fem
 
 from . import compat
-from .cells import Cells, sum_rows
+from .cells import Cells, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, companion, on_facet
+from .cusps import Cusps
 from .domain import CONTACT
-from .flux import equilibrate, unbalanced
+from .flux import Flux, balance, equilibrate, field_squares, unbalanced
 from .gap import Sums, integrate, integrate_edge
-from .loads import Load
+from .loads import Certain, Load, Segments
 from .moments import Coefficient, Sampled
 
 if TYPE_CHECKING:
@@ -92,7 +93,10 @@ class Certificate:
 
     @cached_property
     def companion(self) -> fem.Function | None:
-        """The companion v without its lifting, of degree 2 for d = 2, affine else; collective."""
+        """The companion v of degree 2 for d = 2, affine else; collective.
+
+        Without its lifting and, where there are some, its cusps.
+        """
         if self._made is None:
             return None
         made = self._made
@@ -113,8 +117,9 @@ class Certificate:
 class _Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
-    κ is given by its means; whether it varies within cells is told. force is this rank's share of
-    ∫_Γ1 y·n, reach the radius of the ball around (y + κ∇v)/2 that has κ∇u in it, loose ends added.
+    κ is given by its means; whether it varies within cells is told. hats and segments are moments
+    of f and g. force is this rank's share of ∫_Γ1 y·n, reach the radius of the ball around
+    (y + κ∇v)/2 that has κ∇u in it, loose ends added.
     """
 
     level: Level
@@ -123,10 +128,19 @@ class _Made:
     excess: FloatArray
     vertices: FloatArray
     bumps: FloatArray
+    hats: FloatArray | None
+    segments: Segments
+    cusps: Cusps | None
     varies: bool
     force: float
     reach: float
 
+
+STEADY = 1e-12
+"""Part of κ by which its bounds on a cell may differ where it is constant there."""
+
+LIFT_SHARE = 1e-2
+"""What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
 TENSOR = "the coefficient is not a scalar"
@@ -154,44 +168,82 @@ def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = No
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
+    slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
     contact_side = cells.sides[CONTACT]
     obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
     gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
     flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
+    size = _size(cells, kappa, w, flux, slopes)
+    certain = Certain.of(data.f, load, cells, kappa.low, size)
+    if certain.reason is not None:
+        level.tidy()
+        return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
+    flux.left += cells.volume * (certain.load.mean - load.mean)
+    load = certain.load
+    segments = Segments.of(edge, cells, kappa.low, size)
+    if segments.reason is not None:
+        level.tidy()
+        return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
+    there = edge.side.local, edge.side.cells
+    change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
+    flux.excess[there] += change
+    np.add.at(flux.left, edge.side.cells, change)
+    left = unbalanced(level, cells, flux.left, kappa.low)
+    carried = balance(cells, flux, kappa.low, size, left)
+    if carried:
+        left = unbalanced(level, cells, flux.left, kappa.low)
+    excess = field_squares(cells, flux.excess, slice(0, cells.number))
+    kappa.enclose(cells, slopes, excess, size)
     if solution.element != "CR":
         conforming = solution.u.function_space.dofmap.list[: cells.number]
         own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
         change = cells.apply(w - own, slice(0, cells.number))
         flux.excess -= cells.tdim * kappa.mean * change
         w = own
-    v = companion(cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps)
+    steady = kappa.high - kappa.low <= STEADY * kappa.mean
+    goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
+    v = companion(
+        cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps, steady, goal
+    )
     sums = integrate(cells, kappa, w, load, flux, v)
+    unsure = 0.0 if v.cusps is None else v.cusps.add(cells, w, load, kappa.low, flux, v, sums)
     assert sums.indicators is not None
     np.add.at(sums.indicators, contact_side.cells, v.contact)
-    edge_square = integrate_edge(cells, kappa, w, load, edge, flux, v, sums)
-    lift, lift_energy = _lifted(cells, kappa, load, v, sums)
-    on_edge = on_facet(cells, edge.side, edge.g, v.vertices, v.bumps)
-    edge_energy = edge.measure @ (edge.g.weights @ (edge.values * on_edge))
+    edge_square = integrate_edge(cells, kappa, w, load, segments, flux, v, sums)
+    lift, lift_energy, *with_lift = _lifted(cells, kappa, certain, v, sums)
+    lift_energy += unsure
+    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
+    edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
     total = dict(zip(_TOTALS, cells.total(*(getattr(sums, name) for name in _TOTALS)), strict=True))
-    contact, edge_square, edge_energy, lift, lift_energy = cells.total(
-        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy
+    contact, edge_square, edge_energy, lift, lift_energy, *with_lift = cells.total(
+        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, *with_lift
     )
     lift = np.sqrt(lift)
-    left = unbalanced(level, cells, flux.left, kappa.low)
-    loose = np.sqrt(edge_square) + left
+    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums)
+    rounding = _rounding(cells, kappa, w, load)
+    loose = np.sqrt(edge_square) + left + hidden + rounding
     same = total["flux"] + total["companion"] + total["load"]
     same += 2 * (total["load_flux"] + total["slack"])
     mixed = 2 * (total["cross"] + total["load_companion"])
-    far = np.sqrt(max(same - mixed, 0.0)) + lift + loose
-    near = np.sqrt(max(same + mixed, 0.0)) + lift
-    bound = near / 2 + loose / 2 + np.sqrt(far**2 / 4 + contact)
+    far = np.sqrt(max(same - mixed + total["far"], 0.0) + with_lift[0]) + loose
+    near = np.sqrt(max(same + mixed + total["near"], 0.0) + with_lift[1]) + rounding
+    radius = loose / 2 + np.sqrt(far**2 / 4 + contact)
+    bound = near / 2 + radius
+    assert sums.middle is not None
+    of_gradients = cells.total(np.sum(np.maximum(sums.middle, 0.0) / kappa.low))[0]
+    bound_h1 = np.sqrt(of_gradients) / 2
+    bound_h1 += (rounding / 2 + radius) / np.sqrt(kappa.smallest)
     energy = total["energy"] - edge_energy
+    assert sums.steepness is not None
+    steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
+    lift_energy += hidden_energy + total["energy_slack"]
+    lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
     level.tidy()
     reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
     if reason is not None:
         return Certificate(reason=reason, seconds=time.perf_counter() - began)
     return Certificate(
-        bound_h1=float(bound / np.sqrt(kappa.smallest)),
+        bound_h1=float(min(bound_h1, bound / np.sqrt(kappa.smallest))),
         bound_energy_norm=float(bound),
         bound_companion=float((far + np.sqrt(far**2 + 4 * contact)) / 2 + lift),
         energy=(
@@ -202,10 +254,10 @@ def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = No
             "flux": float(np.sqrt(total["flux"])),
             "companion": float(np.sqrt(total["companion"])),
             "contact": float(np.sqrt(contact)),
-            "load": float(np.sqrt(total["load"])),
+            "load": float(np.sqrt(total["load"]) + hidden),
             "neumann": float(np.sqrt(total["neumann"])),
             "boundary": float(lift),
-            "solver": float(left),
+            "solver": float(left + carried),
         },
         indicators=sums.indicators,
         seconds=time.perf_counter() - began,
@@ -213,10 +265,13 @@ def certify(solution: Solution, sweeps: int = 2, flux_from: Solution | None = No
             level=level,
             w=w,
             kappa=kappa.mean,
+            hats=load.hats,
+            segments=segments,
             varies=kappa.values is not None,
             excess=flux.excess,
             vertices=v.vertices,
             bumps=v.bumps,
+            cusps=v.cusps,
             force=float(flux.contact.sum()),
             reach=float(bound - near / 2 + loose + lift / 2),
         ),
@@ -232,8 +287,89 @@ _TOTALS = (
     "load_companion",
     "slack",
     "energy",
+    "energy_slack",
+    "far",
+    "near",
     "neumann",
 )
+
+
+def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux, slopes: FloatArray) -> float:
+    """About how large the bound will be: ‖p‖, but for κ within cells; collective.
+
+    Where that is next to nothing, as without a load, the jumps of u_h tell.
+    """
+    squares = field_squares(cells, flux.excess, slice(0, cells.number)) / kappa.mean
+    square, scale, number = cells.total(np.sum(squares), np.sum(kappa.mean * slopes), cells.number)
+    if square < 0.05 * scale / number:
+        index_map = cells.domain.mesh.topology.index_map(0)
+        size, flat = index_map.size_local + index_map.num_ghosts, cells.vertices.ravel()
+        total, count = (
+            cells.share(np.bincount(flat, values, minlength=size).astype(np.float64), 0)
+            for values in (w.ravel(), None)
+        )
+        change = (total / np.maximum(count, 1.0))[cells.vertices] - w
+        jumps = kappa.mean * dot_rows(change, cells.apply(change, slice(0, cells.number)))
+        square += float(cells.total(np.sum(np.maximum(jumps, 0.0)))[0])
+    return float(np.sqrt(max(square, 1e-16 * scale, 1e-200)))
+
+
+ROUNDING = 64 * np.finfo(np.float64).eps
+"""Relative error of what a cell adds to the certificate's norms."""
+
+
+def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load) -> float:
+    """What rounding may do to ‖p ± b‖; collective.
+
+    Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
+    is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller.
+    """
+    values = np.abs(w).max(axis=0)
+    trace = cells.trace(slice(0, cells.number))
+    square = kappa.high * trace * values**2
+    of_load = np.abs(load.mean)
+    if load.variance is not None:
+        of_load = of_load + np.sqrt(load.variance)
+    square += cells.diameter2 * cells.volume * of_load**2 / kappa.low
+    return float(ROUNDING * np.sqrt(cells.total(np.sum(square))[0]))
+
+
+def _hidden(
+    level: Level,
+    cells: Cells,
+    kappa: Coefficient,
+    certain: Certain,
+    segments: Segments,
+    v: Companion,
+    sums: Sums,
+) -> tuple[float, float]:
+    """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
+
+    On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
+    on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise.
+    """
+    counts = certain.missed is not None, bool(segments.missed.any())
+    if not any(cells.total(*counts)):
+        return 0.0, 0.0
+    missed, square, change = np.zeros(cells.number), 0.0, 0.0
+    if certain.missed is not None and certain.rough is not None:
+        missed = certain.missed
+        rough = poincare(cells.tdim) * np.sqrt(cells.diameter2 / kappa.low) * certain.rough
+        assert sums.steepness is not None
+        means = np.abs(v.vertices[cells.vertices].sum(axis=0) / (cells.tdim + 1))
+        if cells.tdim == 2:
+            means += np.abs(v.bumps[cells.facets]).sum(axis=0) / 3
+        if v.cusps is not None:
+            np.add.at(means, v.cusps.at, np.abs(v.cusps.means))
+        change = np.sum(means * missed + rough * np.sqrt(np.maximum(sums.steepness, 0.0)))
+        square = np.sum(rough**2)
+    at, sizes = segments.beyond()
+    on_edge = np.sqrt(np.sum(sizes**2 / pick(kappa.low, at)))
+    missed = missed + np.bincount(segments.facets.cells, segments.missed, minlength=cells.number)
+    change += segments.change(v)
+    square, on_edge, change = cells.total(square, on_edge**2, change)
+    loose = np.sqrt(square) + np.sqrt(on_edge)
+    return loose + unbalanced(level, cells, missed, kappa.low, False), float(change)
 
 
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
@@ -243,21 +379,36 @@ def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
 
 
 def _lifted(
-    cells: Cells, kappa: Coefficient, load: Load, v: Companion, sums: Sums
-) -> tuple[float, float]:
-    """‖κ^{1/2} ∇ℓ‖² and how far J(v + ℓ) may be from J(v), bounds of this rank's shares."""
+    cells: Cells, kappa: Coefficient, certain: Certain, v: Companion, sums: Sums
+) -> tuple[float, float, float, float]:
+    """Bounds of what ℓ changes, this rank's shares.
+
+    Returns:
+        ‖κ^{1/2} ∇ℓ‖², how far J(v + ℓ) may be from J(v), and what ‖p − b‖² and ‖p + b‖² grow by,
+        the last put into the cells' shares.
+    """
     at, slope, size = v.lift
     if not len(at):
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0
     which, place = np.unique(at, return_inverse=True)
     high = kappa.high[which] if kappa.high.ndim else kappa.high
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
+    load = certain.load
     f = np.abs(load.mean[which])
     if load.variance is not None:
         f = np.hypot(f, np.sqrt(load.variance[which]))
+    if certain.rough is not None:
+        f += certain.rough[which] / np.sqrt(cells.volume[which])
     assert sums.steepness is not None
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
     assert sums.indicators is not None
-    sums.indicators[which] += steep**2
     change = before * steep + 0.5 * steep**2 + np.sqrt(cells.volume[which]) * f * area
-    return float(np.sum(steep**2)), float(np.sum(change))
+    assert sums.middle is not None and sums.across is not None
+    noise = 1e-14 * sums.indicators[which]
+    far, near = (
+        steep * (2.0 * np.sqrt(np.maximum(row[which], 0.0) + noise) + steep)
+        for row in (sums.across, sums.middle)
+    )
+    sums.middle[which] = np.maximum(sums.middle[which], 0.0) + near
+    sums.indicators[which] += steep**2
+    return float(np.sum(steep**2)), float(np.sum(change)), float(np.sum(far)), float(np.sum(near))

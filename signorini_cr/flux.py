@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .assembly import Level
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
 
 
 @dataclass(eq=False)
@@ -91,7 +92,9 @@ def equilibrate(
     return Flux(excess, contact, touching, left)
 
 
-def unbalanced(level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray) -> float:
+def unbalanced(
+    level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray, signed: bool = True
+) -> float:
     """Bound W with |Σ_T left_T e_T| ≤ W ‖κ^{1/2} ∇e‖ for e ∈ H¹ that vanishes on Γ0.
 
     e_T is the mean over T. Level by level, what a cell's children have too much or too little is
@@ -103,6 +106,7 @@ def unbalanced(level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArr
         cells: The same mesh.
         left: Integrals over the cells, shape (cells,).
         kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
+        signed: Whether left is known; else it is an upper bound of the absolute value.
     """
     volume, bound = cells.volume, 0.0
     while level.coarser is not None and level.parent_cell is not None:
@@ -120,40 +124,98 @@ def unbalanced(level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArr
             np.minimum.at(coarse, parent, kappa_min)
             kappa_min = coarse
         h = domain.mesh.h(d, np.arange(number, dtype=np.int32))
-        square = np.maximum(square - left**2 / volume, 0.0)
+        if signed:
+            square = np.maximum(square - left**2 / volume, 0.0)
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if level.domain is not cells.domain:
         cells = Cells(level.domain, level.V)
-    return float(bound + _carried(cells, left, kappa_min))
+    return float(bound + _carried(cells, left, kappa_min, signed))
 
 
-def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray) -> float:
-    """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T.
+def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
+    """Add to y what the cells lack, carried to Γ0 along a tree, where that is worth it; collective.
+
+    Args:
+        cells: The mesh.
+        flux: y; what is left becomes 0 but for rounding.
+        kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
+        size: About ‖κ^{-1/2}(y − κ∇u_h)‖.
+        bound: What `unbalanced` gives.
+
+    Returns:
+        The norm ‖κ^{-1/2} q‖ of what was added; 0 if nothing was.
+    """
+    if bound <= WORTH * size:
+        return 0.0
+    fluxes, _, all_reached = _carry(cells, flux.left)
+    if not all_reached:
+        return 0.0
+    squares = field_squares(cells, fluxes, slice(0, cells.number)) / kappa_min
+    square = cells.total(np.sum(squares))[0]
+    if not np.sqrt(size**2 + square) - size < bound:
+        return 0.0
+    flux.excess += fluxes
+    flux.left += sum_rows(fluxes)
+    return float(np.sqrt(square))
+
+
+WORTH = 1e-3
+"""Part of the bound from which on what is left of the equation is carried away by y itself."""
+
+
+def _carry(cells: Cells, left: FloatArray) -> tuple[FloatArray, IntArray, bool]:
+    """Fluxes of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
 
     q·n vanishes on the boundary but Γ0. Cell after cell, the farthest from Γ0 first, sends what it
     holds through the facet by which a walk from Γ0 first came to it.
+
+    Returns:
+        Fluxes out of each cell, shape (d + 1, cells), the local facets that the cells send through,
+        and whether all cells have a way.
     """
     comm = cells.comm
     fluxes = np.zeros((cells.tdim + 1, cells.number))
+    ways = np.zeros(cells.number, dtype=np.intp)
     arrived = np.zeros(len(cells.exterior))
     for layer, way_out in reversed(cells.layers):
         inflow = arrived[cells.facets[:, layer]]
         outflow = -left[layer] - inflow.sum(axis=0)
         fluxes[:, layer] = inflow
         fluxes[way_out, layer] = outflow
+        ways[layer] = way_out
         through = cells.facets[way_out, layer]
         arrived[through] = -outflow
         if comm.size > 1:
             arrived[cells.between] += cells.from_others(through, -outflow)
     reached = cells.total(sum(len(layer) for layer, _ in cells.layers), cells.number)
-    if reached[0] != reached[1]:
+    return fluxes, ways, bool(reached[0] == reached[1])
+
+
+def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, signed: bool) -> float:
+    """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T."""
+    fluxes, ways, all_reached = _carry(cells, left)
+    if not all_reached:
         return np.inf
-    squares = field_squares(cells, fluxes, slice(0, cells.number))
-    return float(np.sqrt(comm.allreduce(float(np.sum(squares / kappa_min)))))
+    everywhere = slice(0, cells.number)
+    if signed:
+        squares = field_squares(cells, fluxes, everywhere)
+    else:  # the triangle inequality for what comes in by each facet, and for the cell's own
+        norms, at = np.zeros(cells.number), np.arange(cells.number)
+        for i, amount in enumerate((*fluxes, left)):
+            unit = np.zeros_like(fluxes)
+            if i < len(fluxes):
+                unit[i] = 1.0
+            amount = np.where(ways == i, 0.0, np.abs(amount))
+            unit[ways, at] = -1.0
+            norms += amount * np.sqrt(np.maximum(field_squares(cells, unit, everywhere), 0.0))
+        squares = norms**2
+    return float(np.sqrt(cells.comm.allreduce(float(np.sum(squares / kappa_min)))))
 
 
-def field_squares(cells: Cells, fluxes: FloatArray, part: slice) -> FloatArray:
+def field_squares(
+    cells: Cells, fluxes: FloatArray, part: slice | npt.NDArray[np.intp]
+) -> FloatArray:
     """‖p‖²_T of the field with the given fluxes out of the cell, shape (cells in the part,).
 
     p = (s (x − x_T) − Σ a_i X_i) / (d |T|) with s the sum of the fluxes and a_i = flux_i − s/(d+1).

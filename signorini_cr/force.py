@@ -63,13 +63,17 @@ def force_bounds(solution: Solution) -> tuple[float, float]:
     total = sum_rows(at_vertices)
     work = made.kappa * (dot_rows(v, slopes) - dot_rows(w, slopes))
     work -= made.kappa * 4 / 3 * dot_rows(made.bumps[cells.facets], slopes)
+    if made.cusps is not None:
+        pull, _ = made.cusps.pulls(cells)
+        work[made.cusps.at] += dot_rows(pull, at_vertices[:, made.cusps.at])
     s = sum_rows(P)
     work -= (s * total - dot_rows(P, at_vertices)) / d - s * total / (d + 1)
-    load, edge = level.load, level.edge
-    if load.hats is not None:
-        work -= cells.volume * dot_rows(load.hats, at_vertices)
-    on_edge = edge.g.hats @ at_vertices[cells.others[edge.side.local].T, edge.side.cells]
-    edge_work = np.sum(edge.measure * edge.g.weights[:, None] * edge.rest * on_edge)
+    if made.hats is not None:
+        work -= cells.volume * dot_rows(made.hats, at_vertices)
+    edge = made.segments
+    ends = at_vertices[cells.others[edge.side.local].T, edge.side.cells]
+    on_edge = np.einsum("qin,in->qn", edge.hats, ends)
+    edge_work = np.sum(edge.measure * edge.weights[:, None] * edge.rest * on_edge)
     energy = np.sum(made.kappa * dot_rows(at_vertices, slopes))
     middle, energy = cells.total(
         made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)

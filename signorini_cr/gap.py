@@ -10,6 +10,7 @@ All of them are quadratic forms in a handful of numbers per cell, in which the m
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from .cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bump_squares, on_facet
 from .flux import Flux, field_squares
-from .loads import Edge, Load
+from .loads import Load, Segments
 from .moments import Coefficient
 
 FloatArray = npt.NDArray[np.float64]
@@ -32,27 +33,37 @@ class Sums:
         flux: ‖p‖².
         companion: ‖b‖².
         cross: ∫ p·b.
+        far: How far ‖p − b‖² may be above its value by quadrature.
+        near: The same of ‖p + b‖².
         load: Bound of ‖κ^{-1/2}σ‖².
         load_flux: ∫ κ^{-1/2}σ·p.
         load_companion: ∫ κ^{-1/2}σ·b.
         slack: How far load_flux may be from the truth.
         energy: ½∫ κ|∇v|² − ∫ f v.
+        energy_slack: How far this may be from the truth.
         neumann: The part of load that comes from g alone.
         indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).
         steepness: ∫_T κ|∇v|², shape (cells,).
+        middle: Bounds of ∫_T |p + κ^{-1/2}σ + b|², shape (cells,).
+        across: The same of ∫_T |p + κ^{-1/2}σ − b|².
     """
 
     flux: float = 0.0
     companion: float = 0.0
     cross: float = 0.0
+    far: float = 0.0
+    near: float = 0.0
     load: float = 0.0
     load_flux: float = 0.0
     load_companion: float = 0.0
     slack: float = 0.0
     energy: float = 0.0
+    energy_slack: float = 0.0
     neumann: float = 0.0
     indicators: FloatArray | None = None
     steepness: FloatArray | None = None
+    middle: FloatArray | None = None
+    across: FloatArray | None = None
 
 
 def integrate(
@@ -69,19 +80,31 @@ def integrate(
         v: v.
     """
     d = cells.tdim
-    sums = Sums(indicators=np.empty(cells.number), steepness=np.empty(cells.number))
-    assert sums.indicators is not None and sums.steepness is not None
+    indicators, steepness, middle, across = np.empty((4, cells.number))
+    sums = Sums(indicators=indicators, steepness=steepness, middle=middle, across=across)
     for part in blocks(cells.number):
         P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
         height = v.bumps[cells.facets[:, part]] if d == 2 else None
-        forms = _exact if kappa.values is None else _by_quadrature
-        pp, bb, pb, vv = forms(cells, kappa, part, P, c, W, height)
+        around, beside = np.zeros((2, part.stop - part.start))
+        if kappa.values is None:
+            pp, bb, pb, vv = _exact(cells, kappa, part, P, c, W, height)
+        else:
+            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(
+                cells, kappa, part, P, c, W, height
+            )
+            around += near
+            beside += far
+            sums.far += float(np.sum(far))
+            sums.near += float(np.sum(near))
+            sums.energy_slack += float(np.sum(of_energy))
         volume, s = cells.volume[part], sum_rows(P)
         total = sum_rows(c) + sum_rows(W)
         fv = load.mean[part] * total / (d + 1)
         if height is not None:
             fv += load.mean[part] * sum_rows(height) / 3
-        indicators = pp + bb
+        share = pp + bb
+        around += pp + bb + 2.0 * pb
+        beside += pp + bb - 2.0 * pb
         if load.hats is not None and load.bumps is not None and load.variance is not None:
             hats, bumps = load.hats[:, part], load.bumps[:, part]
             moment = dot_rows(hats, c)
@@ -91,26 +114,28 @@ def integrate(
             fv += moment
             square = poincare(d) ** 2 * cells.diameter2[part] * volume * load.variance[part]
             osc = square / pick(kappa.low, part)
-            indicators += osc
-            mean, low, high = (pick(k, part) for k in (kappa.mean, kappa.low, kappa.high))
-            sums.load += float(np.sum(osc))
-            sums.load_companion += float(np.sum(volume * moment))
+            share += osc
+            against, slack = np.zeros_like(osc), np.zeros_like(osc)
             if d == 2:
                 against = _against_potential(cells, P, s, hats, bumps, part)
-                sums.load_flux += float(np.sum(against / mean))
+                against /= pick(kappa.mean, part)
             else:
-                sums.slack += float(np.sum(np.sqrt(osc * pp)))
+                slack = np.sqrt(osc * pp)
             if kappa.values is not None:
                 # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
-                spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
-                steep = np.sqrt(np.maximum(dot_rows(W, cells.apply(W, part)), 0.0))
-                y = np.sqrt(field_squares(cells, P, part)) + mean * steep
-                sums.slack += float(np.sum(np.sqrt(square) * spread * y))
+                slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
+            sums.load += float(np.sum(osc))
+            sums.load_companion += float(np.sum(volume * moment))
+            sums.load_flux += float(np.sum(against))
+            sums.slack += float(np.sum(slack))
+            around += osc + 2.0 * (against + slack + volume * moment)
+            beside += osc + 2.0 * (against + slack - volume * moment)
         sums.flux += float(np.sum(pp))
         sums.companion += float(np.sum(bb))
         sums.cross += float(np.sum(pb))
         sums.energy += float(np.sum(0.5 * vv - volume * fv))
-        sums.indicators[part], sums.steepness[part] = indicators, vv
+        indicators[part], steepness[part] = share, vv
+        middle[part], across[part] = around, beside
     return sums
 
 
@@ -119,7 +144,7 @@ def integrate_edge(
     kappa: Coefficient,
     w: FloatArray,
     load: Load,
-    edge: Edge,
+    edge: Segments,
     flux: Flux,
     v: Companion,
     sums: Sums,
@@ -127,7 +152,7 @@ def integrate_edge(
     """Add what g has beyond its means on Γg.
 
     σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
-    Where κ varies within cells, y − κ∇u_h is no gradient, and the norm is returned instead.
+    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f.
 
     Args:
         cells: The mesh.
@@ -146,18 +171,23 @@ def integrate_edge(
     at, sizes = edge.oscillation()
     low = pick(kappa.low, at)
     assert sums.indicators is not None
+    assert sums.middle is not None and sums.across is not None
     sums.indicators[at] += sizes**2 / low
     sums.neumann = float(np.sum(sizes**2 / low))
-    if kappa.values is not None or d != 2:
+    if d != 2:
         return sums.neumann
     of_f: npt.NDArray[np.float64] = np.zeros(len(at))
     if load.variance is not None:
         square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
         of_f = poincare(d) * np.sqrt(square)
-    sums.load += float(np.sum((2.0 * of_f * sizes + sizes**2) / low))
+    more = (2.0 * of_f * sizes + sizes**2) / low
+    sums.load += float(np.sum(more))
+    for row in (sums.middle, sums.across):
+        row[at] += more
     ends = cells.others[side.local].T, side.cells
-    weights = edge.measure * edge.g.weights[:, None] * edge.rest
-    jump = on_facet(cells, side, edge.g, v.vertices, v.bumps) - edge.g.hats @ w[ends]
+    weights = edge.measure * edge.weights[:, None] * edge.rest
+    jump = on_facet(cells, side, edge.hats, v.vertices, v.bumps)
+    jump -= np.einsum("qin,in->qn", edge.hats, w[ends])
     sums.load_companion += float(np.sum(weights * jump))
     # The potential of y − κ_T∇u_h, as in _against_potential
     P = flux.excess[:, side.cells]
@@ -167,11 +197,40 @@ def integrate_edge(
     middle = (apex + base.sum(axis=0)) / (d + 1)
     pull = a[side.local, np.arange(len(s))][:, None] * (apex - middle)
     pull += np.einsum("in,ink->nk", a[ends[0], np.arange(len(s))], base - middle)
-    x = np.einsum("qi,ink->qnk", edge.g.hats, base) - middle
+    x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
     potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
     potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
     sums.load_flux += float(np.sum(weights * potential))
+    np.add.at(sums.middle, side.cells, 2.0 * (weights * (potential + jump)).sum(axis=0))
+    np.add.at(sums.across, side.cells, 2.0 * (weights * (potential - jump)).sum(axis=0))
+    if kappa.values is not None:
+        slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], w[:, at])
+        sums.slack += float(np.sum(slack))
+        for row in (sums.middle, sums.across):
+            row[at] += 2.0 * slack
     return 0.0
+
+
+def _twist(
+    cells: Cells,
+    kappa: Coefficient,
+    where: slice | npt.NDArray[np.intp],
+    P: FloatArray,
+    W: FloatArray,
+) -> FloatArray:
+    """max_T |κ⁻¹ − κ_T⁻¹| ‖y‖_T, or somewhat more.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        where: Which cells.
+        P: Fluxes of y − κ_T∇u_h out of them.
+        W: u_h at their vertices.
+    """
+    mean, low, high = (pick(k, where) for k in (kappa.mean, kappa.low, kappa.high))
+    spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
+    steep = np.sqrt(np.maximum(dot_rows(W, cells.apply(W, where)), 0.0))
+    return spread * (np.sqrt(np.maximum(field_squares(cells, P, where), 0.0)) + mean * steep)
 
 
 def _exact(
@@ -218,38 +277,110 @@ def _by_quadrature(
     W: FloatArray,
     height: FloatArray | None,
 ) -> tuple[FloatArray, ...]:
-    """The same for any κ.
+    """The same for any κ, and how far it may be from the truth.
+
+    Returns:
+        ∫_T of |p|², |b|², p·b and κ|∇v|²; and bounds of what quadrature may miss of ∫_T |p − b|²,
+        ∫_T |p + b|² and ½∫_T κ|∇v|².
+    """
+    values, cut = kappa.values, kappa.cut
+    assert values is not None and cut is not None
+    rule, mean = kappa.rule, kappa.mean
+    points = zip(values[:, part], rule.weights, rule.hats.T, strict=True)
+    rows = _at_points(cells, mean, part, P, c, W, height, points)
+    rows = _with_slack(rows, cut.errors[:, part], cells.tdim)
+    first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
+    if first < last:
+        pieces, within = cut.pieces[np.arange(first, last)], cut.errors_inside[:, first:last]
+        at = pieces.parent - part.start
+        hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
+        points = zip(kappa.inside[:, first:last], rule.weights, hats, strict=True)
+        of_cell = P[:, at], c[:, at], W[:, at], None if height is None else height[:, at]
+        there = _at_points(cells, mean, pieces.parent, *of_cell, points)
+        there = _with_slack(there, within, cells.tdim) * pieces.part
+        which, place = np.unique(at, return_inverse=True)
+        rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
+    return tuple(rows)
+
+
+def _with_slack(rows: FloatArray, errors: FloatArray, d: int) -> FloatArray:
+    """The first four rows, and what quadrature may miss; see `Coefficient.enclose` for the errors.
+
+    With z = v or 2u_h − v it is the smaller of two bounds of what it misses of ∫ κ⁻¹|y − κ∇z|²:
+    that of its three products, and what follows from ‖κ^{-1/2}(y − κ∇z)‖ ≤ N(y − κ∇z) + 2R N(∇z),
+    where N(·)² is 1 + t times the quadrature of κ⁻¹|·|².
+    """
+    pp, bb, pb, vv, yy, *at_z = rows
+    R, t, W, inverse_W, strip_low, strip_high, _ = errors
+    slack = []
+    for sign, (zz, steep) in ((-2.0, at_z[:2]), (2.0, at_z[2:])):
+        products = 2.0 * (inverse_W * yy + W * zz)
+        square = np.maximum(pp + bb + sign * pb, 0.0)
+        norm = (1.0 + t) * (np.sqrt(square) + 2.0 * R * np.sqrt(steep)) ** 2
+        # on strips κ may be what it is nowhere else, and an affine field (d + 1) times its norm
+        strips = strip_low * yy + strip_high * zz
+        slack.append(np.fmin(products, norm - square + 2.0 * (d + 1) ** 2 * strips))
+    return np.stack([pp, bb, pb, vv, *slack, W * at_z[0]])
+
+
+def _at_points(
+    cells: Cells,
+    mean: FloatArray,
+    where: slice | npt.NDArray[np.intp],
+    P: FloatArray,
+    c: FloatArray,
+    W: FloatArray,
+    height: FloatArray | None,
+    points: Iterable[tuple[FloatArray, float, FloatArray]],
+) -> FloatArray:
+    """Means over points of |T| times what the gap is made of.
+
+    It is |p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and κ⁻¹|∇z|² for z = v and z = 2u_h − v.
 
     At a point with barycentric coordinates λ_k, y − κ_T∇u_h = Σ Q_k X_k / (d |T|) with
     Q_k = λ_k ΣP − P_k, and ∇(v − u_h) = Σ γ_k ∇λ_k with γ_k = c_k + 4 Σ_l height_l λ_m, where
     k, l, m are the three vertices. As Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
+
+    Args:
+        cells: The mesh.
+        mean: κ_T.
+        where: Which cells.
+        P: Fluxes of y − κ_T∇u_h out of the cells.
+        c: v − u_h at the vertices.
+        W: u_h at the vertices.
+        height: Heights of v's bumps.
+        points: κ, a weight, and the point's barycentric coordinates, shape (d + 1,) or (d + 1, n).
     """
-    d, mean, volume = cells.tdim, pick(kappa.mean, part), cells.volume[part]
-    assert kappa.values is not None
+    d, mean, volume = cells.tdim, pick(mean, where), cells.volume[where]
     s = sum_rows(P)
-    gg = dot_rows(W, cells.apply(W, part))
-    pp, bb, pb, vv = np.zeros((4, len(volume)))
-    for k, weight, hat in zip(
-        kappa.values[:, part], kappa.rule.weights, kappa.rule.hats.T, strict=True
-    ):
-        Q = hat[:, None] * s - P
+    gg = dot_rows(W, cells.apply(W, where))
+    rows = np.zeros((9, len(volume)))
+    for k, weight, hat in points:
+        hat = hat.reshape(len(hat), -1)
+        Q = hat * s - P
         gamma = c.copy()
         if height is not None:
             for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
                 gamma[i] += 4.0 * hat[m] * height[j]
                 gamma[j] += 4.0 * hat[m] * height[i]
         qq = np.zeros_like(s)
-        for (i, j), length in zip(cells.pairs, cells.lengths[:, part], strict=True):
+        for (i, j), length in zip(cells.pairs, cells.lengths[:, where], strict=True):
             qq -= Q[i] * Q[j] * length
         qq /= d**2 * volume
-        S_gamma = cells.apply(gamma, part)
+        S_gamma = cells.apply(gamma, where)
         bend, along = dot_rows(gamma, S_gamma), dot_rows(W, S_gamma)
+        Qw = dot_rows(Q, W) / d
         off = k - mean
-        pp += weight / k * (qq - 2.0 * off * dot_rows(Q, W) / d + off**2 * gg)
-        bb += weight * k * bend
-        pb += weight * (dot_rows(Q, gamma) / d - off * along)
-        vv += weight * k * (gg + 2.0 * along + bend)
-    return pp, bb, pb, vv
+        pp, bb = (qq - 2.0 * off * Qw + off**2 * gg) / k, k * bend
+        pb = dot_rows(Q, gamma) / d - off * along
+        yy = qq + 2.0 * mean * Qw + mean**2 * gg
+        values = [pp, bb, pb, k * (gg + 2.0 * along + bend), yy]
+        for sign in (2.0, -2.0):
+            zz = gg + sign * along + bend
+            values += [zz, zz / k]
+        for row, value in zip(rows, values, strict=True):
+            row += weight * value
+    return rows
 
 
 def _against_potential(

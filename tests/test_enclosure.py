@@ -1,0 +1,277 @@
+"""Enclosures: jets against values elsewhere, and bounds of data that quadrature does not see."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx.mesh import create_unit_square
+from mpi4py import MPI
+
+from signorini_cr import Polygon, Problem, exact, expressions, solve
+from signorini_cr.compat import cell_nodes
+from signorini_cr.families import structured
+from signorini_cr.jets import Boxes, Enclosure, indices, lowered
+
+WORLD = MPI.COMM_WORLD
+
+FORMULAS = [
+    "sin(7*x*y) - cos(9*x)",
+    "abs(x)**3/(2 + y) - x**2",
+    "max(x, y) + min(x**3, exp(-y))",
+    "where(x > 0.1 and y <= 0.4, x, sqrt(y + 2))",
+    "(1 + y**2)**-2 + (2 + x)**0.5",
+    "sqrt(x**2 + y**2)**1.5*cos(1.5*atan2(y, x))",
+    "tan(x) + asin(x/3) - acos(y/3)",
+    "atan(x*3 - y) + sinh(x)*cosh(y - x) + tanh(3*x)",
+    "sign(x - y)*x",
+    "(2 + x)**y",
+    "(abs(x) + 0.01)**(y - x)",
+    "exp(-30*((x - 0.3)**2 + y**2)) + log(3 + x*y)",
+    "where(x < 0.2, 0, (x - 0.2)**2)",
+    "max(0, x)**1.5",
+    "where(not (x > y) or x == 0, 1, where(y != 2, 2, 3))",
+    "1/x",
+    "sqrt(x)",
+]
+
+
+def made(text):
+    mesh = create_unit_square(MPI.COMM_SELF, 1, 1)
+    formula = expressions.parse(text)
+    return formula, lowered(ufl.as_ufl(formula.ufl(ufl.SpatialCoordinate(mesh))))
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_jets_hold_at_every_point(text):
+    """Values by NumPy's reading of the formula, derivatives by Taylor's formula with them."""
+    formula, expression = made(text)
+    rng = np.random.default_rng(len(text))
+    n = 300
+    middle = rng.uniform(-1.5, 1.5, (2, n))
+    half = 10.0 ** rng.uniform(-5, -0.3, n) * rng.uniform(0.2, 1, (2, n))
+    low, high = middle - half, middle + half
+    jet = Enclosure(Boxes(low, high))(expression)
+    for _ in range(30):
+        at, step = low + (high - low) * rng.random((2, 2, n))
+        value = formula.numpy(at.T)
+        known = np.isfinite(value)
+        assert np.all(((jet.low <= value) & (value <= jet.high))[known])
+        # f(b) − f(a) is Taylor's polynomial at a, with the last coefficient from anywhere between
+        value_there = formula.numpy(step.T)
+        for order in (1, 2, 3):
+            start = Enclosure(Boxes(at, at), order=order)(expression)
+            off, room = value_there - value, 1e-12 * (1 + np.abs(value) + np.abs(value_there))
+            for index, here, over in zip(indices(2, order)[1:], start.rest, jet.rest, strict=False):
+                ball = over if sum(index) == order else here
+                if ball is not None:
+                    size = (step[0] - at[0]) ** index[0] * (step[1] - at[1]) ** index[1]
+                    off = off - ball[0] * size
+                    room = room + ball[1] * np.abs(size) + 1e-12 * np.abs(ball[0] * size)
+            fine = np.isfinite(off) & np.isfinite(room)
+            assert np.all(np.abs(off[fine]) <= room[fine] * (1 + 1e-9))
+
+
+@pytest.mark.parametrize("text", ["sin(7*x*y) - cos(9*x)", "exp(x)*(2 + y)**0.5/(3 + x)"])
+def test_jets_are_sharp_to_first_order(text):
+    """The width of a range is the variation plus O(h²)."""
+    formula, expression = made(text)
+    middle = np.random.default_rng(0).uniform(-1, 1, (2, 50))
+    excess = []
+    for h in (1e-2, 1e-3):
+        jet = Enclosure(Boxes(middle - h, middle + h))(expression)
+        grid = np.linspace(-h, h, 9)
+        values = [formula.numpy((middle + np.array([[a], [b]])).T) for a in grid for b in grid]
+        excess.append(np.max(jet.high - jet.low - np.ptp(values, axis=0)))
+    assert excess[1] < 0.2 * excess[0]
+
+
+# ---- exact problems in one variable, whose data jump inside cells
+
+
+def clipped(triangle, normal, c):
+    """The parts of a triangle on both sides of normal·x = c."""
+    s = triangle @ normal - c
+    if (s >= 0).all() or (s <= 0).all():
+        return [triangle]
+    i = next(i for i in range(3) if np.sum((s > 0) == (s[i] > 0)) == 1)
+    a, b, d = triangle[i], triangle[i - 2], triangle[i - 1]
+    p, q = (a + (z - a) * s[i] / (s[i] - z @ normal + c) for z in (b, d))
+    return [np.array(t) for t in ([a, p, q], [p, b, q], [b, d, q])]
+
+
+def weighted_error(solution, normal, breaks, slope, kappa):
+    """‖κ^{1/2}∇_h(u − u_h)‖ for ∇u = slope(s, middle) normal, affine in s between the breaks."""
+    mesh, V = solution.domain.mesh, solution.u.function_space
+    own = mesh.topology.index_map(2).size_local
+    corners = mesh.geometry.x[cell_nodes(mesh)[:own], :2]
+    facets = solution.u.x.array[V.dofmap.list[:own]]
+    w = facets.sum(axis=1, keepdims=True) - 2 * facets
+    rise = (w[:, 1:] - w[:, :1])[:, :, None]
+    gradients = np.linalg.solve(corners[:, 1:] - corners[:, :1], rise)[:, :, 0]
+    total = 0.0
+    for cell, gradient in zip(corners, gradients, strict=True):
+        parts = [cell]
+        for c in breaks:
+            parts = [piece for part in parts for piece in clipped(part, normal, c)]
+        for part in parts:
+            area = 0.5 * abs(np.linalg.det(part[1:] - part[0]))
+            middle = part.mean(axis=0) @ normal
+            mids = (part + np.roll(part, 1, axis=0)) / 2  # exact for quadratics
+            off = slope(mids @ normal, middle)[:, None] * normal - gradient
+            total += area / 3 * kappa(middle) * np.sum(off**2)
+    return np.sqrt(WORLD.allreduce(total))
+
+
+def square(kind, sides=("contact", "neumann", "dirichlet", "neumann")):
+    polygon = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], list(sides))
+    return structured(polygon, 8) if kind == "squares" else polygon.mesh(0.13)
+
+
+def holds(solution, error, energy):
+    certificate = solution.certificate
+    assert certificate.reason is None
+    low, high = certificate.energy
+    assert certificate.bound_energy_norm >= error * (1 - 1e-9)
+    assert low <= energy + 1e-12 and energy - 1e-12 <= high
+    return certificate.bound_energy_norm / error
+
+
+UP = np.array([0.0, 1.0])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 4])
+@pytest.mark.parametrize("kind", ["squares", "gmsh"])
+def test_a_load_that_jumps_inside_cells(kind, degree):
+    """−u'' = 3 below c and −2 above, ∂ₙu = 0 at the bottom, where α is out of reach."""
+    for c in (0.31, 0.5, 0.77):
+        problem = Problem(
+            f=lambda x, c=c: ufl.conditional(x[1] < c, 3.0, -2.0),
+            obstacle=-9.0,
+            quadrature_degree=degree,
+        )
+        solution = solve(problem, square(kind))
+        slope = lambda s, m, c=c: np.where(m < c, -3 * s, 2 * s - 5 * c)  # noqa: E731
+        error = weighted_error(solution, UP, [c], slope, lambda m: 1.0)
+        left = 2 - 5 * c  # u' at the top
+        energy = -0.5 * (3 * c**3 + (left**3 + 27 * c**3) / 6)
+        assert holds(solution, error, energy) < 1.9 or degree < 4
+
+
+@pytest.mark.parametrize("degree", [0, 4, 8])
+@pytest.mark.parametrize("kind", ["squares", "gmsh"])
+def test_a_coefficient_that_jumps_inside_cells(kind, degree):
+    for c in (0.31, 0.55):
+        kappa = lambda m, c=c: 1.0 if m < c else 10.0  # noqa: E731
+        problem = Problem(
+            f=2.0,
+            obstacle=-9.0,
+            coefficient=lambda x, c=c: ufl.conditional(x[1] < c, 1.0, 10.0),
+            quadrature_degree=degree,
+        )
+        solution = solve(problem, square(kind))
+        slope = lambda s, m, k=kappa: -2 * s / k(m)  # noqa: E731
+        error = weighted_error(solution, UP, [c], slope, kappa)
+        holds(solution, error, -(2 / 3) * (c**3 + (1 - c**3) / 10))
+
+
+def test_a_spot_between_all_quadrature_points():
+    """f = 40 for |y − c| < 0.005: u_h = 0, and the bound must know."""
+    c, w = 0.519, 0.005
+    problem = Problem(f=lambda x: ufl.conditional(abs(x[1] - c) < w, 40.0, 0.0), obstacle=-9.0)
+    solution = solve(problem, square("squares"))
+    slope = lambda s, m: -40 * np.clip(s - c + w, 0, 2 * w)  # noqa: E731
+    error = weighted_error(solution, UP, [c - w, c + w], slope, lambda m: 1.0)
+    energy = -0.5 * 1600 * ((2 * w) ** 3 / 3 + (2 * w) ** 2 * (1 - c - w))
+    holds(solution, error, energy)
+
+
+@pytest.mark.parametrize("kind", ["squares", "gmsh"])
+def test_data_that_jump_across_an_oblique_line(kind):
+    """u = −s/κ with κ 1:10 at s = 0: κ jumps, u_D and α have kinks inside facets."""
+    normal, c = np.array([0.6, 0.8]), 0.63
+    kappa = lambda m: 1.0 if m < c else 10.0  # noqa: E731
+
+    def far(x):
+        return 0.6 * x[0] + 0.8 * x[1] - c
+
+    problem = Problem(
+        f=0.0,
+        dirichlet=lambda x: ufl.conditional(far(x) < 0, -far(x), -far(x) / 10),
+        obstacle=lambda x: ufl.conditional(far(x) < 0, -far(x), -far(x) / 10),
+        coefficient=lambda x: ufl.conditional(far(x) < 0, 1.0, 10.0),
+    )
+    sides = ("contact", "dirichlet", "dirichlet", "dirichlet")
+    solution = solve(problem, square(kind, sides))
+    slope = lambda s, m: np.full_like(s, -1 / kappa(m))  # noqa: E731
+    error = weighted_error(solution, normal, [c], slope, kappa)
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    parts = [p for t in (corner[:3], corner[[0, 2, 3]]) for p in clipped(t, normal, c)]
+    energy = sum(
+        0.25 * abs(np.linalg.det(p[1:] - p[0])) / kappa(p.mean(axis=0) @ normal) for p in parts
+    )
+    holds(solution, error, energy)
+
+
+def test_flux_data_with_a_jump_inside_a_facet():
+    """g = −2 at the bottom left of c, 0 else: the bracket of a finer mesh is inside."""
+    sides = ("neumann", "contact", "dirichlet", "contact")
+    problem = Problem(
+        g=lambda x: ufl.conditional(x[0] < 0.47, -2.0, 0.0), obstacle=-9.0, quadrature_degree=0
+    )
+    polygon = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], list(sides))
+    brackets = [solve(problem, structured(polygon, n)).certificate.energy for n in (4, 8, 64)]
+    for low, high in brackets[:2]:
+        assert low <= brackets[2][0] and brackets[2][1] <= high
+
+
+def test_a_tent_narrower_than_a_facet():
+    """α rises between the points of its quadrature: the companion must be above it."""
+    problem = Problem(f=-1.0, obstacle=lambda x: ufl.max_value(-0.2, 0.3 - 40 * abs(x[0] - 0.563)))
+    brackets = [solve(problem, exact.E.structured(n)).certificate.energy for n in (4, 8, 160)]
+    for low, high in brackets[:2]:
+        assert low <= brackets[2][1] and brackets[2][0] <= high
+
+
+def test_reasons():
+    sides = ("contact", "neumann", "dirichlet", "neumann")
+    domain = square("squares", sides)
+    cases = {
+        "f is not bounded": Problem(f=lambda x: abs(x[1] - 0.3) ** -0.4, obstacle=-9.0),
+        "g is not bounded": Problem(g=lambda x: abs(x[1] - 0.3) ** -0.6, obstacle=-9.0),
+        # A jump would be refused; so steep is nearly one
+        "u_D jumps on a boundary facet, or its derivative is not known to be bounded": Problem(
+            dirichlet=lambda x: abs(x[0] - 0.3) ** 0.6, obstacle=-9.0
+        ),
+        "α jumps": Problem(
+            f=-9.0, obstacle=lambda x: ufl.conditional(abs(x[0] - 0.3) < 0.01, 0.5, -0.5)
+        ),
+        "no enclosure": Problem(f=lambda x: ufl.bessel_J(0, x[0]), obstacle=-9.0),
+    }
+    for words, problem in cases.items():
+        certificate = solve(problem, domain).certificate
+        assert certificate.bound_h1 is None and certificate.energy is None
+        assert words in certificate.reason
+
+
+def test_a_jump_along_cell_sides_costs_nothing():
+    """On a line of the mesh, straight or oblique, a jump is no jump inside any cell."""
+    for condition in (lambda x: x[1] < 0.375, lambda x: x[0] < x[1]):
+        problem = Problem(f=lambda x, c=condition: ufl.conditional(c(x), 3.0, -2.0), obstacle=-9.0)
+        parts = solve(problem, square("squares")).certificate.parts
+        assert parts["load"] < 1e-5 * parts["flux"]
+
+
+def test_same_figures_on_any_number_of_ranks():
+    polygon = Polygon(
+        [[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"]
+    )
+    problem = Problem(
+        f=lambda x: ufl.conditional(x[0] + 2 * x[1] < 1.1, 3.0, -2.0),
+        g=lambda x: ufl.conditional(x[1] < 0.43, 1.0, 0.0),
+        coefficient=lambda x: ufl.conditional(x[0] < 0.61, 1.0, 4.0),
+        obstacle=lambda x: -0.05 * abs(x[0] - 0.4),
+    )
+    here, alone = (
+        solve(problem, structured(polygon, 8, comm)).certificate for comm in (WORLD, MPI.COMM_SELF)
+    )
+    assert np.isclose(here.bound_h1, alone.bound_h1, rtol=1e-5)
+    assert np.allclose(here.energy, alone.energy, rtol=1e-5)
