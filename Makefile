@@ -4,7 +4,7 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies test ranks lint types clean purge
+.PHONY: demo studies verify test ranks test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -12,6 +12,11 @@ demo:
 # docs/studies.md with all its tables and pictures
 studies:
 	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 demos docs
+
+# docs/verification.md: what the program claims, checked by other code; then the same on two ranks
+verify:
+	$(run) timeout --kill-after=20 3600 python3 verification --out docs/verification.md
+	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 verification
 
 test:
 	$(run) $(limit) python3 -m pytest
@@ -24,6 +29,13 @@ shared = $(addprefix tests/test_,contact.py hierarchy.py multigrid.py output.py 
 ranks:
 	$(run) $(limit) mpirun -n 3 python3 -m pytest $(shared) -k 'not rates'
 	$(run) $(limit) mpirun -n 4 python3 -m pytest $(shared) -k 'not rates'
+
+# sdist and wheel, built, installed and tried: on the DOLFINx that is there, and on that of pip
+test-package:
+	./container/check-package
+
+test-wheels:
+	./container/check-package wheels
 
 lint:
 	$(run) container/tool ruff check

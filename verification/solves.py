@@ -1,0 +1,424 @@
+"""Contact forces of discrete problems: stiff data, random ones, thin cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from formulas import Formula, numeric, symbolic
+from judgement import EXACT, NOTHING, Judge, Verdict, finest
+from mpi4py import MPI
+from reference import Data
+from report import Group, Row, told
+
+from signorini_cr import Domain, Polygon, Problem
+
+COMM = MPI.COMM_WORLD
+
+OWN = (
+    "the same discrete problem, assembled and solved by other code: direct solver, active set "
+    "method, residuals in extended precision; refinement changes its forces by less than 1e-9"
+)
+CERTAIN = 1e8
+"""Contrast up to which the program may not refuse."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A discrete problem.
+
+    Attributes:
+        name: To find it again.
+        mesh: Makes the coarsest mesh.
+        levels: Meshes, the coarsest included.
+        formulas: f, g, α, u_D and κ.
+        parameters: Theirs.
+        contrast: Largest κ over the smallest.
+        degree: Of the quadrature.
+    """
+
+    name: str
+    mesh: Callable[[], Domain]
+    levels: int
+    formulas: dict[str, Formula]
+    parameters: tuple[float, ...]
+    contrast: float = 1.0
+    degree: int = 4
+
+    def run(self, ways: Sequence[bool] = (True, False)) -> list[Verdict]:
+        """Solve nested, cold, or both, and judge; collective."""
+        domain = self.mesh()
+        given: dict[str, Any] = {
+            key: symbolic(formula, domain.mesh, self.parameters)
+            for key, formula in self.formulas.items()
+        }
+        problem = Problem(**given, quadrature_degree=self.degree)
+        values = {key: numeric(formula, self.parameters) for key, formula in self.formulas.items()}
+        judge = Judge(Data(**values, degree=self.degree))
+        out = []
+        for nested in ways:
+            solution, steps = finest(problem, domain, self.levels, nested)
+            out.append(judge.verdict(solution, steps, COMM))
+        return out
+
+
+def squashed(domain: Domain, factor: float) -> Domain:
+    """The same mesh made thin."""
+    domain.mesh.geometry.x[:, 1] *= factor
+    return domain
+
+
+def tell(case: Case, way: str, verdict: Verdict) -> str:
+    """What went wrong, in a line."""
+    words = f"{case.name}, {way}: "
+    if verdict.fault:
+        return words + verdict.fault
+    if verdict.refused:
+        return words + "refused"
+    return words + (
+        f"forces wrong by {verdict.error:.0e}, their sum by {verdict.total:.0e}, "
+        f"{verdict.facets} facets in the wrong state"
+    )
+
+
+WAYS = {True: "nested", False: "cold"}
+
+
+def row_of(
+    name: str,
+    cases: Sequence[Case],
+    may_refuse: Callable[[Case], bool],
+    more: Callable[[Case, Verdict], str | None] = lambda *_: None,
+    least_proper: int = 0,
+) -> Row:
+    """Run cases and count.
+
+    Args:
+        name: What they have in common.
+        cases: To be run.
+        may_refuse: Whether the program may say that it did not converge.
+        more: What else there is to complain about, if anything.
+        least_proper: So many must have contact on a part of Γ1, not on all and not on none.
+    """
+    refused, proper, degenerate, number, steps = 0, 0, 0, 0, 0
+    error, failures = 0.0, []
+    for case in cases:
+        verdicts = case.run()
+        proper += any(verdict.proper for verdict in verdicts)
+        for way, verdict in zip(WAYS.values(), verdicts, strict=True):
+            number += 1
+            refused += verdict.refused
+            degenerate += verdict.degenerate
+            if not (verdict.refused or verdict.fault):
+                error = max(error, verdict.error, verdict.total)
+            steps = max(steps, *verdict.steps, 0)
+            complaint = more(case, verdict)
+            if not verdict.right and not (verdict.refused and may_refuse(case)):
+                failures.append(tell(case, way, verdict))
+            if complaint is not None:
+                failures.append(f"{case.name}, {way}: {complaint}")
+    if proper < least_proper:
+        failures.append(f"contact on a proper part of Γ1 in {proper} problems only")
+    worst = f"error of the forces {error:.0e}; {refused} refused"
+    worst += f"; at most {steps} CG steps"
+    worst += f"; contact on a proper part of Γ1 in {proper} of {len(cases)} problems"
+    if degenerate:
+        worst += f"; {degenerate} facets on the fence left out"
+    return told(Row(name, number, worst, OWN, failures))
+
+
+# ---- stiff data
+
+
+def _zero(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return 0.0 * x
+
+
+def _weight(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return -3.0 + 0.0 * x
+
+
+def _waves(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return -0.3 + 0.1 * m.cos(9.0 * x)
+
+
+def _slope(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return x / 5
+
+
+def _aslant(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return m.where(m.above(0.05 - 0.13 * y, x), p[0], 1.0)
+
+
+def _lumps(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    """Two discs, one on the boundary above."""
+    first = (x + 0.45) ** 2 + (y - 0.95) ** 2
+    second = (x - 0.5) ** 2 + (y - 0.55) ** 2
+    return m.where(m.above(0.09, m.smaller(first, second)), p[0], 1.0)
+
+
+def _layers(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    """A stiff plate between soft layers, tied to the sides."""
+    return m.where(m.above(0.06, abs(y - 0.55 - 0.1 * x)), p[0], 1.0)
+
+
+def _board(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    """Stiff and soft fields in turn, and soft along most of Γ1."""
+    wave = m.sin(4.1 * x + 0.3) * m.sin(4.7 * y + 0.9)
+    soft = m.above(m.where(m.above(x, -0.4), 0.35, 0.02), y)
+    return m.where(soft, 1.0, m.where(m.above(wave, 0.0), p[0], 1.0))
+
+
+RECTANGLE = ([[-1, 0], [1, 0], [1, 1], [-1, 1]], ["contact", "neumann", "dirichlet", "neumann"])
+HELD = ([[-1, 0], [1, 0], [1, 1], [-1, 1]], ["contact", "dirichlet", "dirichlet", "dirichlet"])
+CROOKED = (
+    [[-1, 0], [0.2, -0.15], [1, 0.1], [1.2, 0.9], [0, 1.2], [-0.9, 0.8]],
+    ["contact", "contact", "neumann", "dirichlet", "dirichlet", "neumann"],
+)
+ANGLE = (
+    [[-1, 0], [1, 0], [1, 0.5], [0.1, 0.5], [0.1, 1], [-1, 1]],
+    ["contact", "neumann", "dirichlet", "neumann", "dirichlet", "neumann"],
+)
+
+
+def _stiff(name: str, polygon: Any, kappa: Formula, contrast: float, levels: int = 4) -> Case:
+    vertices, boundary = polygon
+    return Case(
+        f"{name}, C = {contrast:.0e}",
+        lambda: Polygon(vertices, boundary).mesh(0.25, COMM),
+        levels,
+        {
+            "f": _weight,
+            "g": _zero,
+            "obstacle": _waves,
+            "dirichlet": _slope,
+            "coefficient": kappa,
+        },
+        (contrast,),
+        contrast,
+    )
+
+
+STIFF = {
+    "rectangle, κ = C left of a slant line": (RECTANGLE, _aslant),
+    "rectangle held on three sides, C in two discs": (HELD, _lumps),
+    "crooked hexagon, C in a plate": (CROOKED, _layers),
+    "L-shape, C in every other field": (ANGLE, _board),
+}
+
+
+def stiff(seed: int, quick: bool) -> Group:
+    """κ that jumps by many orders of magnitude, u_D that varies along the stiff part."""
+    rows = []
+    exponents = (4, 12) if quick else (2, 4, 6, 7, 8, 9, 10, 11, 12)
+    patterns = list(STIFF.items())[:2] if quick else list(STIFF.items())
+    levels = 2 if quick else 4
+    for name, (polygon, kappa) in patterns:
+        for title, chosen in (
+            ("C ≤ 1e8", [e for e in exponents if e <= 8]),
+            ("C > 1e8", [e for e in exponents if e > 8]),
+        ):
+            cases = [_stiff(name, polygon, kappa, 10.0**e, levels) for e in chosen]
+            rows.append(row_of(f"{name}, {title}", cases, lambda case: case.contrast > CERTAIN))
+    return Group(
+        "forces",
+        "Contact forces where the coefficient jumps",
+        f"f = −3, α = −0.3 + 0.1 cos 9x, u_D = x/5, κ = C on a part and 1 elsewhere, {levels} "
+        "meshes, each case from nested and from cold starts. Passed: the force on every facet and "
+        f"their sum right to {EXACT:.0e} (relative, the sum of all facets' errors) and the same "
+        "facets in contact; for C above 1e8 that or refused.",
+        rows,
+    )
+
+
+# ---- random problems
+
+
+def _any_load(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[0] * (1.0 + p[1] * m.sin(3.0 * x + p[2]))
+
+
+def _any_flux(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[3] * m.cos(2.0 * x + p[2])
+
+
+def _any_obstacle(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[4] + p[5] * m.cos(p[6] * x + p[7])
+
+
+def _any_value(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[8] * x + p[9] * y
+
+
+def _half(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return m.where(m.above(p[11] * x + p[12] * y, p[13]), p[10], 1.0)
+
+
+def _disc(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return m.where(
+        m.above(0.12, (x - p[13]) ** 2 + p[14] * (y - p[15]) ** 2),
+        p[10],
+        1.0,
+    )
+
+
+def _strip(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return m.where(m.above(0.15, abs(p[11] * x + p[12] * y - p[13])), p[10], 1.0)
+
+
+def _fields(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    wave = m.sin(4.0 * x + p[7]) * m.sin(p[16] * y + p[2])
+    return m.where(m.above(wave, 0.0), p[10], 1.0)
+
+
+KAPPAS: tuple[Formula, ...] = (_half, _disc, _strip, _fields)
+
+
+def _any_case(seed: int, number: int, thin: bool, levels: int) -> Case:
+    """A random polygon above one or two contact edges, random data."""
+    rng = np.random.default_rng((seed, number))
+    corners = int(rng.integers(3, 6))
+    angles = np.sort(rng.uniform(0.2, np.pi - 0.2, corners))
+    while np.diff(angles).min() < 0.2:
+        angles = np.sort(rng.uniform(0.2, np.pi - 0.2, corners))
+    radii = rng.uniform(0.7, 1.3, corners)
+    top = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+    bottom = [[-1.0, 0.0], [1.0, 0.0]]
+    boundary = ["contact"]
+    if rng.random() < 0.4:
+        bottom.insert(1, [rng.uniform(-0.4, 0.4), rng.uniform(-0.3, -0.05)])
+        boundary.append("contact")
+    vertices = np.concatenate([bottom, top])
+    sides = rng.choice(["dirichlet", "neumann"], corners + 1, p=[0.6, 0.4])
+    sides[rng.integers(0, corners + 1)] = "dirichlet"
+    aspect = 10.0 ** rng.uniform(1, 3) if thin else 1.0
+    size = float(rng.uniform(0.22, 0.4))
+    contrast = float(10.0 ** rng.uniform(0, 10)) if rng.random() < 0.85 else 1.0
+    inside = contrast if rng.random() < 0.7 else 1.0 / contrast
+    angle = rng.uniform(0, 2 * np.pi)
+    slope = rng.uniform(-0.3, 0.3)
+    parameters = [
+        -rng.uniform(0.5, 4),
+        rng.uniform(-0.5, 0.5),
+        rng.uniform(0, 6),
+        rng.uniform(-0.3, 0.3),
+        rng.uniform(-0.35, 0.0),
+        rng.uniform(0.1, 0.35),
+        rng.uniform(3, 11),
+        rng.uniform(0, 6),
+        slope,
+        rng.uniform(-0.2, 0.2),
+        inside,
+        np.cos(angle),
+        aspect * np.sin(angle),
+        rng.uniform(-0.3, 0.5),
+        aspect**2,
+        rng.uniform(0.2, 0.7) / aspect,
+        4.0 * aspect,
+    ]
+    for x, side in ((1.0, sides[0]), (-1.0, sides[-1])):
+        if side == "dirichlet":  # where Γ0 meets Γ1 the obstacle may not be above u_D
+            above = _any_obstacle(np, x, 0.0, parameters) - _any_value(np, x, 0.0, parameters)
+            parameters[4] -= max(above + 0.01, 0.0)
+    kappa = KAPPAS[int(rng.integers(len(KAPPAS)))]
+    return Case(
+        f"problem {number} of seed {seed} (aspect {aspect:.0f}, contrast {contrast:.0e})",
+        lambda: squashed(
+            Polygon(vertices, (*boundary, *map(str, sides))).mesh(size, COMM), 1.0 / aspect
+        ),
+        levels,
+        {
+            "f": _any_load,
+            "g": _any_flux,
+            "obstacle": _any_obstacle,
+            "dirichlet": _any_value,
+            "coefficient": kappa,
+        },
+        tuple(float(p) for p in parameters),
+        contrast,
+    )
+
+
+def random(seed: int, quick: bool) -> Group:
+    """Random polygons and data."""
+    number, levels = (8, 2) if quick else (300, 3)
+    rows = []
+    for title, thin in (("cells of any shape", False), ("cells up to 1000 times as long", True)):
+        own = [n for n in range(number) if (n % 4 == 3) == thin]
+        cases = [_any_case(seed, n, thin, levels) for n in own]
+        rows.append(
+            row_of(title, cases, lambda case: True, least_proper=0 if quick else 2 * len(own) // 3)
+        )
+    return Group(
+        "random",
+        "Random problems",
+        "Random polygons, f, g, α and u_D, κ in half planes, discs, strips and fields with a "
+        f"contrast up to 1e10; {levels} meshes, each case from nested and from cold starts. "
+        f"Passed: the same facets in contact and forces right to {EXACT:.0e}, or refused. A facet "
+        "is on the fence, and may be in either state, where the rounding of data in double "
+        f"precision decides; forces below {NOTHING:.0e} of what they are made of are none.",
+        rows,
+    )
+
+
+# ---- thin cells
+
+STEPS = 60
+"""CG steps that thin cells may take on any mesh."""
+
+
+def _flat(factor: float, levels: int, whole: bool, contrast: float = 1.0) -> Case:
+    """A polygon squashed, and meshed before or after."""
+    vertices = np.array([[-1, 0], [0.1, -0.1], [1, 0], [1.1, 0.8], [0, 1.1], [-0.9, 0.9]])
+    boundary = ("contact", "contact", "neumann", "dirichlet", "dirichlet", "neumann")
+
+    def mesh() -> Domain:
+        if whole:
+            return Polygon(vertices * [1, factor], boundary).mesh(0.25, COMM)
+        return squashed(Polygon(vertices, boundary).mesh(0.25, COMM), factor)
+
+    kind = "meshed after" if whole else "meshed before"
+    return Case(
+        f"squashed to {factor:.0e}, {kind}",
+        mesh,
+        levels,
+        {
+            "f": _weight,
+            "g": _zero,
+            "obstacle": _any_obstacle,
+            "dirichlet": _slope,
+            "coefficient": _half,
+        },
+        (0, 0, 0, 0, -0.1, 0.2, 7.0, 0.5, 0, 0, contrast, 1.0, 0.0, 0.1, 0, 0, 0),
+        contrast,
+    )
+
+
+def thin(seed: int, quick: bool) -> Group:
+    """Polygons squashed."""
+
+    def long(case: Case, verdict: Verdict) -> str | None:
+        steps = max(verdict.steps, default=0)
+        return f"{steps} CG steps" if steps > STEPS else None
+
+    levels = 3 if quick else 5
+    rows = []
+    for factor, counted in ((1e-3, True), (1e-4, False)):
+        cases = [_flat(factor, levels, whole) for whole in (True, False)]
+        row = row_of(
+            f"squashed to {factor:.0e}" + (f", ≤ {STEPS} CG steps on every mesh" * counted),
+            cases,
+            lambda case: False,
+            long if counted else lambda *_: None,
+        )
+        rows.append(row)
+    return Group(
+        "thin",
+        "Thin cells",
+        "A hexagon squashed, triangulated before and after, "
+        f"{levels} meshes, nested and cold. Passed: solved, the same facets in contact and forces "
+        f"right to {EXACT:.0e}.",
+        rows,
+    )
