@@ -11,14 +11,11 @@ force (or gap times the diagonal) on any of them, in parts of the load.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import numpy.typing as npt
 from one_solve import by_case, cases, comm, meshes
-from petsc4py import PETSc
 
+from signorini_cr.options import defaults
 from signorini_cr.solution import Solution
 
 HEAD = (
@@ -33,19 +30,7 @@ HEAD = (
     "wrong: solver",
     "wrong: LU",
 )
-
-
-@contextmanager
-def options(**values: str) -> Iterator[None]:
-    """Set options of the solver for the time of a block."""
-    database = PETSc.Options("signorini_")
-    for name, value in values.items():
-        database.setValue(name, value)
-    try:
-        yield
-    finally:
-        for name in values:
-            database.delValue(name)
+DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
 
 
 def finest(name: str, dofs: float, nested: bool = True) -> Solution:
@@ -74,9 +59,9 @@ def wrong(solution: Solution, exact: Solution) -> str:
 def row(name: str, dofs: float, repeats: int) -> list[str]:
     """One line of the table; there is nothing to repeat."""
     own = finest(name, dofs)
-    with options(ksp_type="preonly", pc_type="lu", pc_factor_mat_solver_type="mumps"):
+    with defaults(DIRECT):
         cold = finest(name, dofs, nested=False)
-        with options(snes_atol=f"{1e-13 * own.level.system.load}"):
+        with defaults({"snes_atol": 1e-13 * own.level.system.load}):
             exact = finest(name, dofs, nested=False)
     three, both = (own, cold, exact), (own, cold)
     return [

@@ -62,6 +62,9 @@ SIZE = 0.08
 SHOWN = 4e4
 """Meshes with more dofs are in the table and in the picture."""
 
+MOST = 500
+"""CG steps after which a linear solve that is compared with is ended."""
+
 Coarsest = Callable[[], Domain]
 
 EXAMPLES = {"S1": exact.S1, "A": exact.A, "C 7/2": exact.root(3.5), "C 11/2": exact.root(5.5)}
@@ -146,7 +149,10 @@ def timed(action: Callable[[], object]) -> float:
 
 
 def linear_solve(A: PETSc.Mat, b: PETSc.Vec) -> tuple[float, int]:
-    """Time and steps of CG + BoomerAMG with PETSc's defaults, rtol 1e-8, set-up included."""
+    """Time and steps of CG + BoomerAMG with PETSc's defaults, rtol 1e-8, set-up included.
+
+    It ends after `MOST` steps.
+    """
     x, steps = b.duplicate(), 0
 
     def action() -> None:
@@ -155,7 +161,7 @@ def linear_solve(A: PETSc.Mat, b: PETSc.Vec) -> tuple[float, int]:
         ksp.setOperators(A)
         ksp.setType("cg")
         ksp.getPC().setType("hypre")
-        ksp.setTolerances(rtol=1e-8)
+        ksp.setTolerances(rtol=1e-8, max_it=MOST)
         ksp.solve(b, x)
         steps = ksp.getIterationNumber()
         ksp.destroy()

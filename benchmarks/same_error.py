@@ -22,6 +22,7 @@ import time
 from pathlib import Path
 from statistics import median
 
+from launch import launched
 from tables import tabulate
 
 HEAD = ("", "dofs", "H1 error", "Newton, finest", "mesh", "assembly", "VI", "whole run")
@@ -124,13 +125,12 @@ def main() -> None:
     runs: dict[str, list[dict[str, float]]] = {"cr": [], "p1": []}
     for repetition in range(arguments.repeats + 1):
         for element, kept in runs.items():
-            command = [sys.executable, __file__, "--n", str(arguments.n), "--only", element]
-            # what Python needs to get as far as this file belongs to the whole run
-            environment = {**os.environ, "SAME_ERROR_AGE": "0.03"}
             subprocess.run([sys.executable, "-c", WARM], check=True)
-            result = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
+            # what Python needs to get as far as this file belongs to the whole run
+            command = "--n", str(arguments.n), "--only", element
+            found = launched(*command, SAME_ERROR_AGE="0.03")
             if repetition:  # the first one fills the cache of compiled forms
-                kept.append(json.loads(result.stdout.splitlines()[-1]))
+                kept.append(found)
     names = {"cr": "CR, this program", "p1": "P1, plain DOLFINx"}
     rows = []
     for element, kept in runs.items():

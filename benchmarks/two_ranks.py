@@ -27,15 +27,13 @@ import argparse
 import gc
 import json
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median, quantiles
 
+from launch import launched
 from tables import head, line
 
 FIRST, SOLVES = 2, 6
@@ -109,14 +107,10 @@ def run(name: str) -> None:
         print(json.dumps(found[FIRST:]))
 
 
-def launched(ranks: int, name: str) -> list[Solve]:
+def solved(ranks: int, name: str) -> list[Solve]:
     """The solves of one run in new processes."""
-    command = ["mpirun", "-n", str(ranks), sys.executable, __file__, "--run", name]
-    surroundings = {**os.environ, **LARGE_PAGES}
-    result = subprocess.run(
-        command, stdout=subprocess.PIPE, check=True, text=True, env=surroundings
-    )
-    return [Solve(*facts) for facts in json.loads(result.stdout.splitlines()[-1])]
+    found = launched("--run", name, ranks=ranks, **LARGE_PAGES)
+    return [Solve(*facts) for facts in found]
 
 
 @dataclass(frozen=True)
@@ -129,7 +123,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Case:
-    """The solves of one case on one rank and on two, as `launched` returns them."""
+    """The solves of one case on one rank and on two, as `solved` returns them."""
 
     name: str
     one: list[Solve]
@@ -140,8 +134,8 @@ class Case:
         """Let one rank and two take turns."""
         case = cls(name, [], [])
         for _ in range(turns):
-            case.one.extend(launched(1, name))
-            case.two.extend(launched(2, name))
+            case.one.extend(solved(1, name))
+            case.two.extend(solved(2, name))
         return case
 
     @property

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +24,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from launch import launched
 from tables import tabulate
 
 PROBLEM = Path(__file__).parents[1] / "meshes" / "s1.toml"
@@ -137,19 +136,14 @@ def run(meshes: int, folder: str, began: float) -> None:
     sys.exit(status)
 
 
-def launched(column: Run) -> dict[str, float]:
+def times(column: Run) -> dict[str, float]:
     """The times of one run in new processes, with that of the whole."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = dict(os.environ)
-        if column.fresh:
-            environment["XDG_CACHE_HOME"] = folder
-        command = ["mpirun", "-n", str(column.ranks)] if column.ranks > 1 else []
-        command += [sys.executable, __file__, "--run", str(column.levels), f"{folder}/out"]
+        cache = {"XDG_CACHE_HOME": folder} if column.fresh else {}
+        ranks = column.ranks if column.ranks > 1 else None
         began = time.time()
-        result = subprocess.run(
-            [*command, str(began)], stdout=subprocess.PIPE, check=True, text=True, env=environment
-        )
-        seconds: dict[str, float] = json.loads(result.stdout.splitlines()[-1])
+        arguments = "--run", str(column.levels), f"{folder}/out", str(began)
+        seconds: dict[str, float] = launched(*arguments, ranks=ranks, **cache)
         return seconds | {"": time.time() - began}
 
 
@@ -163,15 +157,15 @@ def main() -> None:
     if arguments.run:
         meshes, folder, began = arguments.run
         run(int(meshes), folder, float(began))
-    launched(RUNS[1])  # compiles what the columns but the first expect to find
-    measured = [[launched(column) for _ in range(arguments.repeats)] for column in RUNS]
+    times(RUNS[1])  # compiles what the columns but the first expect to find
+    measured = [[times(column) for _ in range(arguments.repeats)] for column in RUNS]
 
     def row(title: str, of: Callable[[dict[str, float]], float]) -> list[str]:
-        return [title, *(f"{median(map(of, times)):.2f}" for times in measured)]
+        return [title, *(f"{median(map(of, runs)):.2f}" for runs in measured)]
 
-    rows = [row(name, lambda times, name=name: times.get(name, 0.0)) for name in PARTS]
-    rows.append(row("all else", lambda times: 2 * times[""] - sum(times.values())))
-    rows.append(row("**altogether**", lambda times: times[""]))
+    rows = [row(name, lambda run, name=name: run.get(name, 0.0)) for name in PARTS]
+    rows.append(row("all else", lambda run: 2 * run[""] - sum(run.values())))
+    rows.append(row("**altogether**", lambda run: run[""]))
     tabulate(("seconds", *(column.title for column in RUNS)), rows, arguments.out / "whole_run.md")
 
 

@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI  # first: the DOLFINx of the wheels finds the MPI that is loaded
+
+# isort: split
 from dolfinx.mesh import Mesh, entities_to_geometry
-from mpi4py import MPI
 
 from signorini_cr import canvas, exact, norms, solve, solve_levels, theory
 from signorini_cr.errors import on_root

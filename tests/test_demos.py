@@ -67,7 +67,7 @@ def is_picture(path):
 
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("name", ["demo_adaptive", "demo_certificate", "demo_theorem_31"])
+@pytest.mark.parametrize("name", ["demo_theorem_31"])  # and those of test_certificate_demos.py
 def test_demos_on_their_own(name, ranks, tmp_path):
     result = run(ranks, DEMOS / f"{name}.py", tmp_path, levels=4)
     assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
