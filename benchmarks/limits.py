@@ -25,7 +25,7 @@ from tables import tabulate
 from ufl.core.expr import Expr
 
 from signorini_cr import Polygon, Problem, exact
-from signorini_cr.domain import Domain
+from signorini_cr.mesh.domain import Domain
 
 FloatArray = npt.NDArray[np.float64]
 

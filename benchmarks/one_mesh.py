@@ -23,10 +23,10 @@ from petsc4py import PETSc
 from tables import tabulate
 
 from signorini_cr import exact, solve
-from signorini_cr.assembly import Level
-from signorini_cr.domain import Domain
-from signorini_cr.problem import Forms, Problem
-from signorini_cr.space import ghosted_vector
+from signorini_cr.fem.problem import Forms, Problem
+from signorini_cr.fem.space import ghosted_vector
+from signorini_cr.mesh.domain import Domain
+from signorini_cr.vi.assembly import Level
 
 HEAD = (
     "mesh",

@@ -47,9 +47,9 @@ from petsc4py import PETSc  # noqa: E402
 from tables import head, line, tabulate  # noqa: E402
 
 from signorini_cr import Polygon, Problem, exact, solve_levels  # noqa: E402
-from signorini_cr.domain import Domain  # noqa: E402
+from signorini_cr.fem.space import ghosted_vector  # noqa: E402
+from signorini_cr.mesh.domain import Domain  # noqa: E402
 from signorini_cr.solution import Solution  # noqa: E402
-from signorini_cr.space import ghosted_vector  # noqa: E402
 
 comm = MPI.COMM_WORLD
 

@@ -105,16 +105,12 @@ def run(meshes: int, folder: str, began: float) -> None:
         import dolfinx.jit
         from mpi4py import MPI
 
-        from signorini_cr import (
-            assembly,
-            cli,
-            gmshmesh,
-            levels,
-            output,
-            problem,
-            problemfile,
-            solution,
-        )
+        from signorini_cr import levels, solution
+        from signorini_cr.app import cli, problemfile
+        from signorini_cr.fem import problem
+        from signorini_cr.mesh import gmshmesh
+        from signorini_cr.output import report as output
+        from signorini_cr.vi import assembly
     for owner, attribute, name in (
         (builtins, "__import__", PACKAGES),
         (problemfile, "load", FILE),

@@ -26,10 +26,11 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from signorini_cr import Polygon, Problem, canvas, exact, plots, solve_adaptive, solve_levels
-from signorini_cr.errorplot import plot_error
+from signorini_cr import Polygon, Problem, exact, plots, solve_adaptive, solve_levels
 from signorini_cr.errors import on_root
-from signorini_cr.output import level_record, table_header, table_row
+from signorini_cr.output import canvas
+from signorini_cr.output.errorplot import plot_error
+from signorini_cr.output.report import level_record, table_header, table_row
 
 comm = MPI.COMM_WORLD
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")

@@ -25,8 +25,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import canvas, exact, solve, solve_adaptive, solve_levels
+from signorini_cr import exact, solve, solve_adaptive, solve_levels
 from signorini_cr.errors import on_root
+from signorini_cr.output import canvas
 
 comm = MPI.COMM_WORLD
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")

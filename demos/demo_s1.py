@@ -28,8 +28,8 @@ import numpy as np
 from mpi4py import MPI
 
 from signorini_cr import exact, plots, solve_levels
-from signorini_cr.output import level_record, table_header, table_row
-from signorini_cr.tables import markdown_table
+from signorini_cr.output.report import level_record, table_header, table_row
+from signorini_cr.output.tables import markdown_table
 
 comm = MPI.COMM_WORLD
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")

@@ -21,10 +21,11 @@ from mpi4py import MPI  # first: the DOLFINx of the wheels finds the MPI that is
 # isort: split
 from dolfinx.mesh import Mesh, entities_to_geometry
 
-from signorini_cr import canvas, exact, norms, solve, solve_levels, theory
+from signorini_cr import exact, norms, solve, solve_levels, theory
 from signorini_cr.errors import on_root
-from signorini_cr.exact import Example
+from signorini_cr.output import canvas
 from signorini_cr.solution import Solution
+from signorini_cr.verification.exact import Example
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

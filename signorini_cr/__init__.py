@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .adaptive import solve_adaptive
-    from .certificate import Certificate
-    from .domain import Domain, Polygon, read_gmsh
     from .errors import InputError, NotConverged
+    from .estimate.certificate import Certificate
+    from .fem.problem import Problem
     from .levels import solve, solve_levels
-    from .problem import Problem
+    from .mesh.domain import Domain, Polygon, read_gmsh
     from .solution import Solution
 
 # The wheels of DOLFINx find MPI only where this has loaded it before them. Its own complaints,
@@ -35,17 +35,26 @@ __version__ = "0.1.0"
 
 # Loaded when first used: `signorini-cr --help` must not wait for DOLFINx
 _ROOMS = {
-    "Domain": "domain",
-    "Polygon": "domain",
-    "read_gmsh": "domain",
+    "Domain": "mesh.domain",
+    "Polygon": "mesh.domain",
+    "read_gmsh": "mesh.domain",
     "InputError": "errors",
     "NotConverged": "errors",
     "Solution": "solution",
     "solve": "levels",
     "solve_levels": "levels",
     "solve_adaptive": "adaptive",
-    "Certificate": "certificate",
-    "Problem": "problem",
+    "Certificate": "estimate.certificate",
+    "Problem": "fem.problem",
+}
+# Modules that scripts use by name, wherever they stand.
+_MODULES = {
+    "exact": "verification.exact",
+    "norms": "verification.norms",
+    "theory": "verification.theory",
+    "families": "mesh.families",
+    "plots": "output.plots",
+    "force": "estimate.force",
 }
 __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Domain",
@@ -66,6 +75,8 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
 def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return getattr(import_module(f".{_ROOMS[name]}", __name__), name)
+    if name in _MODULES:
+        return import_module(f".{_MODULES[name]}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

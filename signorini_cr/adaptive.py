@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .domain import Domain
 from .errors import InputError, NotConverged
-from .hierarchy import refine_marked
+from .fem.problem import Problem
 from .levels import LevelMonitor, solve_sequence
-from .problem import Problem
+from .mesh.domain import Domain
+from .mesh.refinement import refine_marked
 from .solution import Solution
 
 FloatArray = npt.NDArray[np.float64]

@@ -9,19 +9,19 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from .admissible import check_data
-from .assembly import Level
-from .contact import contact_facts
-from .domain import Domain
+from .data.admissible import check_data
 from .errors import InputError
+from .fem.problem import Forms, Problem
+from .fem.space import ghosted_vector
 from .garbage import release
-from .hierarchy import check_refinable, refine
-from .nested import nested_start
-from .problem import Forms, Problem
+from .mesh.domain import Domain
+from .mesh.refinement import check_refinable, refine
 from .solution import Solution
-from .solver import solve_vi
-from .space import ghosted_vector
-from .stopping import NOISE
+from .vi.assembly import Level
+from .vi.contact import contact_facts
+from .vi.nested import nested_start
+from .vi.solver import solve_vi
+from .vi.stopping import NOISE
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
 """Called with level, step, residual norm, active dofs and linear iterations so far, which are the
@@ -141,7 +141,7 @@ def _solve(
     system = level.system
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
     if level.loose is not None:
-        level.loose.check(level)
+        level.loose.check(level.system)
     u, residual = system.start(), fem.Function(level.V)
     arrays = system.b.x.array, system.lower, u.x.array, residual.x.array
     vectors = [ghosted_vector(level.V, array) for array in arrays]

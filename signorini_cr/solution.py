@@ -9,12 +9,12 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from .assembly import Level
-from .certificate import Certificate, certify
-from .contact import Contact
-from .domain import Domain
-from .problem import Problem
-from .solver import Iterations
+from .estimate.certificate import Certificate, certify
+from .fem.problem import Problem
+from .mesh.domain import Domain
+from .vi.assembly import Level
+from .vi.contact import Contact
+from .vi.solver import Iterations
 
 
 @dataclass(eq=False)

@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from signorini_cr.files import STAGE, check_writable
-from signorini_cr.output import FILES
+from signorini_cr.output.files import STAGE, check_writable
+from signorini_cr.output.report import FILES
 
 CASE = """[domain]
 vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from signorini_cr.domain import PARTS
 from signorini_cr.errors import InputError
-from signorini_cr.gmshmesh import Triangulation, read
+from signorini_cr.mesh.domain import PARTS
+from signorini_cr.mesh.gmshmesh import Triangulation, read
 
 MESHES = Path(__file__).parent.parent / "meshes"
 NUMBERS = (

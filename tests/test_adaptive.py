@@ -15,8 +15,8 @@ from signorini_cr import (
     solve_levels,
 )
 from signorini_cr.adaptive import mark
-from signorini_cr.domain import PARTS
-from signorini_cr.space import facet_measures
+from signorini_cr.fem.space import facet_measures
+from signorini_cr.mesh.domain import PARTS
 
 WORLD = MPI.COMM_WORLD
 

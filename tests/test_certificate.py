@@ -19,14 +19,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
-from signorini_cr.assembly import Level
-from signorini_cr.cells import Cells
-from signorini_cr.certificate import certify
 from signorini_cr.compat import cell_nodes
-from signorini_cr.flux import unbalanced
-from signorini_cr.force import force_bounds
-from signorini_cr.problem import Forms
-from signorini_cr.ranges import range_of
+from signorini_cr.data.ranges import range_of
+from signorini_cr.estimate.certificate import certify
+from signorini_cr.estimate.flux import unbalanced
+from signorini_cr.estimate.force import force_bounds
+from signorini_cr.fem.cells import Cells
+from signorini_cr.fem.problem import Forms
+from signorini_cr.vi.assembly import Level
 
 WORLD = MPI.COMM_WORLD
 GOAL = 1.45

@@ -4,7 +4,7 @@ import pytest
 from test_demos import DEMOS, is_picture, run
 
 from signorini_cr import InputError, exact, solve
-from signorini_cr.errorplot import plot_error
+from signorini_cr.output.errorplot import plot_error
 
 
 @pytest.mark.serial

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from signorini_cr import cli, commandline, levels
+from signorini_cr import levels
+from signorini_cr.app import cli, commandline
 from signorini_cr.errors import NotConverged
 
 COMM = MPI.COMM_WORLD
@@ -527,7 +528,7 @@ def process(
 @pytest.mark.serial
 def test_help_answers_without_the_heavy_libraries() -> None:
     program = (
-        "import sys\nfrom signorini_cr import cli\nassert cli.main(['solve', '--help']) == 0\n"
+        "import sys\nfrom signorini_cr.app import cli\nassert cli.main(['solve', '--help']) == 0\n"
         "heavy = {'numpy', 'mpi4py', 'petsc4py', 'dolfinx', 'ufl', 'gmsh', 'matplotlib'}\n"
         "if 'dolfinx_solver' in sys.modules:  # the wheels, which load MPI first\n"
         "    heavy.remove('mpi4py')\n"
@@ -556,7 +557,7 @@ def test_a_rank_that_fails_alone_ends_the_run(tmp_path: Path) -> None:
     """In the midst of the solver, where the other one waits for it."""
     (tmp_path / "case.toml").write_text(CASE)
     (tmp_path / "run.py").write_text(
-        "import sys\nfrom signorini_cr import cli\n\ndef step(self, text):\n"
+        "import sys\nfrom signorini_cr.app import cli\n\ndef step(self, text):\n"
         "    if not self.root:\n        raise RuntimeError('here')\n\n"
         "cli.Screen.step = step\nsys.exit(cli.main())\n"
     )

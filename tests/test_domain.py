@@ -12,9 +12,9 @@ import ufl
 from dolfinx import cpp, fem
 from mpi4py import MPI
 
-from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
-from signorini_cr.partition import bisect
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
+from signorini_cr.mesh.partition import bisect
 
 COMM = MPI.COMM_WORLD
 MESHES = Path(__file__).parent.parent / "meshes"

@@ -6,10 +6,11 @@ import ufl
 from dolfinx.mesh import create_unit_square
 from mpi4py import MPI
 
-from signorini_cr import Polygon, Problem, exact, expressions, solve
+from signorini_cr import Polygon, Problem, exact, solve
+from signorini_cr.app import expressions
 from signorini_cr.compat import cell_nodes
-from signorini_cr.families import structured
-from signorini_cr.jets import Boxes, Enclosure, indices, lowered
+from signorini_cr.data.jets import Boxes, Enclosure, indices, lowered
+from signorini_cr.mesh.families import structured
 
 WORLD = MPI.COMM_WORLD
 

@@ -7,11 +7,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from signorini_cr import exact, families, norms, solve, solve_levels
-from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN
 from signorini_cr.errors import InputError
-from signorini_cr.hierarchy import refine
-from signorini_cr.problem import as_expression
-from signorini_cr.space import facet_measures
+from signorini_cr.fem.problem import as_expression
+from signorini_cr.fem.space import facet_measures
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN
+from signorini_cr.mesh.refinement import refine
 
 COMM = MPI.COMM_WORLD
 KNOWN = [name for name, example in exact.ALL.items() if example.problem.exact is not None]

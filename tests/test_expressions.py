@@ -11,8 +11,8 @@ import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 
+from signorini_cr.app.expressions import DEEPEST, LARGEST, LONGEST_CHAIN, check_name, parse
 from signorini_cr.errors import InputError
-from signorini_cr.expressions import DEEPEST, LARGEST, LONGEST_CHAIN, check_name, parse
 
 GOOD = [
     "2",

@@ -14,10 +14,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from test_cli import process
 
-from signorini_cr import cli, files
+from signorini_cr.app import cli
 from signorini_cr.errors import InputError
 from signorini_cr.memory import ran_out_of_memory
-from signorini_cr.output import FILES
+from signorini_cr.output import files
+from signorini_cr.output.report import FILES
 
 COMM = MPI.COMM_WORLD
 
@@ -35,7 +36,7 @@ def test_a_run_that_is_ended_leaves_whole_files_of_one_run(seed: int, tmp_path: 
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from signorini_cr import cli
+from signorini_cr.app import cli
 line, rows = cli.Screen.line, []
 
 def limited(self, text):
@@ -126,7 +127,7 @@ def test_what_a_killed_run_leaves_the_next_one_removes(tmp_path: Path) -> None:
     (stale / "solution.vtu").write_text("half")
     alien.mkdir()
     program = (
-        "import sys, time\nfrom pathlib import Path\nfrom signorini_cr.files import _enter\n"
+        "import sys, time\nfrom pathlib import Path\nfrom signorini_cr.output.files import _enter\n"
         f"print(_enter(Path({str(tmp_path)!r}))[0], flush=True)\ntime.sleep(60)"
     )
     other = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
@@ -141,7 +142,7 @@ def test_what_a_killed_run_leaves_the_next_one_removes(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypatch) -> None:
-    from signorini_cr import output
+    from signorini_cr.output import report as output
 
     (shared_tmp_path / "case.toml").write_text(kills.CASE.replace("9", "3"))
     COMM.Barrier()

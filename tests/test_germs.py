@@ -5,9 +5,9 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from signorini_cr.domain import Polygon
-from signorini_cr.germs import allowance, first_inside
-from signorini_cr.jets import lowered
+from signorini_cr.data.germs import allowance, first_inside
+from signorini_cr.data.jets import lowered
+from signorini_cr.mesh.domain import Polygon
 
 pytestmark = pytest.mark.serial
 

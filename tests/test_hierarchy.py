@@ -9,11 +9,11 @@ from dolfinx import cpp, fem, la
 from mpi4py import MPI
 
 from signorini_cr.compat import cell_nodes
-from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain, Polygon
 from signorini_cr.errors import InputError
-from signorini_cr.hierarchy import refine, refine_marked
+from signorini_cr.fem.problem import Problem
 from signorini_cr.levels import solve_levels
-from signorini_cr.problem import Problem
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain, Polygon
+from signorini_cr.mesh.refinement import refine, refine_marked
 
 COMM = MPI.COMM_WORLD
 SHAPES = {

@@ -6,10 +6,10 @@ import mesh_mutations
 import numpy as np
 import pytest
 
-from signorini_cr import mshfile
-from signorini_cr.domain import PARTS
 from signorini_cr.errors import InputError
-from signorini_cr.gmshmesh import read
+from signorini_cr.mesh import mshfile
+from signorini_cr.mesh.domain import PARTS
+from signorini_cr.mesh.gmshmesh import read
 
 pytestmark = pytest.mark.serial
 

@@ -18,28 +18,20 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import (
-    NotConverged,
-    Polygon,
-    Problem,
-    exact,
-    garbage,
-    multigrid,
-    solve,
-    solve_levels,
-)
-from signorini_cr.assembly import Level
-from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain
-from signorini_cr.hierarchy import refine, refine_marked
-from signorini_cr.masking import MaskedMatrix
-from signorini_cr.multigrid import Grid
-from signorini_cr.nested import nested_start
+from signorini_cr import NotConverged, Polygon, Problem, exact, garbage, solve, solve_levels
+from signorini_cr.fem.problem import Forms
+from signorini_cr.fem.space import function_space, ghosted_vector
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from signorini_cr.mesh.refinement import refine, refine_marked
+from signorini_cr.multigrid import cycle as multigrid
+from signorini_cr.multigrid.cycle import Grid
+from signorini_cr.multigrid.masking import MaskedMatrix
+from signorini_cr.multigrid.parents import Layout, Parents
+from signorini_cr.multigrid.transfer import averaging, inclusion, prolongate, prolongation
 from signorini_cr.options import AMG
-from signorini_cr.parents import Layout, Parents
-from signorini_cr.problem import Forms
-from signorini_cr.solver import solve_vi
-from signorini_cr.space import function_space, ghosted_vector
-from signorini_cr.transfer import averaging, inclusion, prolongate, prolongation
+from signorini_cr.vi.assembly import Level
+from signorini_cr.vi.nested import nested_start
+from signorini_cr.vi.solver import solve_vi
 
 # Obtuse corners, a hole, and contact in three pieces that meet in a corner and at the hole
 CROOKED = Polygon(

@@ -7,8 +7,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from signorini_cr import Problem, exact, norms, solve, solve_levels, theory
-from signorini_cr.domain import CONTACT
-from signorini_cr.space import facet_measures, function_space
+from signorini_cr.fem.space import facet_measures, function_space
+from signorini_cr.mesh.domain import CONTACT
 
 COMM = MPI.COMM_WORLD
 

@@ -19,11 +19,12 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, Problem, output, solve, solve_levels
-from signorini_cr.certificate import SHARES, Certificate
-from signorini_cr.files import check_writable, write_files
-from signorini_cr.space import function_space
-from signorini_cr.vtu import write_vtu
+from signorini_cr import Domain, InputError, Problem, solve, solve_levels
+from signorini_cr.estimate.certificate import SHARES, Certificate
+from signorini_cr.fem.space import function_space
+from signorini_cr.output import report as output
+from signorini_cr.output.files import check_writable, write_files
+from signorini_cr.output.vtu import write_vtu
 
 WORLD = MPI.COMM_WORLD
 

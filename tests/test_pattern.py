@@ -9,10 +9,10 @@ from dolfinx.mesh import GhostMode, create_rectangle, create_unit_cube
 from mpi4py import MPI
 
 from signorini_cr import Polygon, exact
-from signorini_cr.hierarchy import refine
-from signorini_cr.parents import Layout
-from signorini_cr.pattern import empty_matrix
-from signorini_cr.space import function_space
+from signorini_cr.fem.space import function_space
+from signorini_cr.mesh.refinement import refine
+from signorini_cr.multigrid.parents import Layout
+from signorini_cr.multigrid.pattern import empty_matrix
 
 WORLD = MPI.COMM_WORLD
 TRIANGLE = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"])

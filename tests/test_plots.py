@@ -13,9 +13,10 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, Polygon, Problem, canvas, plots, solve
-from signorini_cr.raster import raster
-from signorini_cr.space import function_space
+from signorini_cr import Domain, InputError, Polygon, Problem, plots, solve
+from signorini_cr.fem.space import function_space
+from signorini_cr.output import canvas
+from signorini_cr.output.raster import raster
 
 image = pytest.importorskip("matplotlib.image")
 WORLD = MPI.COMM_WORLD

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
+from signorini_cr.app.problemfile import ProblemFile, load
 from signorini_cr.errors import InputError
 from signorini_cr.levels import solve, solve_levels
-from signorini_cr.problemfile import ProblemFile, load
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
 
 SQUARE = """
 [domain]

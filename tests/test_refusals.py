@@ -11,15 +11,16 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from signorini_cr import cli, exact
-from signorini_cr.admissible import check_data
-from signorini_cr.consistency import doubts
-from signorini_cr.domain import Domain, Polygon, read_gmsh
+from signorini_cr import exact
+from signorini_cr.app import cli
+from signorini_cr.app.expressions import parse
+from signorini_cr.data.admissible import check_data
+from signorini_cr.data.consistency import doubts
+from signorini_cr.data.pointwise import evaluate
 from signorini_cr.errors import InputError, on_root
-from signorini_cr.expressions import parse
+from signorini_cr.fem.problem import Forms, Problem
 from signorini_cr.levels import solve, solve_levels
-from signorini_cr.pointwise import evaluate
-from signorini_cr.problem import Forms, Problem
+from signorini_cr.mesh.domain import Domain, Polygon, read_gmsh
 
 COMM = MPI.COMM_WORLD
 RECTANGLE = np.array([(-1, 0), (1, 0), (1, 1), (-1, 1)], dtype=np.float64)

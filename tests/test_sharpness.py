@@ -17,9 +17,10 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from signorini_cr import Domain, Problem, companion, exact, solve
-from signorini_cr.certificate import certify
+from signorini_cr import Domain, Problem, exact, solve
 from signorini_cr.compat import cell_nodes
+from signorini_cr.estimate import companion
+from signorini_cr.estimate.certificate import certify
 
 WORLD = MPI.COMM_WORLD
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3

@@ -6,12 +6,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact
-from signorini_cr.assembly import Level
-from signorini_cr.masking import rows_of
-from signorini_cr.parents import Layout
-from signorini_cr.problem import Forms
-from signorini_cr.smoothing import OVER_RELAXATION, GaussSeidel
-from signorini_cr.transfer import inclusion
+from signorini_cr.fem.problem import Forms
+from signorini_cr.multigrid.masking import rows_of
+from signorini_cr.multigrid.parents import Layout
+from signorini_cr.multigrid.smoothing import OVER_RELAXATION, GaussSeidel
+from signorini_cr.multigrid.transfer import inclusion
+from signorini_cr.vi.assembly import Level
 
 # Corners of five degrees: large entries, many of them positive
 FLAT = Polygon([[0, 0], [5, 0], [5, 0.4]], ["contact", "dirichlet", "neumann"])

@@ -8,8 +8,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import InputError, NotConverged, Polygon, Problem, solve, solve_levels
-from signorini_cr.domain import CONTACT
-from signorini_cr.space import closure_dofs, function_space
+from signorini_cr.fem.space import closure_dofs, function_space
+from signorini_cr.mesh.domain import CONTACT
 
 SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 PROBLEM = Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0]))

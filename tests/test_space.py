@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 from signorini_cr.compat import cell_nodes
 from signorini_cr.errors import InputError
-from signorini_cr.space import (
+from signorini_cr.fem.space import (
     closure_dofs,
     facet_entities,
     facet_measures,

@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, NotConverged, Polygon, Problem, Solution, solve_levels
 from signorini_cr.compat import cell_nodes
-from signorini_cr.hierarchy import refine
+from signorini_cr.mesh.refinement import refine
 
 LONG = np.longdouble
 Function = Callable[..., object]  # of x, y and numpy or ufl

@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from signorini_cr import Problem, exact, norms, solve, solve_levels
 from signorini_cr.compat import cell_nodes
-from signorini_cr.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 
 COMM = MPI.COMM_WORLD
 

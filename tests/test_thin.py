@@ -13,9 +13,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from signorini_cr import Polygon, Problem, compat, exact, multigrid, solve, solve_levels
-from signorini_cr.assembly import Level
+from signorini_cr import Polygon, Problem, compat, exact, solve, solve_levels
+from signorini_cr.multigrid import cycle as multigrid
 from signorini_cr.options import AMG
+from signorini_cr.vi.assembly import Level
 
 comm = MPI.COMM_WORLD
 

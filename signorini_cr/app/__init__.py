@@ -1,0 +1,4 @@
+"""The command `signorini-cr`.
+
+Command line, screen, problem file and its expressions.
+"""

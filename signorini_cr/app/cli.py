@@ -1,0 +1,353 @@
+"""The command `signorini-cr`: from a problem file to a folder of results.
+
+Nothing heavy is imported before the command line has been understood, so that ``--help`` and a
+misspelt option answer at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .commandline import (
+    UsageError,
+    launched,
+    left_alone,
+    read_arguments,
+    start_petsc,
+    wait_for_all,
+)
+from .screen import Screen, wrapped
+
+if TYPE_CHECKING:
+    from ..errors import NotConverged
+    from ..mesh.domain import Domain
+    from ..solution import Solution
+    from .problemfile import ProblemFile
+
+DONE, FAULT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; collective under mpirun.
+
+    Args:
+        argv: Arguments without the program's name, by default those of the process.
+
+    Returns:
+        The exit status, the same on every rank.
+    """
+    screen = Screen(launched()[0] == 0)
+    try:
+        args = read_arguments(sys.argv[1:] if argv is None else argv)
+    except SystemExit:  # --help and --version have answered
+        screen.flush()
+        return DONE
+    except UsageError as error:
+        screen.complain(str(error))
+        wait_for_all()
+        return BAD_INPUT
+    with _interruptible() as interrupted:
+        return _run(args, screen, interrupted)
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Keep in mind that an interruption was asked for.
+
+    KeyboardInterrupt may reach us as another error: of PETSc, whose callback it was raised in, or
+    of an import.
+    """
+    asked = threading.Event()
+
+    def ask(*_: object) -> None:
+        asked.set()
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # which can't be interrupted
+        yield asked
+        return
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not where it is ignored, as in the background
+        signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked
+    finally:
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, before)
+
+
+def _run(args: argparse.Namespace, screen: Screen, interrupted: threading.Event) -> int:
+    """Start PETSc and do what the command says; whatever goes wrong becomes a message."""
+    try:
+        start_petsc(args.petsc)
+        from mpi4py import MPI
+
+        comm = MPI.COMM_WORLD
+        screen.root = comm.rank == 0
+        screen.quiet, screen.verbose = args.quiet, getattr(args, "verbose", False)
+        if (complaint := left_alone(comm.size)) is not None:
+            screen.complain(complaint)
+            return BAD_INPUT
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except Exception:
+        if interrupted.is_set():
+            return INTERRUPTED
+        raise
+    try:
+        from ..errors import InputError, NotConverged
+
+        try:
+            status = {"solve": _solve, "check": _check}[args.command](args, screen, comm)
+        except InputError as error:
+            screen.complain(str(error))
+            status = BAD_INPUT
+        except NotConverged as error:
+            screen.complain(str(error))
+            status = NOT_CONVERGED
+        screen.flush()
+        comm.Barrier()  # mpirun ends all ranks when the first leaves with an error
+        return status
+    except (Exception, KeyboardInterrupt) as error:
+        # Perhaps on this rank only: the others must not wait for it
+        kept = "".join(getattr(error, "__notes__", ()))  # from _solve
+        if interrupted.is_set() or isinstance(error, KeyboardInterrupt):
+            screen.complain(f"interrupted{kept and f'; {kept}'}")
+            if comm.size > 1:
+                comm.Abort(INTERRUPTED)
+            return INTERRUPTED
+        import traceback
+
+        where = f" on rank {comm.rank}" if comm.size > 1 else ""
+        with suppress(OSError):  # whether or not it can be told
+            traceback.print_exc()
+            print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
+        if comm.size > 1:
+            comm.Abort(FAULT)
+        return FAULT
+
+
+def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
+    from ..errors import NotConverged
+    from ..memory import most_memory, ran_out_of_memory
+    from ..output import report as output
+    from ..output.files import check_writable
+
+    folder = _folder(args)
+    with _named("--out"):
+        check_writable(folder, output.FILES, comm)
+    screen.progress("reading")
+    records: list[output.Record] = []
+    try:
+        return _solve_levels(args, screen, comm, folder, records)
+    except (Exception, KeyboardInterrupt) as error:
+        if not ran_out_of_memory(error):
+            error.add_note(_kept(records, folder) if records else "")
+            raise
+    failure = NotConverged(
+        f"out of memory, of which this process has had {most_memory() / 1e9:.2g} GB", len(records)
+    )
+    if comm.size > 1:  # the other ranks know nothing of it
+        screen.root = True
+    screen.complain(f"{args.file}: {_stopped(failure, records, folder)}")
+    if comm.size > 1:
+        comm.Abort(NOT_CONVERGED)
+    return NOT_CONVERGED
+
+
+def _solve_levels(
+    args: argparse.Namespace,
+    screen: Screen,
+    comm: Any,
+    folder: Path,
+    records: list[dict[str, Any]],
+) -> int:
+    """Solve, and append to `records` what is solved and safe in the folder."""
+    from ..errors import NotConverged
+    from ..output import report as output
+
+    case, domain, seconds = _read(args, screen, comm)
+    element = args.element.upper()
+    finest: Solution | None = None
+    failure: NotConverged | None = None
+    try:
+        for solution in _solutions(case, domain, element, screen):
+            if not records:
+                solution.seconds["mesh"] = seconds
+            record = output.level_record(solution, records[-1] if records else None)
+            report = output.make_report(case.title, element, comm, [*records, record], False)
+            with _named("--out"):
+                output.write_levels(folder, report, solution)
+            records.append(record)
+            finest = solution
+            if screen.verbose:
+                taken = solution.iterations.preconditioner
+                screen.line(wrapped(taken, "  linear systems: "))
+            if len(records) == 1:
+                screen.line(output.table_header(records[0]))
+            screen.line(output.table_row(records[-1], records[0]))
+    except NotConverged as error:
+        failure = error
+    failure = failure or _above_tolerance(case, records)
+    screen.progress("writing")
+    if finest is not None:
+        report = output.make_report(case.title, element, comm, records, failure is None)
+        with _named("--out"):
+            names = output.write_output(folder, report, finest)
+        screen.line("")
+        screen.text(_facts(records[-1]))
+        if (reason := records[-1]["bound_reason"]) is not None:
+            screen.text(f"no bound of the error: {reason}")
+        screen.text(f"written to {folder}: {', '.join(names)}")
+    if failure is not None:
+        screen.complain(f"{case.path}: {_stopped(failure, records, folder)}")
+        return NOT_CONVERGED
+    return DONE
+
+
+def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
+    from ..fem.space import facet_measures
+    from ..mesh.domain import PARTS
+    from ..output import plots
+    from ..output.files import check_writable, write_files
+
+    folder, picture = _folder(args), "mesh.png"
+    with _named("--out"):
+        check_writable(folder, [picture], comm)
+    case, domain, _ = _read(args, screen, comm)
+    topology = domain.mesh.topology
+    screen.line(f"{case.path}: in order")
+    screen.text(f"{topology.index_map(topology.dim).size_global} cells on the coarsest mesh")
+    for name, part in PARTS.items():
+        _, lengths = facet_measures(domain.mesh, domain.facets(part))
+        number, length = comm.allreduce(len(lengths)), comm.allreduce(float(lengths.sum()))
+        screen.text(f"{name}: {number} facets, length {length:.6g}")
+    if not plots.can_draw(comm):
+        screen.text("not drawn: Matplotlib is not installed")
+        return DONE
+
+    def draw(path: Path) -> None:
+        plots.plot_mesh(domain, path, case.title)
+
+    with _named("--out"):
+        write_files(folder, {picture: draw}, comm=comm)
+    screen.text(f"drawn in {folder / picture}")
+    return DONE
+
+
+def _read(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemFile, Domain, float]:
+    """The checked problem file, the coarsest mesh and how long the mesh took."""
+    import time
+    from dataclasses import replace
+
+    from . import problemfile
+
+    case = problemfile.load(args.file, comm)
+    if getattr(args, "levels", None) is not None:
+        case = replace(case, levels=args.levels)
+    screen.progress("making the mesh")
+    began = time.perf_counter()
+    domain = case.mesh(comm)
+    seconds = time.perf_counter() - began
+    for doubt in case.check(domain):
+        screen.warn(f"{case.path}: {doubt}")
+    return case, domain, seconds
+
+
+def _solutions(
+    case: ProblemFile, domain: Domain, element: str, screen: Screen
+) -> Iterator[Solution]:
+    from .. import levels
+    from ..adaptive import solve_adaptive
+    from ..errors import InputError
+
+    def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
+        facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
+        screen.step(f"  level {level}  {facts}")
+
+    screen.progress("level 0")
+    try:
+        if case.mode == "uniform":
+            yield from levels.solve_levels(case.problem, domain, case.levels, element, monitor)
+        else:
+            yield from solve_adaptive(
+                case.problem,
+                domain,
+                tolerance=case.tolerance,
+                levels=case.levels,
+                max_dofs=case.max_dofs,
+                element=element,
+                monitor=monitor,
+            )
+    except InputError as error:
+        raise InputError(f"{case.path}: {error}") from None
+
+
+def _facts(record: dict[str, Any]) -> str:
+    """What happens on Γ1, in a sentence."""
+    contact = record["contact"]
+    line = (
+        f"contact on {contact['active']} of {contact['facets']} facets, length"
+        f" {contact['length']:.6g}, force {contact['force']:.6g}"
+    )
+    points = [
+        "(" + ", ".join(f"{value:.6g}" for value in point) + ")" for point in contact["transitions"]
+    ]
+    if points:
+        more = f" and {len(points) - 6} more" if len(points) > 6 else ""
+        line += f"; it begins or ends at {', '.join(points[:6])}{more}"
+    return line
+
+
+def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotConverged | None:
+    """What stopped an adaptive run before the bound that was asked for was reached."""
+    if case.mode == "uniform" or case.tolerance == 0.0 or not records:
+        return None
+    from ..errors import NotConverged
+
+    bound = records[-1]["bound_h1"]
+    if bound is not None and bound <= case.tolerance:
+        return None
+    limit = (
+        f"levels = {case.levels}" if len(records) >= case.levels else f"max_dofs = {case.max_dofs}"
+    )
+    return NotConverged(
+        f"the certified bound is {bound:.3g}, above the tolerance of {case.tolerance:g}, and"
+        f" {limit} allows no further mesh",
+        records[-1]["level"],
+    )
+
+
+def _stopped(failure: NotConverged, records: list[dict[str, Any]], folder: Path) -> str:
+    level = len(records) if failure.level is None else failure.level
+    return f"stopped on level {level}: {failure.reason}\n{_kept(records, folder)}"
+
+
+def _kept(records: list[dict[str, Any]], folder: Path) -> str:
+    if not records:
+        return "no level was finished, nothing was written"
+    if len(records) == 1:
+        return f"level 0 is finished and kept in {folder}"
+    return f"levels 0 to {len(records) - 1} are finished and kept in {folder}"
+
+
+@contextmanager
+def _named(key: str) -> Iterator[None]:
+    """Put the key before what an InputError says."""
+    from ..errors import InputError
+
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from None
+
+
+def _folder(args: argparse.Namespace) -> Path:
+    return Path(args.file.stem + "-out") if args.out is None else args.out

@@ -1,0 +1,245 @@
+"""The command line of `signorini-cr`, and how the program was launched.
+
+Everything here answers before NumPy, MPI or DOLFINx are loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NoReturn
+
+from .. import __version__
+from .screen import WIDTH
+
+PETSC_NOTE = (
+    "Options with a single dash, such as -log_view or -signorini_snes_atol 1e-12, are left to PETSc"
+    " (-options_left shows those that nothing used)."
+)
+EXIT_NOTE = (
+    "Exit status: 0 solved, every level converged; 2 bad input, nothing written; 3 not converged,"
+    " out of memory, or stopped by a limit; 130 interrupted; 143 terminated. Report and tables of a"
+    " level are kept as soon as it is finished, whatever ends the run then."
+)
+
+
+class UsageError(Exception):
+    """The command line cannot be understood."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argparse parser that prints on rank 0 alone and raises instead of leaving."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}\n{self.format_usage()}")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        if launched()[0] == 0:
+            super()._print_message(message, file)
+
+
+def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
+    """Understand the command line.
+
+    Args:
+        argv: Arguments without the program's name.
+
+    Returns:
+        The command, its arguments, and as ``petsc`` the words that are left to PETSc.
+
+    Raises:
+        UsageError: There is something in it that is not allowed.
+        SystemExit: Help or the version was asked for and has been printed.
+    """
+    own, petsc = _split(list(argv))
+    parser, commands = _parser()
+    for word in argv:
+        shown = word.encode("utf-8", "backslashreplace").decode("utf-8")
+        if shown != word:
+            parser.error(f"{shown}: this is no text in UTF-8, which DOLFINx needs")
+    first = own[0] if own else ""
+    if first not in ("-h", "--help", "--version", *commands):
+        near = difflib.get_close_matches(first, commands, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {' and '.join(commands)}"
+        if not first or first.startswith("-"):
+            parser.error(f"a command comes first; {hint}")
+        parser.error(f"there is no command {first!r}; {hint}")
+    args, rest = parser.parse_known_args(own)
+    for word in rest:
+        _unknown(word, commands[args.command])
+    for option, value in pairwise(petsc):
+        if option == "-options_file" and not Path(value).is_file():
+            parser.error(f"-options_file {value}: there is no such file")
+    args.petsc = petsc
+    return args
+
+
+def _parser() -> tuple[_Parser, dict[str, _Parser]]:
+    shared: dict[str, Any] = {
+        "allow_abbrev": False,
+        "formatter_class": lambda prog: argparse.HelpFormatter(prog, width=WIDTH),
+    }
+    parser = _Parser(
+        prog="signorini-cr",
+        description="Signorini problems with the Crouzeix-Raviart element.",
+        epilog=f"{EXIT_NOTE} Runs alone or under mpirun -n N.",
+        **shared,
+    )
+    parser.add_argument("--version", action="version", version=f"signorini-cr {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    solve = commands.add_parser(
+        "solve",
+        help="solve on a sequence of meshes",
+        description="Solve on a sequence of meshes, print one row a level, write DIR.",
+        usage="signorini-cr solve FILE.toml [--out DIR] [--levels N] [--element cr|p1]\n"
+        + " " * 26
+        + "[--quiet] [-v] [PETSc options]",
+        epilog=f"{PETSC_NOTE} {EXIT_NOTE}",
+        **shared,
+    )
+    check = commands.add_parser(
+        "check",
+        help="validate a problem file and draw its mesh",
+        description="Read and validate FILE.toml, make the coarsest mesh and draw it with its"
+        " boundary parts as DIR/mesh.png. Nothing is solved.",
+        usage="signorini-cr check FILE.toml [--out DIR] [--quiet]",
+        **shared,
+    )
+    for command in (solve, check):
+        command.add_argument("file", metavar="FILE.toml", type=Path, help="the problem file")
+        command.add_argument(
+            "--out",
+            metavar="DIR",
+            type=_directory,
+            help="folder for the results, made if it is not there (default: FILE-out in the"
+            " current folder)",
+        )
+        command.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    solve.add_argument(
+        "--levels", metavar="N", type=_at_least_one, help="number of meshes, instead of the file's"
+    )
+    solve.add_argument(
+        "--element",
+        choices=("cr", "p1"),
+        type=str.lower,
+        default="cr",
+        metavar="cr|p1",
+        help="Crouzeix-Raviart (default), or conforming linear elements to compare with",
+    )
+    solve.add_argument(
+        "-v", "--verbose", action="store_true", help="print every step of the solver"
+    )
+    for each in (parser, solve, check):
+        vars(each)["color"] = False  # messages are folded, which counts every character
+    return parser, {"solve": solve, "check": check}
+
+
+def _directory(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("the name of a folder is needed")
+    return Path(text)
+
+
+def _at_least_one(text: str) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of 1 or more is needed, found {text}")
+    return number
+
+
+def _split(argv: list[str]) -> tuple[list[str], list[str]]:
+    """Part the command line in ours and PETSc's: ``-name`` and, where there is one, its value."""
+    own: list[str] = []
+    petsc: list[str] = []
+    words = iter(range(len(argv)))
+    for i in words:
+        if argv[i] == "--":
+            return own + argv[i:], petsc
+        if not _is_petsc_option(argv[i]):
+            own.append(argv[i])
+            continue
+        petsc.append(argv[i])
+        if i + 1 < len(argv) and not _cannot_be_value(argv[i + 1]):
+            petsc.append(argv[next(words)])
+    return own, petsc
+
+
+def _is_petsc_option(word: str) -> bool:
+    return len(word) > 2 and word[0] == "-" and (word[1].isalpha() or word[1] == "_")
+
+
+def _cannot_be_value(word: str) -> bool:
+    return (
+        (word[:1] == "-" and not word[1:2].isdigit() and word[1:2] != ".")
+        or word.endswith(".toml")
+        or word in ("solve", "check")
+    )
+
+
+def _unknown(word: str, command: _Parser) -> NoReturn:
+    if not word.startswith("-"):
+        command.error(f"{word!r} is one argument too many; one FILE.toml is allowed")
+    options = [name for name in command._option_string_actions if name.startswith("--")]
+    near = difflib.get_close_matches(word.split("=")[0], options, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(options)}"
+    command.error(f"there is no option {word.split('=')[0]}; {hint}")
+
+
+def start_petsc(options: list[str]) -> None:
+    """Hand PETSc its options: at its start, or now where it has started already."""
+    import petsc4py
+
+    if "petsc4py.PETSc" not in sys.modules:
+        # PETSc would take a closed pipe, or being told to stop, for a crash
+        petsc4py.init([sys.argv[0] or "signorini-cr", "-no_signal_handler", *options])
+    elif options:
+        from petsc4py import PETSc
+
+        PETSc.Options().insertString(" ".join(options))
+
+
+def launched() -> tuple[int, int]:
+    """Rank and number of ranks as the launcher tells them, without loading MPI."""
+    for rank, size in (
+        ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
+        ("PMI_RANK", "PMI_SIZE"),
+        ("SLURM_PROCID", "SLURM_NTASKS"),
+    ):
+        if os.environ.get(rank, "").isdigit():
+            number = os.environ.get(size, "")
+            return int(os.environ[rank]), int(number) if number.isdigit() else 1
+    return 0, 1
+
+
+def left_alone(size: int) -> str | None:
+    """Say so where a launcher has started more processes than MPI knows of.
+
+    Each would solve the whole problem, and all would write into the same folder.
+
+    Args:
+        size: How many MPI knows of.
+    """
+    for variable in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE"):  # Slurm's is set without srun, too
+        number = os.environ.get(variable, "")
+        if number.isdigit() and int(number) > size:
+            return (
+                f"launched as one of {number} processes, but MPI knows of {size}: mpirun belongs"
+                " to another MPI than mpi4py, or has ended"
+            )
+    return None
+
+
+def wait_for_all() -> None:
+    """Leave together: mpirun ends all ranks when the first leaves with an error."""
+    if launched()[1] > 1:
+        from mpi4py import MPI
+
+        MPI.COMM_WORLD.Barrier()

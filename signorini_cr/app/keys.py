@@ -1,0 +1,195 @@
+"""The keys of a TOML file: found, typed and within bounds, or a message that says why not."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import InputError
+
+
+def read_text(path: Path) -> str:
+    """The text of a file in UTF-8."""
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise InputError("there is no such file") from None
+    except IsADirectoryError:
+        raise InputError("this is a folder; a problem file (TOML) is needed") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"this is not a text file in UTF-8 (byte {error.start})") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"the file cannot be read: {reason}") from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The table that a TOML text stands for."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError("the TOML is nested too deeply") from None
+    except tomllib.TOMLDecodeError as error:
+        what, _, where = str(error).rpartition(" (at ")
+        where = where.rstrip(")")
+        what = re.sub(r"\('(.*?)',?\)", lambda name: "[" + name[1].replace("', '", ".") + "]", what)
+        if not where.startswith("line "):
+            last = len(text.rstrip().split("\n"))
+            raise InputError(
+                f"TOML syntax at the end of the file (line {last}): {what or error}"
+            ) from None
+        line, column = (int(word.split()[1]) for word in where.split(", "))
+        found = text.split("\n")[line - 1].rstrip().expandtabs(1)
+        picture = f"\n    {found}\n    {' ' * (column - 1)}^" if 0 < len(found) <= 70 else ""
+        if "{" in found and "}" not in found:
+            what += " (all of { … } must stand on one line)"
+        raise InputError(f"TOML syntax in {where}: {what}{picture}") from None
+
+
+def insist_known(
+    table: Mapping[str, Any],
+    section: str,
+    allowed: Collection[str],
+    sections: Mapping[str, Collection[str]] = MappingProxyType({}),
+) -> None:
+    """Reject keys that are not allowed, with what may have been meant.
+
+    Args:
+        table: The keys found.
+        section: Where, for the message.
+        allowed: The keys that may be there.
+        sections: Keys of the sections, to see where a key would belong.
+    """
+    for key in table:
+        if key in allowed:
+            continue
+        full = f"{section}.{key}" if section else key
+        homes = [name for name, keys in sections.items() if key in keys and name != section]
+        near = difflib.get_close_matches(key.lower(), allowed, n=1)
+        if homes and not near:
+            hint = f"it belongs under [{homes[0]}]"
+        else:
+            hint = (f"did you mean {near[0]}? Allowed" if near else "allowed") + " are "
+            hint += ", ".join(allowed)
+        kind = "key" if section else "section"
+        raise InputError(f"{full}: there is no such {kind}; {hint}")
+
+
+def get(
+    table: Mapping[str, Any],
+    section: str,
+    key: str,
+    read: Callable[[str, Any], Any],
+    default: Any = None,
+    needed: str = "",
+) -> Any:
+    """The value of a key, read and checked.
+
+    Args:
+        table: The keys found.
+        section: Where, for the message.
+        key: The key wanted.
+        read: Called with the full key and the value.
+        default: What a missing key stands for; without one, it is an error.
+        needed: What belongs there, for the message.
+    """
+    full = f"{section}.{key}" if section else key
+    if key in table:
+        return read(full, table[key])
+    if default is None:
+        raise InputError(f"{full}: this key is missing; {needed} is needed")
+    return default
+
+
+def string(key: str, value: Any) -> str:
+    """Insist on a string."""
+    if not isinstance(value, str):
+        raise InputError(f"{key}: a string is needed, found {shown(value)}")
+    return value
+
+
+def array(key: str, value: Any) -> list[Any]:
+    """Insist on a list."""
+    if not isinstance(value, list):
+        raise InputError(f"{key}: a list is needed, found {shown(value)}")
+    return value
+
+
+def number(key: str, value: Any) -> float:
+    """Insist on a finite number; true and false are none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{key}: a number is needed, found {shown(value)}")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise InputError(f"{key}: a finite number is needed, found {shown(value)}")
+    return result
+
+
+def positive(key: str, value: Any) -> float:
+    """Insist on a number above 0."""
+    result = number(key, value)
+    if result <= 0:
+        raise InputError(f"{key}: a number above 0 is needed, found {shown(value)}")
+    return result
+
+
+def not_negative(key: str, value: Any) -> float:
+    """Insist on a number of 0 or more."""
+    result = number(key, value)
+    if result < 0:
+        raise InputError(f"{key}: 0 or more is needed, found {shown(value)}")
+    return result
+
+
+def whole(key: str, value: Any) -> int:
+    """Insist on a whole number of 1 or more."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InputError(f"{key}: a whole number is needed, found {shown(value)}")
+    if value < 1:
+        raise InputError(f"{key}: 1 or more is needed, found {shown(value)}")
+    return value
+
+
+def one_of(allowed: Collection[str]) -> Callable[[str, Any], str]:
+    """A reader that insists on one of the given words."""
+
+    def read(key: str, value: Any) -> str:
+        if string(key, value) in allowed:
+            return value
+        near = difflib.get_close_matches(value.lower(), allowed, n=1)
+        hint = f"did you mean {near[0]}? Allowed" if near else "allowed"
+        raise InputError(f"{key}: {shown(value)} is unknown; {hint} are {', '.join(allowed)}")
+
+    return read
+
+
+def shown(value: Any) -> str:
+    """A TOML value in a few words."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f'the string "{value if len(value) <= 40 else value[:39] + "…"}"'
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, int):
+        return f"{value}" if abs(value) < 10**15 else "a huge number"
+    return f"{value}"
+
+
+def named(key: str, function: Callable[..., Any], *args: Any, rule: str = "") -> Any:
+    """Call ``function(*args)``; what it complains about gets the key before and the rule after."""
+    try:
+        return function(*args)
+    except InputError as error:
+        raise InputError(f"{key}: {error}" + (rule and f"; {rule}")) from None

@@ -1,0 +1,300 @@
+"""Problem files: TOML → domain, problem and refinement, with every key checked.
+
+Each mistake is an :class:`~signorini_cr.errors.InputError` that names the file, the key, what was
+found and what is allowed, the same on all ranks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..data.admissible import check_data
+from ..data.consistency import doubts
+from ..errors import InputError, on_root
+from ..fem.problem import Forms, Problem
+from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
+from .datacheck import USED_ON, check_values
+from .expressions import Expression, check_name, parse
+from .keys import (
+    array,
+    get,
+    insist_known,
+    named,
+    not_negative,
+    number,
+    one_of,
+    parse_toml,
+    positive,
+    read_text,
+    shown,
+    string,
+    whole,
+)
+
+KEYS = {
+    "domain": ("vertices", "boundary", "size", "holes", "mesh"),
+    "data": ("f", "g", "obstacle", "dirichlet", "coefficient"),
+    "exact": ("u",),
+    "refine": ("mode", "levels", "tolerance", "max_dofs"),
+}
+SECTIONS = ("domain", "define", "data", "exact", "refine")
+MODES = ("uniform", "adaptive")
+MAX_DOFS = 1_000_000
+ENOUGH = 1000
+"""Levels of an adaptive run that names no limit: others end it."""
+MOST_CELLS = 1e9
+"""More than anyone means for the last mesh of a uniform sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemFile:
+    """What a problem file says.
+
+    Attributes:
+        path: The file.
+        title: For reports and pictures; the file's name where there is none.
+        domain: A polygon, or the path of a gmsh file.
+        size: Facet length wanted on the coarsest mesh of a polygon.
+        problem: The data as functions of x, which give UFL.
+        expressions: The data that were written in the file, by key (``data.f`` …).
+        mode: "uniform" or "adaptive".
+        levels: Number of meshes, the coarsest included.
+        tolerance: Adaptive refinement stops when the certified bound is below it.
+        max_dofs: Adaptive refinement stops before a mesh with more degrees of freedom.
+    """
+
+    path: Path
+    title: str
+    domain: Polygon | Path
+    size: float | None
+    problem: Problem
+    expressions: Mapping[str, Expression]
+    mode: str
+    levels: int
+    tolerance: float
+    max_dofs: int
+
+    def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
+        """Make or read the coarsest mesh; collective."""
+        key = "domain.mesh" if isinstance(self.domain, Path) else "domain"
+        try:
+            if isinstance(self.domain, Path):
+                return read_gmsh(self.domain, comm)
+            assert self.size is not None
+            return self.domain.mesh(self.size, comm)
+        except InputError as error:
+            raise InputError(f"{self.path}: {key}: {error}") from None
+
+    def check(self, domain: Domain) -> list[str]:
+        """Try the data out on the coarsest mesh; collective.
+
+        Args:
+            domain: From :meth:`mesh`.
+
+        Returns:
+            What contradicts itself in data that can be solved with, a sentence each.
+
+        Raises:
+            InputError: An expression is not finite where it is needed, the coefficient is not
+                positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, or the last mesh
+                of the sequence would be absurdly large.
+        """
+        topology = domain.mesh.topology
+        cells = topology.index_map(topology.dim).size_global
+        try:
+            if self.mode == "uniform":
+                _few_enough(self.levels, cells, topology.dim)
+            check_values(self.expressions, domain)
+            forms = Forms(self.problem, domain.mesh)
+            check_data(forms, domain)
+            return doubts(forms, domain)
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from None
+
+
+def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
+    """Read a problem file on rank 0 and check it on every rank; collective.
+
+    Args:
+        path: The TOML file.
+        comm: The ranks that take part.
+
+    Raises:
+        InputError: The file cannot be read or says something that is not allowed.
+    """
+    path = Path(path)
+    try:
+        table = parse_toml(on_root(comm, read_text, path))
+        insist_known(table, "", ("title", *SECTIONS), KEYS)
+        title = get(table, "", "title", string, path.stem)
+        sections = {name: _section(table, name) for name in SECTIONS}
+        if "domain" not in table:
+            raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
+        if "data" not in table and "exact" not in table:
+            raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
+        if "exact" in table and not table["exact"]:
+            raise InputError("exact.u: this key is missing; an expression in x and y is needed")
+        domain, size = _domain(sections["domain"], path.parent)
+        expressions = _expressions(sections)
+        refine = sections["refine"]
+        mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
+        tolerance = get(refine, "refine", "tolerance", not_negative, 0.0)
+        max_dofs = get(refine, "refine", "max_dofs", whole, MAX_DOFS)
+        for key, limit in (("tolerance", tolerance), ("max_dofs", max_dofs)):
+            if mode == "uniform" and refine.get(key):
+                raise InputError(
+                    f"refine.{key}: {shown(limit)} is where adaptive refinement ends;"
+                    ' mode = "adaptive" is needed beside it'
+                )
+        return ProblemFile(
+            path=path,
+            title=title,
+            domain=domain,
+            size=size,
+            problem=_problem(expressions),
+            expressions=expressions,
+            mode=mode,
+            levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
+            tolerance=tolerance,
+            max_dofs=max_dofs,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+_SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, [define] and [refine] are optional"
+
+
+def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:
+    section = table.get(name, {})
+    if not isinstance(section, dict):
+        raise InputError(f"{name}: a section [{name}] is needed, found {shown(section)}")
+    if name in KEYS:
+        insist_known(section, name, KEYS[name], KEYS)
+    return section
+
+
+def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, float | None]:
+    """Read [domain]: the polygon and its size, or the path of the mesh."""
+    if "mesh" in table:
+        others = [key for key in ("vertices", "boundary", "size", "holes") if key in table]
+        if others:
+            raise InputError(
+                f"domain: both mesh and {others[0]} are given; either a mesh file or a polygon"
+                " (vertices, boundary, size) is allowed"
+            )
+        return folder / get(table, "domain", "mesh", string), None
+    if "vertices" not in table:
+        raise InputError(
+            "domain: neither vertices nor mesh is given; a polygon (vertices, boundary, size) or"
+            " a mesh file is needed"
+        )
+    polygon = _polygon(table, "domain")
+    holes = []
+    for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
+        key = f"domain.holes[{i}]"
+        if not isinstance(hole, dict):
+            raise InputError(
+                f"{key}: {{ vertices = [...], boundary = [...] }} is needed, found {shown(hole)}"
+            )
+        insist_known(hole, key, ("vertices", "boundary"))
+        holes.append(_polygon(hole, key))
+    if holes:
+        apart = "holes must lie inside the polygon and apart from each other"
+        outline = (polygon.vertices, polygon.boundary)
+        polygon = named("domain.holes", Polygon, *outline, tuple(holes), rule=apart)
+    named("domain.boundary", polygon.check_parts)
+    size = get(table, "domain", "size", positive, needed="a number above 0, the length of a facet,")
+    # From the longest edge on, facets grow inside only; none is longer than the diameter
+    if size > polygon.diameter * (1 + 1e-9):
+        raise InputError(
+            f"domain.size: {size:g} is longer than the domain, whose largest extent is"
+            f" {polygon.diameter:.6g}; the length of a facet is needed, no more than that"
+        )
+    return polygon, size
+
+
+def _polygon(table: Mapping[str, Any], section: str) -> Polygon:
+    key = f"{section}.vertices"
+    vertices = get(table, section, "vertices", array, needed="a list of points [x, y]")
+    for i, vertex in enumerate(vertices):
+        if not isinstance(vertex, list) or len(vertex) != 2:
+            raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
+        for j, coordinate in enumerate(vertex):
+            number(f"{key}[{i}][{j}]", coordinate)
+    if len(vertices) < 3:
+        raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
+    boundary = get(table, section, "boundary", array, needed="a list of labels, one for each edge,")
+    for i, label in enumerate(boundary):
+        one_of(tuple(PARTS))(f"{section}.boundary[{i}]", label)
+    if len(boundary) != len(vertices):
+        raise InputError(
+            f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
+            f" found {len(boundary)} labels"
+        )
+    simple = "the polygon must be simple, its edges must meet at their common vertices only"
+    return named(key, Polygon, np.array(vertices, dtype=np.float64), tuple(boundary), rule=simple)
+
+
+def _few_enough(levels: int, cells: int, dim: int) -> None:
+    most = 1 + int(math.log2(max(MOST_CELLS / cells, 1.0)) / dim)
+    if levels > most:
+        raise InputError(
+            f"refine.levels (or --levels): {levels} meshes would end with far too many cells; from"
+            f" the {cells} of the coarsest mesh on, at most {most} are allowed"
+        )
+
+
+def _expressions(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, Expression]:
+    """Read [define], [data] and [exact]."""
+    names: dict[str, Expression] = {}
+    define = sections["define"]
+    for name, value in define.items():
+        named(f"define.{name}", check_name, name)
+        later = [other for other in define if other not in names]
+        names[check_name(name)] = _expression(f"define.{name}", value, names, later)
+    result = {}
+    for key in USED_ON:
+        section, name = key.split(".")
+        if name in sections[section]:
+            expression = _expression(key, sections[section][name], names, ())
+            if expression.is_condition:
+                raise InputError(f"{key}: a number is needed, but this is a condition")
+            result[key] = expression
+    return result
+
+
+def _expression(
+    key: str, value: Any, names: Mapping[str, Expression], later: Collection[str]
+) -> Expression:
+    if isinstance(value, str):
+        return named(key, parse, value, names, later)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(
+            f"{key}: an expression (a string) or a number is needed, found {shown(value)}"
+        )
+    return parse(repr(number(key, value)))
+
+
+def _problem(expressions: Mapping[str, Expression]) -> Problem:
+    def data(key: str, default: Any) -> Any:
+        if key not in expressions:
+            return default
+        expression = expressions[key]
+        return expression.ufl if expression.constant is None else expression.constant
+
+    return Problem(
+        f=data("data.f", None),
+        g=data("data.g", None),
+        obstacle=data("data.obstacle", 0.0),
+        dirichlet=data("data.dirichlet", None),
+        coefficient=data("data.coefficient", 1.0),
+        exact=data("exact.u", None),
+    )

@@ -1,0 +1,419 @@
+"""Data for which the problem makes sense: K is not empty, and the energy is one.
+
+They are tried out at points of the coarsest mesh, by `pointwise.evaluate`, which tells how far a
+value can be trusted: no data are refused for what rounding has made of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx.mesh import Mesh, compute_midpoints, entities_to_geometry
+from mpi4py import MPI
+
+from ..compat import cell_nodes
+from ..errors import InputError
+from ..fem.cells import Cells, Side, corner_points
+from ..fem.problem import Forms, number
+from ..fem.space import facet_entities
+from ..mesh.domain import CONTACT, DIRICHLET, Domain
+from .pointwise import EPS, evaluate
+
+if TYPE_CHECKING:
+    from .moments import Trace
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+Complaint = tuple[tuple[float, ...], str]
+"""Where, and what is wrong there."""
+
+SAFETY = 4.0
+"""How many times its bound a rounding error may be: the bound is of first order."""
+
+TOLERANCE = 1e-9
+"""What is no difference, in parts of u_D's size: formulas are written with so many digits."""
+
+COORDINATES = 1e-12
+"""Digits of a vertex that a mesh generator gets right, in parts of the domain's diameter."""
+
+SAMPLES, LEAST, MOST = 50_000, 4, 128
+"""Intervals in which u_D is looked at: about so many in all, and so many a facet."""
+
+HUGE = 1e3
+"""How many times the largest value looked at first a value must be to belong to a pole."""
+
+AT_A_TIME = 20_000
+"""Intervals that are cut at a time; of more, only the rougher part of each."""
+
+MIDDLE = 0.45
+"""Where intervals are cut: in their middles, a jump that lies just there, as sign(x) at 0, has the
+mean of both sides."""
+
+SHORTEST = 1e3
+"""Length of the shortest intervals, in units of the points' rounding."""
+
+
+def check_data(forms: Forms, domain: Domain) -> None:
+    """Insist on data for which there is a solution; collective.
+
+    Args:
+        forms: The data.
+        domain: Mesh and boundary parts; of a sequence, the coarsest.
+
+    Raises:
+        InputError: κ is not symmetric and positive definite, u_D jumps, or α is above u_D where Γ0
+            meets Γ1. The message names the point and the values.
+    """
+    comm = domain.mesh.comm
+    _raise_first(comm, _bad_coefficient(forms, domain))
+    u_D = _Values(forms.dirichlet, domain)
+    fixed = _Facets.of(domain, DIRICHLET)
+    _raise_first(comm, _jump(u_D, fixed, forms.source))
+    contact = _Facets.of(domain, CONTACT)
+    _raise_first(comm, _crossing(u_D, fixed, _Values(forms.obstacle, domain), contact))
+
+
+def differs(cells: Cells, side: Side, gap: FloatArray, scale: float, *data: Trace) -> bool:
+    """Tell whether data differ at the vertices of facets by more than their rounding; collective.
+
+    Args:
+        cells: The mesh.
+        side: The facets.
+        gap: What should not be above 0 at their vertices, shape (d, n).
+        scale: Size of what the data are compared with, the same on all ranks.
+        *data: What the gap is made of.
+
+    Returns:
+        Whether they do on this rank.
+    """
+    precision = Precision.of(cells.domain.mesh).vertices
+    vertex, facet = np.nonzero(gap > TOLERANCE * scale)
+    if not len(facet):
+        return False
+    x = corner_points(cells, side)[1][vertex, facet]
+    points = np.zeros((len(x), 3))
+    points[:, : x.shape[1]] = x
+    where = side.cells[facet].astype(np.int32)
+    found = (evaluate(each.expression, points, precision, where) for each in data)
+    slack = sum(SAFETY * each[1] for each in found if each is not None)
+    return bool((gap[vertex, facet] > TOLERANCE * scale + slack).any())
+
+
+@dataclass(frozen=True)
+class Precision:
+    """By how much coordinates may be wrong.
+
+    Attributes:
+        vertices: Of vertices, as they were given or made by a mesh generator.
+        points: Of points between them.
+    """
+
+    vertices: float
+    points: float
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> Precision:
+        """Look at the mesh; collective."""
+        x = mesh.geometry.x[:, : mesh.geometry.dim]
+        ends = (x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf))
+        lows, highs = zip(*mesh.comm.allgather(ends), strict=True)
+        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        rounding = 4 * EPS * float(max(np.abs(low).max(), np.abs(high).max()))
+        return cls(max(2 * rounding, COORDINATES * float(np.linalg.norm(high - low))), rounding)
+
+
+class _Values:
+    """An expression at points of a mesh.
+
+    Args:
+        expression: A scalar.
+        domain: The mesh it may be tied to.
+    """
+
+    def __init__(self, expression: ufl.core.expr.Expr, domain: Domain):
+        self.expression, self.mesh = expression, domain.mesh
+        self.precision = Precision.of(domain.mesh)
+        self.constant = number(expression) is not None
+        self.tied = bool(ufl.algorithms.extract_coefficients(expression))
+
+    def at(
+        self, points: FloatArray, cells: IntArray, error: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Values and tolerances for their rounding, shapes of the points but for the last axis."""
+        shape = points.shape[:-1]
+        cells = np.broadcast_to(cells.reshape(cells.shape + (1,) * (len(shape) - 1)), shape)
+        found = evaluate(self.expression, points.reshape(-1, 3), error, cells.ravel())
+        if found is None:
+            return None
+        return found[0].reshape(shape), SAFETY * found[1].reshape(shape)
+
+
+@dataclass(frozen=True)
+class _Facets:
+    """Facets of one part that this rank owns.
+
+    Attributes:
+        x: Their vertices, shape (n, d, 3).
+        cells: Their cells, shape (n,).
+        nodes: Global numbers of the vertices, shape (n, d).
+    """
+
+    x: FloatArray
+    cells: IntArray
+    nodes: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, domain: Domain, part: int) -> _Facets:
+        mesh, facets = domain.mesh, domain.facets(part)
+        d = mesh.topology.dim
+        nodes = np.zeros((0, d), dtype=np.int32)
+        if len(facets):
+            nodes = np.asarray(entities_to_geometry(mesh, d - 1, facets), dtype=np.int32)
+        known = mesh.geometry.index_map().local_to_global(nodes.ravel())
+        return cls(
+            mesh.geometry.x[nodes],
+            facet_entities(mesh, facets)[:, 0],
+            np.asarray(known, dtype=np.int64).reshape(nodes.shape),
+        )
+
+    @property
+    def paths(self) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Segments that every facet is looked at along: their ends and cells."""
+        if self.x.shape[1] == 2:
+            return self.x[:, 0], self.x[:, 1], self.cells
+        middle = np.repeat(self.x.mean(axis=1), self.x.shape[1], axis=0)
+        return self.x.reshape(-1, 3), middle, np.repeat(self.cells, self.x.shape[1])
+
+
+def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
+    """Where u_D jumps, within a facet or between two that touch; collective.
+
+    Every facet is looked at in intervals. Where u_D is far from affine on one, it is cut in two,
+    until the digits of the coordinates end. What is continuous has fallen by then, however steep it
+    is; a jump is as high as before. (|t|^s falls far enough for s > 0.05, near 0.)
+    """
+    comm = u_D.mesh.comm
+    start, end, cells = fixed.paths
+    total = comm.allreduce(len(start))
+    if u_D.constant or not total:
+        return []
+    pieces = int(np.clip(SAMPLES // total, LEAST, MOST))
+    t = np.arange(pieces)[:, None] + [0.0, MIDDLE]
+    t = np.append(t, pieces) / pieces
+    way = end - start
+    error = u_D.precision.points
+    found = u_D.at(start[:, None] + t[:, None] * way[:, None], cells, error)
+    if comm.allreduce(found is None, op=MPI.LOR):
+        return []
+    assert found is not None
+    values, errors = found
+    # Vertices are where they are: next to a pole of the angle, its value there can be trusted
+    ends = u_D.at(np.stack([start, end], axis=1), cells, 0.0)
+    assert ends is not None
+    errors[:, [0, -1]] = ends[1]
+    finite = np.abs(values[np.isfinite(values)])
+    largest = comm.allreduce(float(finite.max(initial=0.0)), op=MPI.MAX)
+    scale = TOLERANCE * largest
+    complaints = _between(u_D, fixed, scale, key) if u_D.tied else []
+
+    segment: npt.NDArray[np.intp] = np.repeat(np.arange(len(start)), pieces)
+    length = np.linalg.norm(way, axis=1)
+    longest = max(comm.allgather(float(length.max(initial=0.0)))) / pieces
+    shortest = SHORTEST * error
+    halfway = 16.0 * math.sqrt(longest * shortest)
+
+    def triples(array: FloatArray) -> FloatArray:
+        """Ends and middles of the intervals, shape (3, intervals)."""
+        return np.stack([array[:, :-2:2], array[:, 1:-1:2], array[:, 2::2]]).reshape(3, -1)
+
+    # Parameters, values and their errors of all intervals, how rough those were from halfway on
+    s, u, e = triples(np.broadcast_to(t, values.shape)), triples(values), triples(errors)
+    roughest: FloatArray = np.zeros(len(segment))
+    while len(segment):
+        rough = _roughness(u)
+        width = (s[2] - s[0]) * length[segment]
+        roughest = np.where(width <= halfway, np.maximum(rough, roughest), 0.0)
+        x = start[segment] + s[1][:, None] * way[segment]
+        for i in np.flatnonzero(np.abs(u).max(axis=0) > HUGE * largest):
+            complaints.append(_pole_message(key, u_D.mesh, x[i]))
+        level = np.maximum(scale, _noise(e))
+        height = np.abs(u[2] - u[0])
+        short = width < shortest
+        for i in np.flatnonzero(short & (height > np.maximum(level, roughest))):
+            complaints.append(_jump_message(key, u_D.mesh, x[i], u[0, i], u[2, i]))
+        kept = np.flatnonzero(~short & (rough > level))
+        s, u, e, segment, roughest = (
+            s[:, kept],
+            u[:, kept],
+            e[:, kept],
+            segment[kept],
+            roughest[kept],
+        )
+        cuts = s[:2] + MIDDLE * np.diff(s, axis=0)
+        where = start[segment] + cuts[:, :, None] * way[segment]
+        found = u_D.at(where.swapaxes(0, 1), cells[segment], error)
+        assert found is not None
+        s, u, e = (_halves(old, new) for old, new in ((s, cuts), (u, found[0].T), (e, found[1].T)))
+        segment, roughest = np.tile(segment, 2), np.tile(roughest, 2)
+        if len(segment) > AT_A_TIME:
+            half = len(segment) // 2
+            first = _roughness(u[:, :half]) >= _roughness(u[:, half:])
+            kept = np.where(first, np.arange(half), np.arange(half, 2 * half))
+            s, u, e = s[:, kept], u[:, kept], e[:, kept]
+            segment, roughest = segment[kept], roughest[kept]
+    return complaints
+
+
+def _halves(triples: FloatArray, cuts: FloatArray) -> FloatArray:
+    """Both parts of every interval, the first ones first, shape (3, 2 intervals)."""
+    (a, m, b), (p, q) = triples, cuts
+    return np.hstack([np.stack([a, p, m]), np.stack([m, q, b])])
+
+
+def _roughness(u: FloatArray) -> FloatArray:
+    """How far u, at ends and middles, is from affine; 0 where it is not finite."""
+    with np.errstate(all="ignore"):
+        difference = np.abs((1.0 - MIDDLE) * u[0] - u[1] + MIDDLE * u[2])
+    return np.where(np.isfinite(difference), difference, 0.0)
+
+
+def _noise(e: FloatArray) -> FloatArray:
+    """What rounding may make of three values: one of them may lie where nothing can be known."""
+    return 3.0 * np.median(e, axis=0)
+
+
+def _pole_message(key: str, mesh: Mesh, x: FloatArray) -> Complaint:
+    where = place(x, mesh)
+    return where, (
+        f"{key}: the dirichlet value grows without bound towards {shown(where)}; it must be finite"
+        " and continuous"
+    )
+
+
+def _between(u_D: _Values, fixed: _Facets, scale: float, key: str) -> list[Complaint]:
+    """Vertices at which facets give u_D different values; collective.
+
+    Only Functions can: what else depends on x alone.
+    """
+    found = u_D.at(fixed.x, fixed.cells, u_D.precision.vertices)
+    assert found is not None
+    mine = [array.ravel() for array in (fixed.nodes, *found)]
+    node, value, error = (np.concatenate(each) for each in zip(*u_D.mesh.comm.allgather(mine)))
+    order = np.lexsort((value, node))
+    node, value, error = node[order], value[order], error[order]
+    same = np.flatnonzero(
+        (node[1:] == node[:-1]) & (value[1:] - value[:-1] > scale + error[1:] + error[:-1])
+    )
+    places = {int(n): x for n, x in zip(fixed.nodes.ravel(), fixed.x.reshape(-1, 3), strict=True)}
+    return [
+        _jump_message(key, u_D.mesh, places[int(node[i])], value[i], value[i + 1])
+        for i in same
+        if int(node[i]) in places
+    ]
+
+
+def _jump_message(key: str, mesh: Mesh, x: FloatArray, a: float, b: float) -> Complaint:
+    where = place(x, mesh)
+    digits = 9 - math.ceil(math.log10(max(abs(a), abs(b))))
+    a, b = round(a, digits) + 0.0, round(b, digits) + 0.0
+    return where, (
+        f"{key}: at {shown(where)} the dirichlet value jumps from {a:.10g} to {b:.10g}; it must be"
+        " continuous wherever dirichlet facets touch, because no function of finite energy jumps"
+        " on the boundary (a steep slope is allowed)"
+    )
+
+
+def _crossing(u_D: _Values, fixed: _Facets, alpha: _Values, contact: _Facets) -> list[Complaint]:
+    """Where Γ0 meets Γ1 with α above u_D, so that K is empty; collective."""
+    mesh = u_D.mesh
+    comm = mesh.comm
+    error = u_D.precision.vertices
+    found = u_D.at(fixed.x, fixed.cells, error)
+    above = alpha.at(contact.x, contact.cells, error)
+    if comm.allreduce(found is None or above is None, op=MPI.LOR):
+        return []
+    assert found is not None and above is not None
+    mine = [array.ravel() for array in (fixed.nodes, *found)]
+    node, value, slack = (np.concatenate(each) for each in zip(*comm.allgather(mine)))
+    node, one = np.unique(node, return_index=True)
+    row = np.minimum(np.searchsorted(node, contact.nodes), max(len(node) - 1, 0))
+    meets = node[row] == contact.nodes if len(node) else np.zeros(row.shape, dtype=bool)
+    below, less = value[one][row[meets]], slack[one][row[meets]]
+    top, more = (array[meets] for array in above)
+    finite = np.abs(value[np.isfinite(value)]).max(initial=0.0)
+    scale = max(float(finite), *comm.allgather(float(np.abs(top).max(initial=0.0))))
+    wrong = np.flatnonzero(top - below > TOLERANCE * scale + less + more)
+    return [
+        (
+            where := place(contact.x[meets][i], mesh),
+            f"data.obstacle: at {shown(where)}, where contact and dirichlet meet, the obstacle is"
+            f" {top[i]:.10g} but the dirichlet value is only {below[i]:.10g}; the obstacle must not"
+            " be above it",
+        )
+        for i in wrong
+    ]
+
+
+def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
+    """Where κ is not symmetric, or not positive definite, at vertices and midpoints of cells."""
+    mesh = domain.mesh
+    if forms.uniform:
+        return []
+    tdim = mesh.topology.dim
+    owned = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
+    nodes, first = np.unique(cell_nodes(mesh)[owned], return_index=True)
+    x = np.vstack([mesh.geometry.x[nodes], compute_midpoints(mesh, tdim, owned)])
+    cells = np.concatenate([(first // (tdim + 1)).astype(np.int32), owned])
+    found = evaluate(forms.kappa, x, Precision.of(mesh).vertices, cells)
+    if found is None:
+        return []
+    values, errors = (array.reshape(len(x), *(forms.kappa.ufl_shape or (1, 1))) for array in found)
+    usable = np.asarray(np.isfinite(values).all(axis=(1, 2)))
+    values[~usable] = np.eye(values.shape[1])
+    size = np.abs(values).max(axis=(1, 2), initial=0.0)
+    skew = np.abs(values - values.transpose(0, 2, 1))
+    allowed = TOLERANCE * size[:, None, None] + SAFETY * (errors + errors.transpose(0, 2, 1))
+    crooked = np.asarray((skew > allowed).any(axis=(1, 2)))
+    least = np.linalg.eigvalsh(0.5 * (values + values.transpose(0, 2, 1)))[:, 0]
+    wrong = np.flatnonzero(crooked | ~(least > 0))
+    if not len(wrong):
+        return []
+    i = min(wrong, key=lambda i: place(x[i], mesh))
+    where = place(x[i], mesh)
+    if not forms.kappa.ufl_shape:
+        said = f"is {values[i, 0, 0]:.10g}; it must be above 0 everywhere"
+    else:
+        rows = ", ".join("[" + ", ".join(f"{v:.10g}" for v in row) + "]" for row in values[i])
+        said = f"is [{rows}], which is not symmetric; "
+        if not crooked[i]:
+            said = f"is [{rows}], with the eigenvalue {least[i]:.10g}; "
+        said += "a symmetric positive definite tensor is needed"
+    return [(where, f"data.coefficient: the value at {shown(where)} {said}")]
+
+
+def place(x: FloatArray, mesh: Mesh) -> tuple[float, ...]:
+    """A point for a message, without the digits that rounding has made."""
+    digits = 11 - math.ceil(math.log10(np.abs(mesh.geometry.x).max()))
+    return tuple(float(value) + 0.0 for value in np.round(x[: mesh.geometry.dim], digits))
+
+
+def shown(x: Sequence[float]) -> str:
+    """A point in a message."""
+    return "(" + ", ".join(f"{value:.10g}" for value in x) + ")"
+
+
+def first(comm: MPI.Comm, found: list[Complaint]) -> str | None:
+    """The complaint about the first point from the left, on all ranks; collective."""
+    every = [each for each in comm.allgather(min(found, default=None)) if each is not None]
+    return min(every)[1] if every else None
+
+
+def _raise_first(comm: MPI.Comm, found: list[Complaint]) -> None:
+    if (message := first(comm, found)) is not None:
+        raise InputError(message)

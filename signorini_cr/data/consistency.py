@@ -1,0 +1,151 @@
+"""Data that contradict one another: an exact solution that is none, a flux on no facet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx.mesh import compute_midpoints
+from mpi4py import MPI
+
+from ..compat import cell_nodes
+from ..fem.problem import Forms, number
+from ..fem.space import facet_entities, facet_measures
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from .admissible import SAFETY, Complaint, Precision, first, place, shown
+from .pointwise import evaluate
+
+FloatArray = npt.NDArray[np.float64]
+Found = tuple[FloatArray, FloatArray]
+"""Values at points, and what rounding may have done to them."""
+
+ENOUGH = 1e-6
+"""What is no difference, in parts of the largest value: an exact solution may be a fit."""
+
+
+def doubts(forms: Forms, domain: Domain) -> list[str]:
+    """Say what contradicts itself in data that can be solved with; collective.
+
+    Args:
+        forms: The data.
+        domain: Mesh and boundary parts; of a sequence, the coarsest.
+
+    Returns:
+        A sentence each, the same on all ranks.
+    """
+    found = []
+    given = forms.problem.g is not None and number(forms.g) != 0.0
+    if given and domain.mesh.comm.allreduce(len(domain.facets(NEUMANN))) == 0:
+        found.append("data.g: it acts nowhere, for no facet is neumann")
+    if forms.exact is not None:
+        said = _Solution(forms, domain).complaint()
+        if said is not None:
+            found.append(f"exact.u: {said}: it is not the solution, and errors say how far from it")
+    return found
+
+
+class _Solution:
+    """An exact solution on a mesh."""
+
+    def __init__(self, forms: Forms, domain: Domain):
+        """Take the data; collective."""
+        self.forms, self.domain, self.mesh = forms, domain, domain.mesh
+        self.precision = Precision.of(domain.mesh).vertices
+        self.u: Any = forms.exact
+        flat = number(self.u) is not None
+        self.slope: Any = None if flat else forms.kappa * ufl.grad(self.u)
+
+    def complaint(self) -> str | None:
+        """The first of the conditions on Γ1, in Ω, on Γ0 and on Γg that u violates; collective."""
+        x, cells, n = self._facets(CONTACT)
+        u, alpha = self._values(self.u, x, cells), self._values(self.forms.obstacle, x, cells)
+        pressure = self._flux(x, cells, n)
+        gap = _difference(u, alpha)
+        height, force = self._size(u, alpha), self._size(pressure)
+        said = self._first(
+            gap[0] < -ENOUGH * height - gap[1],
+            x,
+            "u is {:.6g}, below the obstacle, {:.6g}",
+            u,
+            alpha,
+        )
+        low = ENOUGH * force + pressure[1]
+        said = said or self._first(
+            pressure[0] < -low, x, "the pressure on the obstacle is {:.6g}, below 0", pressure
+        )
+        apart = (gap[0] > ENOUGH * height + gap[1]) & (pressure[0] > low)
+        words = "the pressure on the obstacle is {:.6g} though u is above it by {:.6g}"
+        said = said or self._first(apart, x, words, pressure, gap)
+        problem = self.forms.problem
+        if problem.f is not None and not said:
+            tdim = self.mesh.topology.dim
+            cells = np.arange(self.mesh.topology.index_map(tdim).size_local, dtype=np.int32)
+            x = compute_midpoints(self.mesh, tdim, cells)
+            f = ufl.as_ufl(0.0) if self.slope is None else -ufl.div(self.slope)
+            said = self._same(
+                "f", x, self._values(self.forms.f, x, cells), self._values(f, x, cells)
+            )
+        if problem.dirichlet is not None and not said:
+            x, cells, _ = self._facets(DIRICHLET)
+            given = self._values(self.forms.dirichlet, x, cells)
+            said = self._same("dirichlet", x, given, self._values(self.u, x, cells))
+        if problem.g is not None and not said:
+            x, cells, n = self._facets(NEUMANN)
+            given = self._values(self.forms.g, x, cells)
+            said = self._same("g", x, given, self._flux(x, cells, n))
+        return said
+
+    def _same(self, key: str, x: FloatArray, given: Found, wanted: Found) -> str | None:
+        gap = _difference(given, wanted)
+        wrong = np.abs(gap[0]) > ENOUGH * self._size(given, wanted) + gap[1]
+        words = f"data.{key} is {{:.6g}}, but it asks for {{:.6g}}"
+        return self._first(wrong, x, words, given, wanted)
+
+    def _facets(self, part: int) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
+        """Midpoints of facets, their cells and outward normals."""
+        entities = facet_entities(self.mesh, self.domain.facets(part))
+        corners, _ = facet_measures(self.mesh, self.domain.facets(part))
+        middle, cells = corners.mean(axis=1), entities[:, 0]
+        edges = corners[:, 1:] - corners[:, :1]
+        up = np.broadcast_to([0.0, 0.0, 1.0], middle.shape)
+        normal = np.cross(edges[:, 0], edges[:, 1] if edges.shape[1] > 1 else up)
+        inside = self.mesh.geometry.x[cell_nodes(self.mesh)[cells]].mean(axis=1)
+        normal *= np.sign((normal * (middle - inside)).sum(axis=1))[:, None]
+        return middle, cells, normal / np.linalg.norm(normal, axis=1)[:, None]
+
+    def _values(self, e: Any, x: FloatArray, cells: npt.NDArray[np.int32]) -> Found:
+        """An expression at points; what can't be told is nan."""
+        found = evaluate(e, x, self.precision, cells)
+        if found is None:
+            shape = (len(x), *e.ufl_shape)
+            return np.full(shape, np.nan), np.full(shape, np.nan)
+        return found[0], SAFETY * found[1]
+
+    def _flux(self, x: FloatArray, cells: npt.NDArray[np.int32], n: FloatArray) -> Found:
+        if self.slope is None:
+            return np.zeros(len(x)), np.zeros(len(x))
+        values, errors = self._values(self.slope, x, cells)
+        n = n[:, : values.shape[1]]
+        return (values * n).sum(axis=1), (errors * np.abs(n)).sum(axis=1)
+
+    def _size(self, *found: Found) -> float:
+        """The largest value on any rank."""
+        values = np.concatenate([np.abs(each[0]) for each in found])
+        largest = float(values[np.isfinite(values)].max(initial=0.0))
+        return float(self.mesh.comm.allreduce(largest, op=MPI.MAX))
+
+    def _first(
+        self, wrong: npt.NDArray[np.bool_], x: FloatArray, words: str, *found: Found
+    ) -> str | None:
+        complaints: list[Complaint] = []
+        for i in np.flatnonzero(wrong):
+            where = place(x[i], self.mesh)
+            said = words.format(*(each[0][i] for each in found))
+            complaints.append((where, f"at {shown(where)} {said}"))
+        return first(self.mesh.comm, complaints)
+
+
+def _difference(a: Found, b: Found) -> Found:
+    return a[0] - b[0], a[1] + b[1]

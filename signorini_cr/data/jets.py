@@ -1,0 +1,830 @@
+"""Enclosures of an expression and of its derivatives on many boxes at once.
+
+A jet holds, for each box, numbers between which the value and the Taylor coefficients ∂^k/k! up to
+the third order lie at every point of the box (or at almost every point, where that says so). They
+are found by interval arithmetic: an operator's range follows from its arguments' ranges. Results
+are rounded outwards. A coefficient that has no bound, at a root of 0 or at a kink, is infinite,
+and the coefficients of lower order still hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from ufl import classes
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
+from ufl.algorithms.expand_indices import expand_indices
+
+from .. import compat
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+Range = tuple[FloatArray, FloatArray]
+"""Lower and upper bounds."""
+Ball = tuple[FloatArray, FloatArray] | None
+"""Middles and radii; None for exactly 0."""
+Truth = tuple[BoolArray, BoolArray]
+"""Where a condition can hold, and where it can fail."""
+
+ORDER = 3
+"""The highest order of a jet."""
+_EPS = 4e-16
+"""Relative error of +, −, ·, / and √, with room."""
+_LOOSE = 4e-15
+"""The same of other functions, and of sums of a few products."""
+
+
+class Unknown(Exception):
+    """An expression whose range is not known here."""
+
+
+@cache
+def indices(variables: int, order: int = ORDER) -> tuple[tuple[int, ...], ...]:
+    """The multi-indices of Taylor coefficients, by order, the value's first."""
+    found = [k for k in product(range(order + 1), repeat=variables) if sum(k) <= order]
+    return tuple(sorted(found, key=lambda k: (sum(k), [-i for i in k])))
+
+
+@cache
+def _pairs(variables: int, order: int) -> tuple[tuple[int, int, int], ...]:
+    """(k, i, j) where index k is the sum of i and j, none of which is the value's."""
+    table = {index: place for place, index in enumerate(indices(variables, order))}
+    sums = (
+        (table.get(tuple(p + q for p, q in zip(a, b, strict=True))), i, j)
+        for a, i in table.items()
+        for b, j in table.items()
+        if i and j
+    )
+    return tuple((k, i, j) for k, i, j in sums if k is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Where to enclose: points low ≤ x ≤ high, as they depend on some variables.
+
+    Attributes:
+        low: Least coordinates, shape (gdim, n).
+        high: Largest coordinates, shape (gdim, n).
+        along: ∂x/∂(variables), shape (variables, gdim, n); None where x itself are the variables.
+        corners: Vertices of the simplices that are meant, shape (d + 1, gdim, n); conditions on
+            affine functions are then decided up to a strip along the simplex's boundary which is
+            `STRIP` wide.
+        cells: A cell that holds each box, shape (n,), for data that are given by cells.
+        normal: Outward normals, shape (gdim, n).
+        mesh: The mesh of the cells.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    along: FloatArray | None = None
+    corners: FloatArray | None = None
+    cells: npt.NDArray[np.intp] | None = None
+    normal: FloatArray | None = None
+    mesh: Any = None
+
+    @property
+    def variables(self) -> int:
+        """Of the Taylor polynomials."""
+        return len(self.low if self.along is None else self.along)
+
+    @cached_property
+    def strip(self) -> FloatArray:
+        """Width of what may be left out along the boundary, shape (n,): coordinates' rounding."""
+        return STRIP * np.maximum(np.abs(self.low), np.abs(self.high)).max(axis=0)
+
+    @cached_property
+    def strip_part(self) -> FloatArray:
+        """Upper bound of a strip's part of its simplex, shape (n,).
+
+        Of a simplex a slab of width δ holds at most d δ / (least height), and the least height is
+        at least √det(edges' Gram matrix) / h^(d−1).
+        """
+        assert self.corners is not None
+        edges = (self.corners[1:] - self.corners[:1]).transpose(2, 0, 1)
+        d = edges.shape[1]
+        gram = edges @ edges.transpose(0, 2, 1)
+        volume = np.sqrt(np.maximum(np.linalg.det(gram), 0.0))
+        # no edge is longer than two from the first corner
+        reach = 2.0 * np.sqrt(gram.diagonal(axis1=1, axis2=2).max(axis=1))
+        width = d * self.strip * reach ** (d - 1)
+        return np.divide(width, volume, out=np.ones_like(width), where=width < volume)
+
+
+STRIP = 1e-13
+"""What counts as rounding of a coordinate, in parts of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Jet:
+    """Enclosures of a value and of its Taylor coefficients.
+
+    Attributes:
+        low: Lower bounds of the value, shape (n,) or ().
+        high: Upper bounds of it.
+        rest: Taylor coefficients in the order of `indices`, from the first on.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    rest: tuple[Ball, ...]
+
+    @cached_property
+    def all(self) -> tuple[Ball, ...]:
+        """All coefficients as middles and radii."""
+        return (_ball((self.low, self.high)), *self.rest)
+
+
+def lowered(expression: Any) -> Any:
+    """The expression in terms of scalar operators, derivatives carried out."""
+    nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
+    if all(isinstance(e, _KNOWN) for e in nodes):
+        return expression
+    return expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
+
+
+def is_local(expression: Any) -> bool:
+    """Whether the expression depends on more than x, so that it differs from cell to cell."""
+    kinds = (fem.Function, classes.GeometricQuantity)
+    return any(
+        isinstance(e, kinds) and not isinstance(e, classes.SpatialCoordinate)
+        for e in ufl.corealg.traversal.unique_pre_traversal(expression)
+    )
+
+
+def has_conditions(expression: Any) -> bool:
+    """Whether the expression may jump by a choice between two others."""
+    return any(
+        isinstance(e, classes.Conditional)
+        for e in ufl.corealg.traversal.unique_pre_traversal(expression)
+    )
+
+
+def strips_of(expression: Any) -> int:
+    """How many conditions an enclosure may decide up to strips, at most."""
+    nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
+    return sum(
+        isinstance(inner, _COMPARISONS)
+        for e in nodes
+        if isinstance(e, classes.Conditional)
+        for inner in ufl.corealg.traversal.pre_traversal(e.ufl_operands[0])
+    )
+
+
+class Enclosure:
+    """Jets of lowered expressions on given boxes; what they have in common is found once.
+
+    Args:
+        boxes: Where.
+        order: Up to which order.
+
+    Attributes:
+        strips: How many conditions were decided up to strips along the boundary.
+    """
+
+    def __init__(self, boxes: Boxes, order: int = ORDER):
+        """Begin with nothing known."""
+        self.boxes, self.order, self.strips = boxes, order, 0
+        self.size = len(indices(boxes.variables, order)) - 1
+        self._pairs = _pairs(boxes.variables, order)
+        self._known: dict[Any, Jet] = {}
+
+    def __call__(self, e: Any) -> Jet:
+        """The jet of an expression.
+
+        Raises:
+            Unknown: It holds an operator that is not known here.
+        """
+        if e not in self._known:
+            with np.errstate(all="ignore"):
+                self._known[e] = self._jet(e)
+        return self._known[e]
+
+    def inverse(self, e: Any) -> Jet:
+        """The jet of 1/e."""
+        with np.errstate(all="ignore"):
+            return self._compose(self(e), power_series(-1.0))
+
+    def _jet(self, e: Any) -> Jet:
+        if isinstance(e, classes.ScalarValue | classes.Zero):
+            return self._constant(float(e))
+        if isinstance(e, fem.Constant) and e.ufl_shape == ():
+            return self._constant(float(e.value))
+        if isinstance(e, fem.Function):
+            return self._function(e)
+        if isinstance(e, classes.Indexed):
+            return self._component(*e.ufl_operands)
+        if isinstance(e, classes.Conditional):
+            return self._conditional(e)
+        if isinstance(e, classes.Power):
+            return self._power(*e.ufl_operands)
+        if isinstance(e, classes.Atan2):
+            return self._atan2(*(self(operand) for operand in e.ufl_operands))
+        operands: Any = getattr(e, "ufl_operands", ())
+        for kind, series in SERIES.items():
+            if isinstance(e, kind):
+                return self._compose(self(operands[0]), series)
+        for kind, rule in _RULES.items():
+            if isinstance(e, kind):
+                return rule(self, *(self(operand) for operand in operands))
+        raise Unknown(type(e).__name__)
+
+    # ---- what expressions begin with
+
+    def _constant(self, value: float) -> Jet:
+        return Jet(np.array(value), np.array(value), (None,) * self.size)
+
+    def _linear(self, low: FloatArray, high: FloatArray, slopes: FloatArray) -> Jet:
+        """A value with constant first derivatives, shape (variables, n)."""
+        first = [(slope, _LOOSE * np.abs(slope)) if np.any(slope) else None for slope in slopes]
+        return Jet(low, high, (*first, *[None] * self.size)[: self.size])
+
+    def _component(self, vector: Any, index: Any) -> Jet:
+        i = index[0]
+        if not isinstance(i, classes.FixedIndex) or len(index) > 1:
+            raise Unknown("index")
+        if isinstance(vector, classes.SpatialCoordinate):
+            box, i = self.boxes, int(i)
+            if box.along is not None:
+                return self._linear(box.low[i], box.high[i], box.along[:, i])
+            return self._linear(box.low[i], box.high[i], np.eye(len(box.low))[i])
+        if isinstance(vector, classes.FacetNormal) and self.boxes.normal is not None:
+            n = self.boxes.normal[int(i)]
+            return self._linear(*out((n, n), _LOOSE), np.zeros((0, len(n))))
+        if isinstance(vector, fem.Constant):
+            return self._constant(float(np.asarray(vector.value)[int(i)]))
+        raise Unknown(type(vector).__name__)
+
+    def _function(self, function: fem.Function) -> Jet:
+        """Functions that are affine on each cell, or constant."""
+        box, V = self.boxes, function.function_space
+        element = V.ufl_element()
+        within = (
+            box.cells is not None
+            and V.mesh is box.mesh
+            and element.reference_value_shape == ()
+            and element.family_name in ("P", "Lagrange", "Discontinuous Lagrange")
+            and element.degree <= 1
+        )
+        if not within:
+            raise Unknown(function.name)
+        values = function.x.array[V.dofmap.list[box.cells]]
+        ends = values.min(axis=1), values.max(axis=1)
+        if values.shape[1] == 1:
+            return self._linear(*ends, np.zeros((0, len(values))))
+        X = box.mesh.geometry.x[compat.cell_nodes(box.mesh)[box.cells]][:, :, : len(box.low)]
+        rise = (values[:, 1:] - values[:, :1])[:, :, None]
+        slope = np.linalg.solve(X[:, 1:] - X[:, :1], rise)[:, :, 0].T
+        reach = [
+            mul((s, s), (a - p, b - p))
+            for s, a, b, p in zip(slope, box.low, box.high, X[:, 0].T, strict=True)
+        ]
+        low, high = (values[:, 0] + sum(r[k] for r in reach) for k in (0, 1))
+        room = 10 * _LOOSE * (np.abs(values).max(axis=1) + np.ptp(values, axis=1))
+        low, high = np.maximum(low - room, ends[0]), np.minimum(high + room, ends[1])
+        if box.along is not None:
+            slope = np.einsum("vgn,gn->vn", box.along, slope)
+        jet = self._linear(low, high, slope)
+        # the middle of the range is not the value in the middle: not affine for `_difference`
+        after = (_NOTHING,) * (self.size - len(slope))
+        return Jet(low, high, (*jet.rest[: len(slope)], *after)) if self.size else jet
+
+    # ---- arithmetic
+
+    def _sum(self, a: Jet, b: Jet) -> Jet:
+        low, high = out((a.low + b.low, a.high + b.high))
+        return Jet(low, high, tuple(map(_add, a.rest, b.rest)))
+
+    def _product(self, a: Jet, b: Jet) -> Jet:
+        low, high = square_of(a.low, a.high) if a is b else mul((a.low, a.high), (b.low, b.high))
+        x, y = _Factor(a.all), _Factor(b.all)
+        rest = [_Total() for _ in range(self.size)]
+        for k in range(1, self.size + 1):
+            rest[k - 1].product(x, 0, y, k)
+            rest[k - 1].product(x, k, y, 0)
+        for k, i, j in self._pairs:
+            rest[k - 1].product(x, i, y, j)
+        return Jet(low, high, tuple(total.ball for total in rest))
+
+    def _quotient(self, a: Jet, b: Jet) -> Jet:
+        return self._product(a, self._compose(b, power_series(-1.0)))
+
+    def _compose(self, a: Jet, series: Callable[[Range], Sequence[Range]]) -> Jet:
+        """φ(a), given the ranges of φ, φ', φ''/2 and φ'''/6 over a's range."""
+        terms = series((a.low, a.high))
+        rest = [_Total() for _ in range(self.size)]
+        outer, inner = _Factor([_ball(term) for term in terms]), _Factor(a.all)
+        power = inner
+        for order in range(1, self.order + 1):
+            for k in range(1, self.size + 1):
+                rest[k - 1].product(outer, order, power, k)
+            if order < self.order:
+                higher = [_Total() for _ in range(self.size + 1)]
+                for k, i, j in self._pairs:
+                    higher[k].product(power, i, inner, j)
+                power = _Factor([total.ball for total in higher])
+        low, high = terms[0]
+        return Jet(low, high, tuple(total.ball for total in rest))
+
+    def _power(self, base: Any, exponent: Any) -> Jet:
+        p = self(exponent)
+        fixed = p.low.ndim == 0 and p.low == p.high and not any(p.rest)
+        if fixed:
+            return self._compose(self(base), power_series(float(p.low)))
+        u = self(base)
+        whole = self._compose(self._product(p, self._compose(u, _ln)), _exp)
+        # At a base of 0, where the logarithm has no range
+        a, b = np.maximum(u.low, 0.0), np.maximum(u.high, 0.0)
+        ends = np.broadcast_arrays(*(x**q for x in (a, b) for q in (p.low, p.high)))
+        low, high = out((np.minimum.reduce(ends), np.maximum.reduce(ends)), _LOOSE)
+        one = (a <= 1) & (b >= 1)
+        low, high = (
+            np.where(one, np.minimum(low, 1.0), low),
+            np.where(one, np.maximum(high, 1.0), high),
+        )
+        crosses = (p.low < 0) & (p.high > 0) & (a == 0)
+        bad = crosses | (u.low < 0)
+        return Jet(
+            np.where(bad, -np.inf, np.maximum(whole.low, low)),
+            np.where(bad, np.inf, np.minimum(whole.high, high)),
+            whole.rest,
+        )
+
+    def _atan2(self, a: Jet, b: Jet) -> Jet:
+        """The angle of (b, a); it jumps where b < 0 and a changes its sign, and has none at 0."""
+        low = high = np.array(np.nan)
+        for y in (a.low + 0.0, a.high + 0.0):
+            for x in (b.low + 0.0, b.high + 0.0):
+                angle = np.where((x == 0) & (y == 0), np.nan, np.arctan2(y, x))
+                low, high = np.fmin(low, angle), np.fmax(high, angle)
+        low, high = out((low, high), _LOOSE)
+        full = ((a.low < 0) & (a.high >= 0) & (b.low < 0)) | ~np.isfinite(low + high)
+        one = self._compose(self._quotient(a, b), _atan)
+        other = self._compose(self._quotient(b, a), _atan)
+        rest = [_meet(p, _minus(q)) for p, q in zip(one.rest, other.rest, strict=True)]
+        if full.any():
+            for k, ball in enumerate(rest):
+                mid, rad = ball or _NOTHING
+                rest[k] = np.where(full, 0.0, mid), np.where(full, np.inf, rad)
+        return Jet(np.where(full, -4.0, low), np.where(full, 4.0, high), tuple(rest))
+
+    # ---- choices
+
+    def _choose(self, take: BoolArray, either: BoolArray, a: Jet, b: Jet, smooth: int) -> Jet:
+        """`a` where take, else b; the hull of both where either, known up to the order smooth.
+
+        Above the order smooth the coefficients are infinite where either may be.
+        """
+        first, second = a.all, b.all
+        low = np.where(either, np.minimum(a.low, b.low), np.where(take, a.low, b.low))
+        high = np.where(either, np.maximum(a.high, b.high), np.where(take, a.high, b.high))
+        order = [sum(k) for k in indices(self.boxes.variables, self.order)]
+        rest: list[Ball] = []
+        undecided = bool(np.any(either))
+        for k in range(1, self.size + 1):
+            if first[k] is None and second[k] is None and (order[k] <= smooth or not undecided):
+                rest.append(None)
+                continue
+            (m, r), (n, s) = (ball or _NOTHING for ball in (first[k], second[k]))
+            mid, rad = np.where(take, m, n), np.where(take, r, s)
+            if undecided:
+                hull = _ball((np.minimum(m - r, n - s), np.maximum(m + r, n + s)))
+                hull = hull if order[k] <= smooth and hull is not None else _ANY
+                mid, rad = np.where(either, hull[0], mid), np.where(either, hull[1], rad)
+            rest.append((mid, rad))
+        return Jet(low, high, tuple(rest))
+
+    def _maximum(self, a: Jet, b: Jet) -> Jet:
+        above, below = a.low >= b.high, b.low >= a.high
+        jet = self._choose(above, ~(above | below), a, b, 1)
+        return Jet(np.maximum(a.low, b.low), np.maximum(a.high, b.high), jet.rest)
+
+    def _minimum(self, a: Jet, b: Jet) -> Jet:
+        above, below = a.low >= b.high, b.low >= a.high
+        jet = self._choose(below, ~(above | below), a, b, 1)
+        return Jet(np.minimum(a.low, b.low), np.minimum(a.high, b.high), jet.rest)
+
+    def _conditional(self, e: Any) -> Jet:
+        condition, first, second = e.ufl_operands
+        can_hold, can_fail = self.truth(condition)
+        a, b = self(first), self(second)
+        either = can_hold & can_fail
+        agree = bool(np.any(either)) and _agree(condition, first, second)
+        jet = self._choose(can_hold, either, a, b, 1 if agree else 0)
+        if agree and _is_extreme(condition, first, second):
+            rule = self._maximum if _is_maximum(condition, first) else self._minimum
+            extreme = rule(a, b)
+            return Jet(extreme.low, extreme.high, jet.rest)
+        return jet
+
+    def truth(self, e: Any) -> Truth:
+        """Where in the boxes a condition can hold and where it can fail, but for null sets."""
+        if isinstance(e, classes.NotCondition):
+            return self.truth(e.ufl_operands[0])[::-1]
+        if isinstance(e, classes.AndCondition | classes.OrCondition):
+            (holds, fails), (also, nor) = (self.truth(operand) for operand in e.ufl_operands)
+            if isinstance(e, classes.AndCondition):
+                return holds & also, fails | nor
+            return holds | also, fails & nor
+        if not isinstance(e, _COMPARISONS):
+            raise Unknown(type(e).__name__)
+        left, right = e.ufl_operands
+        if isinstance(e, classes.LT | classes.LE):
+            left, right = right, left
+        low, high, thin = self._difference(self(left), self(right))
+        above, below = high > 0, low < 0  # where the difference can be so
+        # It can be 0 on more than a null set only where all derivatives may vanish
+        zero = (low <= 0) & (high >= 0) & ~thin
+        if isinstance(e, classes.EQ):
+            return zero, above | below
+        if isinstance(e, classes.NE):
+            return above | below, zero
+        if isinstance(e, classes.GT | classes.LT):
+            return above, below | zero
+        return above | zero, below
+
+    def _difference(self, a: Jet, b: Jet) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Bounds of a − b, and whether it takes each value on a null set only."""
+        low, high = a.low - b.high, a.high - b.low  # the sign is right whatever the rounding
+        n = self.boxes.variables
+        slopes = [_add(p, _minus(q)) for p, q in zip(a.rest, b.rest, strict=True)]
+        thin = np.zeros(np.broadcast_shapes(low.shape, self.boxes.low[0].shape), dtype=bool)
+        # where a function is 0 its derivatives, and theirs, are 0 almost everywhere
+        for ball in slopes:
+            if ball is not None:
+                thin |= np.abs(ball[0]) > ball[1]
+        corners = self.boxes.corners
+        if corners is None or self.order < 2 or any(a.rest[n:]) or any(b.rest[n:]):
+            return low, high, thin
+        return *self._at_corners(low, high, slopes[:n], corners), thin
+
+    def _at_corners(
+        self, low: FloatArray, high: FloatArray, slopes: Sequence[Ball], corners: FloatArray
+    ) -> Range:
+        """Bounds of an affine function on simplices, but for strips along their boundary.
+
+        The middle of its range on the box is its value in the middle of the box.
+        """
+        self.strips += 1
+        box = self.boxes
+        middle = 0.5 * (low + high)
+        offset = corners - 0.5 * (box.low + box.high)
+        if box.along is not None:  # along a unit vector
+            offset = np.einsum("vgn,cgn->cvn", box.along, offset)
+        half = 0.5 * (box.high - box.low)
+        if box.along is not None:
+            half = np.einsum("vgn,gn->vn", np.abs(box.along), half)
+        rise = np.zeros(offset.shape[::2])
+        steep, reach = np.zeros((2, rise.shape[1]))
+        for axis, ball in enumerate(slopes):
+            if ball is not None:
+                rise = rise + ball[0] * offset[:, axis]
+                steep = np.hypot(steep, ball[0])
+                reach = reach + np.abs(ball[0]) * half[axis]
+        # what the range is wider than an affine function's is rounding
+        rounding = np.maximum(0.5 * (high - low) - reach, 0.0) + _EPS * (np.abs(low) + np.abs(high))
+        room = steep * box.strip - rounding
+        bottom, top = middle + rise.min(axis=0) + room, middle + rise.max(axis=0) - room
+        bad = ~(bottom <= top)
+        return np.where(bad, low, np.maximum(low, bottom)), np.where(
+            bad, high, np.minimum(high, top)
+        )
+
+
+# ---- coefficients as balls
+
+
+class _Factor:
+    """Coefficients, prepared for products."""
+
+    def __init__(self, balls: Sequence[Ball]):
+        self.terms = [
+            None if ball is None else (*ball, np.abs(ball[0]), np.abs(ball[0]) + ball[1])
+            for ball in balls
+        ]
+
+
+class _Total:
+    """A sum of products of balls."""
+
+    def __init__(self) -> None:
+        self.mid: Any = None
+        self.rad: Any = None
+
+    def product(self, x: _Factor, i: int, y: _Factor, j: int) -> None:
+        """Add one product; 0 times what has no bound is 0."""
+        a, b = x.terms[i], y.terms[j]
+        if a is None or b is None:
+            return
+        mid = a[0] * b[0]
+        rad = np.fmax(a[2] * (b[1] + _LOOSE * b[2]), 0.0) + np.fmax(a[1] * b[3], 0.0)
+        self.mid = mid if self.mid is None else self.mid + mid
+        self.rad = rad if self.rad is None else self.rad + rad
+
+    @property
+    def ball(self) -> Ball:
+        """What the sum is."""
+        return None if self.mid is None else _sane(self.mid, self.rad * (1 + 1e-14))
+
+
+_NOTHING = (np.zeros(()), np.zeros(()))
+_ANY = (np.zeros(()), np.array(np.inf))
+
+
+def _sane(mid: FloatArray, rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    bad = ~(np.isfinite(mid) & (rad < np.inf))
+    return (np.where(bad, 0.0, mid), np.where(bad, np.inf, rad)) if bad.any() else (mid, rad)
+
+
+def _ball(range_: Range) -> Ball:
+    low, high = range_
+    if low.ndim == 0 and low == 0 and high == 0:
+        return None
+    mid = 0.5 * low + 0.5 * high
+    return _sane(mid, np.maximum(high - mid, mid - low) * (1 + 1e-15))
+
+
+def _add(a: Ball, b: Ball) -> Ball:
+    if a is None or b is None:
+        return a if b is None else b
+    mid = a[0] + b[0]
+    return mid, (a[1] + b[1] + _EPS * np.abs(mid)) * (1 + 1e-15)
+
+
+def _minus(a: Ball) -> Ball:
+    return None if a is None else (-a[0], a[1])
+
+
+def _meet(a: Ball, b: Ball) -> Ball:
+    """The smaller of two balls which both hold the number."""
+    if a is None or b is None:
+        return None
+    return np.where(a[1] <= b[1], a[0], b[0]), np.minimum(a[1], b[1])
+
+
+# ---- ranges
+
+
+def out(x: Range, room: float = _EPS) -> Range:
+    """Make room for rounding."""
+    low, high = x[0] - room * np.abs(x[0]), x[1] + room * np.abs(x[1])
+    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+
+
+def mul(x: Range, y: Range) -> Range:
+    """The range of a product."""
+    a, b, c, d = x[0] * y[0], x[0] * y[1], x[1] * y[0], x[1] * y[1]
+    low, high = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
+    zero = np.isnan(low)  # 0 times what has no bound
+    return out((np.where(zero, 0.0, low), np.where(zero, 0.0, high)))
+
+
+def square_of(low: FloatArray, high: FloatArray) -> Range:
+    """The range of a square."""
+    a, b = low * low, high * high
+    return out((np.where((low < 0) & (high > 0), 0.0, np.minimum(a, b)), np.maximum(a, b)))
+
+
+def _scaled(factor: float, x: Range) -> Range:
+    low, high = x if factor >= 0 else (x[1], x[0])
+    return out((factor * low, factor * high))
+
+
+def _plus(x: Range, shift: float) -> Range:
+    return out((x[0] + shift, x[1] + shift))
+
+
+def _inverse(x: Range) -> Range:
+    around = (x[0] < 0) & (x[1] > 0)
+    low = np.where(around | (x[1] == 0), -np.inf, 1.0 / x[1])
+    return out((low, np.where(around | (x[0] == 0), np.inf, 1.0 / x[0])))
+
+
+def _raised(x: Range, p: float) -> Range:
+    """x^p; where p is not whole, for what of x is not negative."""
+    if p == 0:
+        return np.array(1.0), np.array(1.0)
+    if p < 0:
+        return _inverse(_raised(x, -p))
+    if p == 1:
+        return x
+    if p == 2:
+        return square_of(*x)
+    whole = p == round(p)
+    low, high = x if whole else (np.maximum(x[0], 0.0), np.maximum(x[1], 0.0))
+    a, b = (np.sqrt(low), np.sqrt(high)) if p == 0.5 else (low**p, high**p)
+    least = np.minimum(a, b)
+    if whole and p % 2 == 0:
+        least = np.where((low < 0) & (high > 0), 0.0, least)
+    return out((least, np.maximum(a, b)), _LOOSE)
+
+
+def _rising(function: Callable[[FloatArray], FloatArray], x: Range) -> Range:
+    return out((function(x[0]), function(x[1])), _LOOSE)
+
+
+def _wave(x: Range, function: Callable[[FloatArray], FloatArray], top: float) -> Range:
+    """The range of a sine or cosine that has a crest at `top`."""
+    turn, room = 2 * np.pi, _LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
+
+    def meets(crest: float) -> BoolArray:
+        last = np.floor((x[1] + room - crest) / turn)
+        return ~(last < np.ceil((x[0] - room - crest) / turn))  # NaN meets all
+
+    a, b = function(x[0]), function(x[1])
+    low, high = out((np.minimum(a, b), np.maximum(a, b)), _LOOSE)
+    low = np.where(meets(top + np.pi), -1.0, np.maximum(low, -1.0))
+    return low, np.where(meets(top), 1.0, np.minimum(high, 1.0))
+
+
+# ---- functions of one variable: the ranges of φ and of its first Taylor coefficients
+
+
+def power_series(p: float) -> Callable[[Range], Sequence[Range]]:
+    """The series of x^p."""
+    factors = (1.0, p, p * (p - 1) / 2, p * (p - 1) * (p - 2) / 6)
+    zero = np.array(0.0), np.array(0.0)
+
+    def series(x: Range) -> Sequence[Range]:
+        return [_scaled(c, _raised(x, p - k)) if c else zero for k, c in enumerate(factors)]
+
+    return series
+
+
+def _exp(x: Range) -> Sequence[Range]:
+    e = _rising(np.exp, x)
+    return e, e, _scaled(0.5, e), _scaled(1 / 6, e)
+
+
+def _ln(x: Range) -> Sequence[Range]:
+    inside = np.maximum(x[0], 0.0), np.maximum(x[1], 0.0)
+    second, third = _scaled(-1 / 2, _raised(inside, -2.0)), _scaled(1 / 3, _raised(inside, -3.0))
+    return _rising(np.log, inside), _inverse(inside), second, third
+
+
+def _sin(x: Range) -> Sequence[Range]:
+    s, c = _wave(x, np.sin, np.pi / 2), _wave(x, np.cos, 0.0)
+    return s, c, _scaled(-1 / 2, s), _scaled(-1 / 6, c)
+
+
+def _cos(x: Range) -> Sequence[Range]:
+    s, c = _wave(x, np.sin, np.pi / 2), _wave(x, np.cos, 0.0)
+    return c, _scaled(-1.0, s), _scaled(-1 / 2, c), _scaled(1 / 6, s)
+
+
+def _tan(x: Range) -> Sequence[Range]:
+    room = _LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
+    pole = np.floor((x[1] + room) / np.pi - 0.5) >= np.ceil((x[0] - room) / np.pi - 0.5)
+    low, high = _rising(np.tan, x)
+    t = np.where(pole, -np.inf, low), np.where(pole, np.inf, high)
+    square = square_of(*t)
+    first = _plus(square, 1.0)
+    third = _scaled(1 / 3, mul(first, _plus(_scaled(3.0, square), 1.0)))
+    return t, first, mul(t, first), third
+
+
+def _asin(x: Range) -> Sequence[Range]:
+    x = np.clip(x[0], -1.0, 1.0), np.clip(x[1], -1.0, 1.0)
+    square = square_of(*x)
+    inside = _plus(_scaled(-1.0, square), 1.0)
+    second = _scaled(0.5, mul(x, _raised(inside, -1.5)))
+    third = _scaled(1 / 6, mul(_plus(_scaled(2.0, square), 1.0), _raised(inside, -2.5)))
+    return _rising(np.arcsin, x), _raised(inside, -0.5), second, third
+
+
+def _acos(x: Range) -> Sequence[Range]:
+    low, high = np.clip(x[1], -1.0, 1.0), np.clip(x[0], -1.0, 1.0)
+    return (_rising(np.arccos, (low, high)), *(_scaled(-1.0, term) for term in _asin(x)[1:]))
+
+
+def _atan(x: Range) -> Sequence[Range]:
+    square = square_of(*x)
+    first = _inverse(_plus(square, 1.0))
+    second = _scaled(-1.0, mul(x, square_of(*first)))
+    third = _scaled(1 / 3, mul(_plus(_scaled(3.0, square), -1.0), _raised(first, 3.0)))
+    return _rising(np.arctan, x), first, second, third
+
+
+def _sinh(x: Range) -> Sequence[Range]:
+    s, c = _rising(np.sinh, x), _hyperbolic_cosine(x)
+    return s, c, _scaled(0.5, s), _scaled(1 / 6, c)
+
+
+def _cosh(x: Range) -> Sequence[Range]:
+    s, c = _rising(np.sinh, x), _hyperbolic_cosine(x)
+    return c, s, _scaled(0.5, c), _scaled(1 / 6, s)
+
+
+def _hyperbolic_cosine(x: Range) -> Range:
+    least = np.where((x[0] < 0) & (x[1] > 0), 0.0, np.minimum(np.abs(x[0]), np.abs(x[1])))
+    return _rising(np.cosh, (least, np.maximum(np.abs(x[0]), np.abs(x[1]))))
+
+
+def _tanh(x: Range) -> Sequence[Range]:
+    t = _rising(np.tanh, x)
+    square = square_of(*t)
+    first = _plus(_scaled(-1.0, square), 1.0)
+    third = _scaled(1 / 3, mul(first, _plus(_scaled(3.0, square), -1.0)))
+    return t, first, _scaled(-1.0, mul(t, first)), third
+
+
+def _abs(x: Range) -> Sequence[Range]:
+    a, b = np.abs(x[0]), np.abs(x[1])
+    either = (x[0] < 0) & (x[1] > 0)
+    slope, kink = np.where(x[0] >= 0, 1.0, -1.0), np.where(either, np.inf, 0.0)
+    return (
+        (np.where(either, 0.0, np.minimum(a, b)), np.maximum(a, b)),
+        (np.where(either, -1.0, slope), np.where(either, 1.0, slope)),
+        (-kink, kink),
+        (-kink, kink),
+    )
+
+
+SERIES: dict[type, Callable[[Range], Sequence[Range]]] = {
+    classes.Abs: _abs,
+    classes.Sqrt: power_series(0.5),
+    classes.Exp: _exp,
+    classes.Ln: _ln,
+    classes.Sin: _sin,
+    classes.Cos: _cos,
+    classes.Tan: _tan,
+    classes.Asin: _asin,
+    classes.Acos: _acos,
+    classes.Atan: _atan,
+    classes.Sinh: _sinh,
+    classes.Cosh: _cosh,
+    classes.Tanh: _tanh,
+}
+
+_RULES: dict[type, Callable[..., Jet]] = {
+    classes.Sum: Enclosure._sum,
+    classes.Product: Enclosure._product,
+    classes.Division: Enclosure._quotient,
+    classes.MaxValue: Enclosure._maximum,
+    classes.MinValue: Enclosure._minimum,
+    classes.Conj: lambda _, a: a,
+    classes.Real: lambda _, a: a,
+}
+
+_KNOWN = (
+    *SERIES,
+    *_RULES,
+    classes.ConstantValue,
+    classes.Conditional,
+    classes.Condition,
+    classes.Power,
+    classes.Atan2,
+    classes.Indexed,
+    classes.MultiIndex,
+    classes.SpatialCoordinate,
+    fem.Constant,
+    fem.Function,
+)
+"""What needs no lowering."""
+_ORDERED = (classes.GT, classes.GE, classes.LT, classes.LE)
+_COMPARISONS = (*_ORDERED, classes.EQ, classes.NE)
+
+
+# ---- conditionals that are continuous
+
+
+@cache
+def _agree(condition: Any, first: Any, second: Any) -> bool:
+    """Whether the branches are seen to be equal where the condition changes."""
+    if not isinstance(condition, _ORDERED):
+        return False
+    if _is_extreme(condition, first, second):
+        return True
+    a, b = condition.ufl_operands
+    if isinstance(a, classes.ConstantValue):
+        a, b = b, a
+    try:
+        one, other = (ufl.replace(branch, {a: b}) for branch in (first, second))
+    except (ValueError, ArithmeticError):
+        return False
+    if isinstance(one, classes.ConstantValue) and isinstance(other, classes.ConstantValue):
+        return float(one) == float(other)
+    return bool(one == other)
+
+
+def _is_extreme(condition: Any, first: Any, second: Any) -> bool:
+    """Whether the conditional is the larger or the smaller of two numbers."""
+    if not isinstance(condition, _ORDERED):
+        return False
+    a, b = condition.ufl_operands
+    return bool((first == a and second == b) or (first == b and second == a))
+
+
+def _is_maximum(condition: Any, first: Any) -> bool:
+    """Whether it is the larger, if it is one of them."""
+    return bool(
+        (first == condition.ufl_operands[0]) == isinstance(condition, classes.GT | classes.GE)
+    )

@@ -1,0 +1,349 @@
+"""The loads f and g as moments: their share of χ (1.10), and how far they are from their means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..fem.cells import Cells, Side, blocks, measures, pick, poincare
+from ..fem.space import facet_quadrature
+from ..mesh.domain import NEUMANN
+from .jets import Boxes, Unknown
+from .moments import LOAD_DEGREE, Trace, Volume
+from .ranges import Cut, Pieces, cut, errors_on, refine
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+
+class Load:
+    """f as the certificate sees it: a few moments on each cell.
+
+    Attributes:
+        mean: f_T, the mean of f, shape (cells,).
+        hats: Means of (f − f_T) λ_i, shape (d + 1, cells); None where f is constant on each cell.
+        bumps: Means of (f − f_T) b_i, shape (d + 1, cells), b_i as in `Rule`; or None.
+        variance: Means of (f − f_T)², shape (cells,); or None.
+        vanishes: Whether f is the number 0; the same on all ranks, also on those without cells.
+    """
+
+    def __init__(
+        self,
+        mean: FloatArray,
+        rows: FloatArray | None,
+        variance: FloatArray | None,
+        vanishes: bool = False,
+    ):
+        """Take the moments; the rows are those of hats and bumps."""
+        self.mean, self.variance, self.vanishes = mean, variance, vanishes
+        half = 0 if rows is None else len(rows) // 2
+        self.hats = None if rows is None else rows[:half]
+        self.bumps = None if rows is None else rows[half:]
+
+    def shares(self, cells: Cells, part: slice) -> FloatArray:
+        """∫_T f ψ_i for the Crouzeix-Raviart functions ψ_i = 1 − d λ_i, shape (d + 1, n)."""
+        d = cells.tdim
+        out = np.empty((d + 1, part.stop - part.start))
+        out[:] = self.mean[part] / (d + 1)
+        if self.hats is not None:
+            out -= d * self.hats[:, part]
+        out *= cells.volume[part]
+        return out
+
+    @classmethod
+    def of(cls, f: Volume, cells: Cells) -> Load:
+        """Integrate f."""
+        n, rule = cells.number, f.rule
+        if f.number is not None:
+            return cls(np.full(n, f.number), None, None, f.number == 0.0)
+        values = f.at(cells)
+        mean, variance = np.empty(n), np.empty(n)
+        tests = np.concatenate([rule.hats, rule.bumps])
+        tests = (tests - (tests @ rule.weights)[:, None]) * rule.weights
+        rows = np.empty((len(tests), n))
+        for part in blocks(n):
+            here = values[part]
+            mean[part] = here @ rule.weights
+            rows[:, part] = tests @ here.T
+            with np.errstate(over="ignore"):  # such data are refused where the load is known
+                variance[part] = (here - mean[part, None]) ** 2 @ rule.weights
+        return cls(mean, rows, variance)
+
+    def refined(self, f: Volume, cells: Cells, cut: Cut) -> Load:
+        """The same, with f integrated piece by piece where cells are cut."""
+        which, place = cut.of
+        if self.hats is None or self.bumps is None or self.variance is None or not len(which):
+            return self
+        rule = f.plain
+        values = f.deviation.values(cut.pieces, cells, rule.hats)
+        weights = rule.weights[:, None] * cut.pieces.part
+        hats = np.einsum("chn,cq->hqn", cut.pieces.hats, rule.hats)
+        bumps = np.stack([4.0 * np.delete(hats, i, axis=0).prod(axis=0) for i in range(len(hats))])
+
+        def integral(integrand: FloatArray) -> FloatArray:
+            sums = np.bincount(place, (weights * integrand).sum(axis=0), minlength=len(which))
+            return sums.astype(np.float64)
+
+        mean, rows, variance = self.mean.copy(), np.vstack([self.hats, self.bumps]), self.variance
+        variance = variance.copy()
+        mean[which] = integral(values)
+        off = values - mean[which][place]
+        variance[which] = integral(off**2)
+        for row, test in zip(rows, (*hats, *bumps), strict=True):
+            row[which] = integral(off * test)
+        return Load(mean, rows, variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Certain:
+    """f by a rule that is good enough for the certificate, and what that rule may have missed.
+
+    There is a q with the moments of `load`, and so little of f − q that
+    |∫_T (f − q)| ≤ missed and ‖f − q‖_T ≤ rough.
+
+    Attributes:
+        load: Moments of f.
+        missed: Shape (cells,); None where f is a number.
+        rough: Shape (cells,); or None.
+        reason: Why there are none, if there are none.
+    """
+
+    load: Load
+    missed: FloatArray | None = None
+    rough: FloatArray | None = None
+    reason: str | None = None
+
+    @classmethod
+    def of(cls, f: Volume, load: Load, cells: Cells, low: FloatArray, size: float) -> Certain:
+        """Enclose f; collective.
+
+        Args:
+            f: The load.
+            load: Its moments by the scheme's own rule.
+            cells: The mesh.
+            low: Lower bound of κ, shape (cells,) or ().
+            size: Of the bound, to which what is missed should be small.
+        """
+        if f.number is not None:
+            return cls(load)
+        fine = f.exact_for(LOAD_DEGREE)
+        if fine is not f:
+            load = Load.of(fine, cells)
+        deviation, points = f.deviation, np.hstack([fine.rule.hats, fine.plain.hats])
+
+        def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
+            quadratic, cubic = deviation(boxes, half, hats=points)
+            return np.stack([cubic, quadratic**2])
+
+        reach = 4.0 * poincare(cells.tdim) ** 2 * cells.diameter2 * cells.volume / low
+        goal = SHARE * size
+        weights = np.stack([2.0 * cells.volume / np.sqrt(low) / goal, reach / goal**2])
+        try:
+            found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
+        except Unknown as error:
+            return cls(load, reason=f"f holds an operator that has no enclosure: {error}")
+        missed = 2.0 * cells.volume * found.errors[0]
+        rough = 2.0 * np.sqrt(cells.volume * found.errors[1])
+        bounded = np.isfinite(missed).all() and np.isfinite(rough).all()
+        reason = None if cells.comm.allreduce(bool(bounded), op=MPI.LAND) else UNBOUNDED
+        return cls(load.refined(fine, cells, found), missed, rough, reason)
+
+
+SHARE = 2e-3
+"""What may be missed of f, in parts of the bound, or thereabouts."""
+UNBOUNDED = "f is not bounded on the mesh, or not known to be"
+
+
+class Edge:
+    """What is needed of g on Γg.
+
+    Attributes:
+        side: The facets.
+        measure: |F|, shape (n,).
+        values: g at the quadrature points, shape (q, n).
+        shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
+    """
+
+    def __init__(self, g: Trace, cells: Cells):
+        """Evaluate g."""
+        self.g, self._cells = g, cells
+        self.side = cells.sides[NEUMANN]
+        _, _, self.values = g.at(cells.domain.mesh, self.side.entities)
+        self.measure = measures(cells, self.side)
+        self.shares = self.measure * (g.hats.T * g.weights @ self.values)
+
+    def to_cells(self) -> FloatArray:
+        """∫_F g ψ_i for the Crouzeix-Raviart functions of the facet's cell, shape (d + 1, n).
+
+        ψ_i = 1 − d λ_i; on the facet itself λ_i = 0.
+        """
+        d = self._cells.tdim
+        out = np.tile(self.shares.sum(axis=0), (d + 1, 1))
+        at = np.arange(len(self.measure))
+        for j, share in zip(self._cells.others[self.side.local].T, self.shares, strict=True):
+            out[j, at] -= d * share
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """g on pieces of the facets of Γg, and what quadrature may have missed of it.
+
+    On each facet there is a q with the moments that these values have, |∫_F (g − q)| ≤ missed
+    and ‖g − q‖_F ≤ rough.
+
+    Attributes:
+        facets: The facets.
+        side: The facet of each piece, shapes (n,).
+        place: Its number among the facets, shape (n,).
+        hats: The facet's barycentric coordinates at the points, shape (q, d, n).
+        weights: Quadrature weights, which add up to 1.
+        measure: The pieces' measures, shape (n,).
+        values: g at the points, shape (q, n).
+        through: ∫_F g, shape (facets,).
+        missed: Shape (facets,).
+        rough: Shape (facets,).
+        reason: Why there are none, if there are none.
+    """
+
+    cells: Cells
+    facets: Side
+    side: Side
+    place: IntArray
+    hats: FloatArray
+    weights: FloatArray
+    measure: FloatArray
+    values: FloatArray
+    through: FloatArray
+    missed: FloatArray
+    rough: FloatArray
+    reason: str | None = None
+
+    @classmethod
+    def of(cls, edge: Edge, cells: Cells, low: FloatArray, size: float) -> Segments:
+        """Enclose g; collective.
+
+        Args:
+            edge: g by the scheme's own rule.
+            cells: The mesh.
+            low: Lower bound of κ, shape (cells,) or ().
+            size: Of the bound, to which what is missed should be small.
+        """
+        g, facets, n = edge.g, edge.side, len(edge.measure)
+        pieces, reason = Pieces.of_facets(cells, facets), None
+        inside: FloatArray = np.zeros((2, n))
+        points, weights = facet_quadrature(cells.domain.mesh, max(LOAD_DEGREE, g.degree))
+        hats = np.column_stack([1.0 - points.sum(axis=1), points])
+        known = g.constant is not None or not cells.comm.allreduce(n)
+        if not known:
+
+            def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
+                quadratic, cubic = g.deviation(boxes, half, hats=hats.T)
+                return np.stack([cubic, quadratic**2])
+
+            here, goal = pick(low, facets.cells), SHARE * size
+            scales = np.stack(
+                [
+                    2.0 * edge.measure / np.sqrt(here) / goal,
+                    4.0 * edge.measure * _trace_constant(cells, facets) ** 2 / here / goal**2,
+                ]
+            )
+            room = 8 * cells.comm.allreduce(n) + 1000
+            try:
+                pieces, inside = refine(
+                    pieces,
+                    lambda p: errors_on(p, errors, cells),
+                    scales,
+                    room,
+                    cells,
+                    g.deviation.apart,
+                )
+                values = g.deviation.values(pieces, cells, hats.T)
+            except Unknown as error:
+                reason = f"g holds an operator that has no enclosure: {error}"
+            if not np.isfinite(inside).all():
+                reason = G_UNBOUNDED
+        reasons = [words for words in cells.comm.allgather(reason) if words]
+        if known or reasons:
+            values = np.full((len(weights), len(pieces.part)), g.constant or 0.0)
+        at, measure = pieces.parent, edge.measure[pieces.parent] * pieces.part
+
+        def total(amounts: FloatArray) -> FloatArray:
+            return np.bincount(at, measure * amounts, minlength=n).astype(np.float64)
+
+        return cls(
+            cells,
+            facets,
+            Side(facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]),
+            at,
+            np.einsum("chn,qc->qhn", pieces.hats, hats),
+            weights,
+            measure,
+            values,
+            total(weights @ values),
+            2.0 * total(inside[0]),
+            2.0 * np.sqrt(total(inside[1])),
+            reasons[0] if reasons else None,
+        )
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """What g has beyond its mean over the facet, shape (q, n)."""
+        n = len(self.through)
+        area = np.bincount(self.place, self.measure, minlength=n)
+        return self.values - (self.through / area)[self.place]
+
+    def _by_cell(self, norms: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Cells at Γg, and the sum of c_F ‖·‖_F over their facets."""
+        at, place = np.unique(self.facets.cells, return_inverse=True)
+        sizes = np.bincount(
+            place, _trace_constant(self.cells, self.facets) * norms, minlength=len(at)
+        )
+        return at, sizes.astype(np.float64)
+
+    def oscillation(self) -> tuple[IntArray, FloatArray]:
+        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each."""
+        squares = self.measure * (self.weights @ self.rest**2)
+        return self._by_cell(np.sqrt(np.bincount(self.place, squares, minlength=len(self.through))))
+
+    def beyond(self) -> tuple[IntArray, FloatArray]:
+        """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""
+        return self._by_cell(self.rough)
+
+    def change(self, vertices: FloatArray, bumps: FloatArray) -> float:
+        """How far ∫_Γg q v may be from ∫_Γg g v, v by vertices and bumps; this rank's share."""
+        ends = vertices[self.facets.ends]
+        area = np.bincount(self.place, self.measure, minlength=len(self.through))
+        bump = np.abs(bumps[self.facets.dofs]) if len(ends) == 2 else 0.0
+        mean = np.abs(ends.mean(axis=0)) + bump
+        swing = np.ptp(ends, axis=0) + 2.0 * bump
+        return float(np.sum(mean * self.missed + swing * np.sqrt(area) * self.rough))
+
+
+G_UNBOUNDED = "g is not bounded on the mesh, or not known to be"
+
+
+def _trace_constant(cells: Cells, side: Side) -> FloatArray:
+    """c_F with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, shape (n,).
+
+    |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F.
+    """
+    d, h = cells.tdim, np.sqrt(cells.diameter2[side.cells])
+    c = poincare(d) * h
+    return np.sqrt(measures(cells, side) / cells.volume[side.cells] * c * (c + 2.0 * h / d))
+
+
+def chi(load: Load, edge: Edge, cells: Cells) -> FloatArray:
+    """χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's cells' share."""
+    if load.vanishes and edge.g.vanishes:
+        return np.zeros(len(cells.exterior))
+    values = np.empty((cells.tdim + 1, cells.number))
+    for part in blocks(cells.number):
+        values[:, part] = load.shares(cells, part)
+    for row, share in zip(values, edge.to_cells(), strict=True):
+        np.add.at(row, edge.side.cells, share)
+    return cells.over_facets(values, shared=False)

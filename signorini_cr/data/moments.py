@@ -1,0 +1,365 @@
+"""The data of a problem as numbers: values, means and moments by quadrature.
+
+f, g, u_D, α and κ are known by their values at quadrature points (`Problem.quadrature_degree`), and
+where they are numbers exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from itertools import product
+from math import factorial
+from weakref import WeakKeyDictionary, proxy
+
+import basix
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
+from ufl.core.expr import Expr
+
+from .. import compat
+from ..fem.cells import Cells
+from ..fem.problem import Forms, number
+from ..fem.space import facet_quadrature
+from .jets import Boxes, Enclosure, strips_of
+from .ranges import Cut, Deviation, Range, cut, range_of
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+LOAD_DEGREE, KAPPA_DEGREE = 4, 8
+"""What the certificate's rules integrate exactly: two quadratics, and for q and s quadratic, y and
+∇z affine, s |y − q ∇z|²."""
+
+
+class Rule:
+    """Quadrature on cells.
+
+    Attributes:
+        weights: Weights, which add up to 1, shape (q,).
+        hats: λ_i at the points, shape (d + 1, q).
+        bumps: b_i = 4 λ_j λ_k, i, j, k different, at the points, shape (d + 1, q); for d = 2.
+    """
+
+    def __init__(self, forms: Forms, degree: int):
+        """Take the rule that is exact for polynomials of a degree."""
+        self.degree = degree
+        self.points, weights = basix.make_quadrature(forms.mesh.basix_cell(), degree)
+        self.weights = weights / weights.sum()
+        self.hats = np.vstack([1.0 - self.points.sum(axis=1), self.points.T])
+        self.bumps = np.stack(
+            [4.0 * np.delete(self.hats, i, axis=0).prod(axis=0) for i in range(len(self.hats))]
+        )
+
+
+class Volume:
+    """Values of an expression in cells.
+
+    Args:
+        expression: A scalar.
+        forms: The problem's.
+        rule: Where to evaluate.
+    """
+
+    def __init__(self, expression: Expr, forms: Forms, rule: Rule):
+        """Compile the expression, unless it is a number."""
+        self.number, self.rule = number(expression), rule
+        self.expression, self._forms = expression, forms
+        self._values = None
+        if self.number is None:
+            self._values = compat.compile_expression(expression, rule.points, forms.mesh)
+
+    def at(self, cells: Cells) -> FloatArray:
+        """Values at the quadrature points of owned cells, shape (cells, q)."""
+        assert self._values is not None
+        which = np.arange(cells.number, dtype=np.int32)
+        return self._values.eval(cells.domain.mesh, which).reshape(
+            cells.number, len(self.rule.weights)
+        )
+
+    @cached_property
+    def deviation(self) -> Deviation:
+        """How far it is from polynomials."""
+        return Deviation(self.expression)
+
+    def exact_for(self, degree: int) -> Volume:
+        """The same by a rule that is exact for a degree at least."""
+        if self.number is not None or self.rule.degree >= degree:
+            return self
+        if degree not in self._others:
+            rule = Rule(self._forms, degree)
+            self._others[degree] = Volume(self.expression, self._forms, rule)
+        return self._others[degree]
+
+    @cached_property
+    def plain(self) -> Rule:
+        """A rule for pieces of cells: what is missed on these is known."""
+        return Rule(self._forms, LOAD_DEGREE)
+
+    @cached_property
+    def _others(self) -> dict[int, Volume]:
+        return {}
+
+
+class Coefficient:
+    """κ on each cell.
+
+    Attributes:
+        mean: κ_T, shape (cells,), or () where κ is a number.
+        low: Lower bound of κ, same shape.
+        high: Upper bound of κ, same shape.
+        values: κ at the points of a rule that is exact for degree 8, shape (q, cells); None where
+            κ is constant on each cell of all ranks.
+        rule: That rule.
+        smallest: Lower bound of κ over all ranks.
+        cut: How far κ and 1/κ are from polynomials on each cell, see `enclose`.
+        inside: κ at the points of the pieces, shape (q, pieces).
+        reason: Why there are no bounds, if there are none.
+    """
+
+    cut: Cut | None = None
+    inside: FloatArray
+
+    def __init__(self, kappa: Volume, cells: Cells):
+        """Evaluate κ; collective."""
+        fine = kappa.exact_for(KAPPA_DEGREE)
+        self.rule = fine.rule
+        self.values: FloatArray | None = None
+        self.reason: str | None = None
+        if kappa.number is not None:
+            self.mean = self.low = self.high = np.array(kappa.number)
+        else:
+            self.deviation = kappa.deviation
+            found: Range | None = range_of(kappa.expression, cells)
+            values = kappa.at(cells)
+            self.mean = values @ kappa.rule.weights
+            if found is None:
+                self.reason = "the coefficient has no computable upper and lower bound"
+                self.low = self.high = self.mean
+            else:
+                self.low, self.high = (np.broadcast_to(x, self.mean.shape) for x in found)
+            varies = bool((self.high - self.low > 1e-13 * np.abs(self.mean)).any())
+            if cells.comm.allreduce(varies, op=MPI.LOR):  # or the bound would depend on the ranks
+                values = values if fine is kappa else fine.at(cells)
+                self.values = np.ascontiguousarray(values.T)
+        # The same way on all ranks
+        smallest = float(self.low.min(initial=np.inf)) if self.low.ndim else float(self.low)
+        self.smallest = min(cells.comm.allgather(smallest))
+        reasons = [reason for reason in cells.comm.allgather(self.reason) if reason]
+        self.reason = reasons[0] if reasons else None
+        if self.reason is None and not self.smallest > 0:
+            self.reason = "the coefficient's computable lower bound is not positive"
+
+    def enclose(self, cells: Cells, steepness: FloatArray, excess: FloatArray, size: float) -> None:
+        """Enclose κ where it varies; collective.
+
+        The errors in `cut` are R, t, W, W', the strips' part of the cell times 1/κ and κ there,
+        and R²: κ is within R of a quadratic polynomial and W of a cubic one, κ⁻¹ is within W' of a
+        cubic one, and a quadratic one is between (1 ± τ) κ⁻¹, t = (1 + τ)/(1 − τ) − 1.
+
+        Args:
+            cells: The mesh.
+            steepness: ‖∇u_h‖² on each cell, shape (cells,).
+            excess: ‖y − κ_T ∇u_h‖² on each cell, shape (cells,).
+            size: Of the bound, to which what quadrature misses should be small.
+        """
+        if self.values is None:
+            return
+        strips = strips_of(self.deviation.expression)
+
+        def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
+            (r, w), (s, x) = (self.deviation(boxes, half, inverse) for inverse in (False, True))
+            low, high = np.zeros((2, len(r)))
+            if strips and boxes.corners is not None:
+                jet = Enclosure(replace(boxes, corners=None), order=0)(self.deviation.expression)
+                part = strips * boxes.strip_part
+                low, high = part / np.maximum(jet.low, 1e-300), part * jet.high
+            return np.stack([r, self._ratio(boxes, r, s), w, x, low, high, r**2])
+
+        # of the bound's square: (e + 2 R a)² for e², a norm κ^{-1/2} weighs
+        weights = self.rule.weights
+        inverse = weights @ (1.0 / self.values)
+        e = excess / self.mean + steepness * (weights @ (self.values - self.mean) ** 2 * inverse)
+        a, none = steepness * inverse, np.zeros(cells.number)
+        shares = np.stack([4.0 * np.sqrt(e * a), e, *[none] * 4, 4.0 * a])
+        shares /= KAPPA_SHARE * size**2
+        self.cut = cut(
+            cells,
+            errors,
+            shares,
+            self.deviation.local,
+            self.deviation.decides,
+            at_most=KAPPA_PIECES,
+        )
+        np.fmin(
+            self.cut.errors[1],
+            self._by_points(self.values, self.cut.errors[0]),
+            out=self.cut.errors[1],
+        )
+        self.inside = self.deviation.values(self.cut.pieces, cells, self.rule.hats)
+
+    def _ratio(self, boxes: Boxes, r: FloatArray, s: FloatArray) -> FloatArray:
+        """T on boxes, with R for κ and for 1/κ given, shape (n,).
+
+        Let q be the quadratic through κ⁻¹ at the rule's points. 1 − κq is within R|q| of a
+        polynomial of degree 4, which is known at the points up to R|q|. Without points R for κ⁻¹
+        has to do.
+        """
+        jet = Enclosure(boxes, order=0)(self.deviation.expression)
+        with np.errstate(all="ignore"):
+            excess = 2.0 * jet.high * s
+            if boxes.corners is None:
+                return np.where(np.isnan(excess), np.inf, excess)
+            hats = self.rule.hats
+            at = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
+            cells = None if boxes.cells is None else np.tile(boxes.cells, hats.shape[1])
+            there = Enclosure(Boxes(at, at, cells=cells, mesh=boxes.mesh), order=0)
+            jet = there(self.deviation.expression)
+            values = np.broadcast_to(0.5 * (jet.low + jet.high), at.shape[1])
+            values = values.reshape(hats.shape[1], len(r))
+            excess = np.fmin(excess, self._by_points(values, r))
+            return np.where(np.isnan(excess), np.inf, excess)
+
+    def _by_points(self, values: FloatArray, r: FloatArray) -> FloatArray:
+        """T by κ at the rule's points, shape (q, n), and R for κ."""
+        (of_two, basis), (of_four, _) = (bernstein(self.rule.hats, k) for k in (2, 4))
+        with np.errstate(all="ignore"):
+            coefficients = of_two @ (1.0 / values)
+            q = basis @ coefficients
+            top = np.abs(of_four @ (1.0 - values * q)) + r * (np.abs(of_four) @ np.abs(q))
+            tau = (top.max(axis=0) + r * np.abs(coefficients).max(axis=0)) * (1 + 1e-10)
+            return np.where(tau < 1.0, 2.0 * tau / (1.0 - tau), np.inf)
+
+
+def bernstein(hats: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Values at points to coefficients in Bernstein's basis, and back.
+
+    A polynomial is nowhere larger than its largest coefficient.
+
+    Args:
+        hats: Barycentric coordinates of the points, shape (d + 1, q).
+        degree: Of the polynomials; the points must determine them.
+    """
+    powers = [k for k in product(range(degree + 1), repeat=len(hats)) if sum(k) == degree]
+    basis = np.stack(
+        [
+            factorial(degree)
+            * np.prod([h**i / factorial(i) for h, i in zip(hats, k, strict=True)], axis=0)
+            for k in powers
+        ],
+        axis=1,
+    )
+    return np.linalg.pinv(basis), basis
+
+
+KAPPA_PIECES = 20_000
+"""Pieces that cells are cut into for it."""
+KAPPA_SHARE = 1e-2
+"""What quadrature may miss of the square of the bound, or thereabouts."""
+
+
+class Trace:
+    """Values of an expression on boundary facets.
+
+    Attributes:
+        degree: What the quadrature is exact for.
+        points: Quadrature points on the reference facet, shape (q, d - 1).
+        weights: Their weights, which add up to 1.
+        hats: Barycentric coordinates of the points, shape (q, d).
+        constant: The number that it is, or None.
+    """
+
+    def __init__(self, expression: Expr, forms: Forms):
+        """Compile the expression, unless it is a number."""
+        self._expression = expression
+        facet = basix.cell.subentity_types(forms.mesh.basix_cell())[-2][0]
+        corners = basix.geometry(facet)
+        self.degree = forms.problem.quadrature_degree
+        self.points, self.weights = facet_quadrature(forms.mesh, self.degree)
+        self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
+        self._corners = len(corners)
+        self.constant = number(expression)
+        if self.constant is None:
+            at = np.vstack([corners, corners.mean(axis=0), self.points])
+            self._values = compat.FacetExpression(expression, at, forms.mesh)
+
+    @property
+    def expression(self) -> Expr:
+        """What it has the values of."""
+        return self._expression
+
+    @property
+    def vanishes(self) -> bool:
+        """Whether it is the number 0."""
+        return self.constant == 0.0
+
+    @cached_property
+    def deviation(self) -> Deviation:
+        """How far it is from polynomials."""
+        return Deviation(self._expression)
+
+    def at(self, mesh: Mesh, entities: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Values at the vertices, the midpoint and the quadrature points of facets.
+
+        Args:
+            mesh: Where.
+            entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+
+        Returns:
+            Arrays of shapes (d, n), (n,) and (q, n); vertices in the order of the cell's closure.
+        """
+        n, k = len(entities), self._corners
+        if self.constant is not None:
+            count = len(self.weights)
+            return tuple(np.full(s, self.constant) for s in ((k, n), n, (count, n)))  # type: ignore
+        values = np.ascontiguousarray(self._values.at(mesh, entities)[:, :, 0].T)
+        return values[:k], values[k], values[k + 1 :]
+
+
+class Sampled:
+    """The data of a problem for evaluation, each compiled when first asked for; collective."""
+
+    def __init__(self, forms: Forms):
+        """Note whose data, weakly: `of` keeps this as long as the forms are there."""
+        self._forms: Forms = proxy(forms)
+        self._rule = Rule(forms, forms.problem.quadrature_degree)
+
+    @cached_property
+    def f(self) -> Volume:
+        """Volume load."""
+        return Volume(self._forms.f, self._forms, self._rule)
+
+    @cached_property
+    def kappa(self) -> Volume | None:
+        """Coefficient; None if it isn't a scalar."""
+        kappa = self._forms.kappa
+        return None if ufl.shape(kappa) else Volume(kappa, self._forms, self._rule)
+
+    @cached_property
+    def u_D(self) -> Trace:
+        """Values on Γ0."""
+        return Trace(self._forms.dirichlet, self._forms)
+
+    @cached_property
+    def alpha(self) -> Trace:
+        """Obstacle."""
+        return Trace(self._forms.obstacle, self._forms)
+
+    @cached_property
+    def g(self) -> Trace:
+        """Flux on Γg."""
+        return Trace(self._forms.g, self._forms)
+
+    @classmethod
+    def of(cls, forms: Forms) -> Sampled:
+        """The data of these forms, one object for all who ask."""
+        if forms not in _SAMPLED:
+            _SAMPLED[forms] = cls(forms)
+        return _SAMPLED[forms]
+
+
+_SAMPLED: WeakKeyDictionary[Forms, Sampled] = WeakKeyDictionary()

@@ -1,0 +1,4 @@
+"""Guaranteed bounds.
+
+Equilibrated flux, companion, duality gap, certificate, contact force.
+"""

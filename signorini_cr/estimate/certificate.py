@@ -1,0 +1,416 @@
+"""How wrong a solution can be: guaranteed bounds of its error and of the energy.
+
+For v ∈ K and y ∈ H(div) with −div y = f, y·n = g on Γg and y·n ≥ 0 on Γ1 the gap J(v) − D(y) bounds
+what neither of them knows about u. Both come from u_h at linear cost, see `flux` and `companion`.
+`docs/certificate.md` has the mathematics; the letters are the same there.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+
+from .. import compat
+from ..data.loads import Certain, Load, Segments
+from ..data.moments import Coefficient, Sampled
+from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
+from ..mesh.domain import CONTACT
+from .companion import Companion, companion, on_facet
+from .cusps import Cusps
+from .flux import Flux, balance, equilibrate, field_squares, unbalanced
+from .gap import integrate, integrate_edge
+from .sums import Sums
+
+if TYPE_CHECKING:
+    from ..vi.assembly import Level
+    from ..vi.solved import Solved
+
+FloatArray = npt.NDArray[np.float64]
+
+SHARES = ("flux", "companion", "contact", "load", "neumann", "boundary", "solver")
+"""Where a bound comes from: the keys of `Certificate.parts`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What is certain about a solution; None where nothing is, `reason` then says why.
+
+    Attributes:
+        bound_h1: ‖u − u_h‖_h, the broken norm (1.6), is at most this.
+        bound_energy_norm: The same for ‖κ^{1/2} ∇_h(u − u_h)‖.
+        bound_companion: The same for ‖κ^{1/2} ∇(u − v)‖, v the conforming companion.
+        energy: J(u) lies between these two.
+        parts: Where the bound comes from: the norms of y − κ∇u_h (flux) and of ∇(v − u_h)
+            (companion), the contact term's square root (contact), the data oscillation of f
+            (load), of g (neumann), of u_D and α (boundary), and what the solver left (solver).
+        indicators: Square of each cell's share, shape (cells,), owned cells.
+        reason: Why figures are missing.
+        seconds: Wall time.
+    """
+
+    bound_h1: float | None = None
+    bound_energy_norm: float | None = None
+    bound_companion: float | None = None
+    energy: tuple[float, float] | None = None
+    parts: dict[str, float] = field(default_factory=dict)
+    indicators: FloatArray | None = None
+    reason: str | None = None
+    seconds: float = 0.0
+    _made: _Made | None = None
+
+    @cached_property
+    def flux(self) -> fem.Function | None:
+        """The flux y as a function in the Raviart-Thomas space of lowest order; collective."""
+        if self._made is None:
+            return None
+        made = self._made
+        cells = Cells(made.level.domain, made.level.V)
+        mesh, d = cells.domain.mesh, cells.tdim
+        everywhere = slice(0, cells.number)
+        fluxes = made.excess - d * made.kappa * cells.apply(made.w, everywhere)
+        # y = slope x + shift on each cell
+        corners = mesh.geometry.x[compat.cell_nodes(mesh)[: cells.number], : mesh.geometry.dim]
+        constants = fem.functionspace(mesh, ("DG", 0))
+        vectors = fem.functionspace(mesh, ("DG", 0, (mesh.geometry.dim,)))
+        slope, shift = fem.Function(constants), fem.Function(vectors)
+        slope.x.array[: cells.number] = fluxes.sum(axis=0) / (d * cells.volume)
+        shift.x.array[: cells.number * mesh.geometry.dim] = (
+            -np.einsum("in,nik->nk", fluxes, corners) / (d * cells.volume)[:, None]
+        ).ravel()
+        for function in (slope, shift):
+            function.x.scatter_forward()
+        y = fem.Function(fem.functionspace(mesh, ("RT", 1)))
+        points = y.function_space.element.interpolation_points
+        points = points() if callable(points) else points
+        y.interpolate(fem.Expression(slope * ufl.SpatialCoordinate(mesh) + shift, points))
+        return y
+
+    @cached_property
+    def companion(self) -> fem.Function | None:
+        """The companion v of degree 2 for d = 2, affine else; collective.
+
+        Without its lifting and, where there are some, its cusps.
+        """
+        if self._made is None:
+            return None
+        made = self._made
+        cells = Cells(made.level.domain, made.level.V)
+        degree = 2 if cells.tdim == 2 else 1
+        v = fem.Function(fem.functionspace(cells.domain.mesh, ("Lagrange", degree)))
+        dofs = v.function_space.dofmap.list[: cells.number]
+        values = made.vertices[cells.vertices]
+        v.x.array[dofs[:, : cells.tdim + 1]] = values.T
+        if degree == 2:
+            middle = (values.sum(axis=0) - values) / 2 + made.bumps[cells.facets]
+            v.x.array[dofs[:, 3:]] = middle.T
+        v.x.scatter_forward()
+        return v
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What y and v are made of; the cells' geometry is made again when it is needed.
+
+    κ is given by its means; whether it varies within cells is told. hats and segments are moments
+    of f and g. force is this rank's share of ∫_Γ1 y·n, reach the radius of the ball around
+    (y + κ∇v)/2 that has κ∇u in it, loose ends added.
+    """
+
+    level: Level
+    w: FloatArray
+    kappa: FloatArray
+    excess: FloatArray
+    vertices: FloatArray
+    bumps: FloatArray
+    hats: FloatArray | None
+    segments: Segments
+    cusps: Cusps | None
+    varies: bool
+    force: float
+    reach: float
+
+
+STEADY = 1e-12
+"""Part of κ by which its bounds on a cell may differ where it is constant there."""
+
+LIFT_SHARE = 1e-2
+"""What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
+
+NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
+TENSOR = "the coefficient is not a scalar"
+ADRIFT = "part of the domain has no way to Γ0, or a figure is not finite"
+
+
+def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) -> Certificate:
+    """Bound the error of a solution; collective.
+
+    Args:
+        solution: From `solve` or `solve_levels`; it need not be converged.
+        sweeps: How often the companion's bumps are improved.
+        flux_from: A Crouzeix-Raviart solution on the same mesh whose flux to take; P1 has none.
+    """
+    began = time.perf_counter()
+    base = solution if flux_from is None else flux_from
+    level, u = base.level, base.u
+    if base.element != "CR" or base.domain is not solution.domain:
+        return Certificate(reason=NO_FLUX)
+    data = Sampled.of(level.forms)
+    if data.kappa is None:
+        return Certificate(reason=TENSOR)
+    cells, load, edge = level.cells, level.load, level.edge
+    kappa = Coefficient(data.kappa, cells)
+    if kappa.reason is not None:
+        return Certificate(reason=kappa.reason)
+    w = vertex_rows(u.x.array, cells)
+    slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
+    contact_side = cells.sides[CONTACT]
+    obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
+    gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
+    flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
+    size = _size(cells, kappa, w, flux, slopes)
+    certain = Certain.of(data.f, load, cells, kappa.low, size)
+    if certain.reason is not None:
+        level.tidy()
+        return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
+    flux.left += cells.volume * (certain.load.mean - load.mean)
+    load = certain.load
+    segments = Segments.of(edge, cells, kappa.low, size)
+    if segments.reason is not None:
+        level.tidy()
+        return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
+    there = edge.side.local, edge.side.cells
+    change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
+    flux.excess[there] += change
+    np.add.at(flux.left, edge.side.cells, change)
+    left = unbalanced(level, cells, flux.left, kappa.low)
+    carried = balance(cells, flux, kappa.low, size, left)
+    if carried:
+        left = unbalanced(level, cells, flux.left, kappa.low)
+    excess = field_squares(cells, flux.excess, slice(0, cells.number))
+    kappa.enclose(cells, slopes, excess, size)
+    if solution.element != "CR":
+        conforming = solution.u.function_space.dofmap.list[: cells.number]
+        own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
+        change = cells.apply(w - own, slice(0, cells.number))
+        flux.excess -= cells.tdim * kappa.mean * change
+        w = own
+    steady = kappa.high - kappa.low <= STEADY * kappa.mean
+    goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
+    v = companion(
+        cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps, steady, goal
+    )
+    sums = integrate(cells, kappa, w, load, flux, v)
+    cusps, known = v.cusps, (v.excess, v.bumps)
+    unsure = 0.0 if cusps is None else cusps.add(cells, w, load, kappa.low, flux, known, sums)
+    assert sums.indicators is not None
+    np.add.at(sums.indicators, contact_side.cells, v.contact)
+    edge_square = integrate_edge(cells, kappa, w, load, segments, flux, v, sums)
+    lift, lift_energy, *with_lift = _lifted(cells, kappa, certain, v, sums)
+    lift_energy += unsure
+    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
+    edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
+    total = dict(zip(_TOTALS, cells.total(*(getattr(sums, name) for name in _TOTALS)), strict=True))
+    contact, edge_square, edge_energy, lift, lift_energy, *with_lift = cells.total(
+        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, *with_lift
+    )
+    lift = np.sqrt(lift)
+    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums)
+    rounding = _rounding(cells, kappa, w, load)
+    loose = np.sqrt(edge_square) + left + hidden + rounding
+    same = total["flux"] + total["companion"] + total["load"]
+    same += 2 * (total["load_flux"] + total["slack"])
+    mixed = 2 * (total["cross"] + total["load_companion"])
+    far = np.sqrt(max(same - mixed + total["far"], 0.0) + with_lift[0]) + loose
+    near = np.sqrt(max(same + mixed + total["near"], 0.0) + with_lift[1]) + rounding
+    radius = loose / 2 + np.sqrt(far**2 / 4 + contact)
+    bound = near / 2 + radius
+    assert sums.middle is not None
+    of_gradients = cells.total(np.sum(np.maximum(sums.middle, 0.0) / kappa.low))[0]
+    bound_h1 = np.sqrt(of_gradients) / 2
+    bound_h1 += (rounding / 2 + radius) / np.sqrt(kappa.smallest)
+    energy = total["energy"] - edge_energy
+    assert sums.steepness is not None
+    steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
+    lift_energy += hidden_energy + total["energy_slack"]
+    lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
+    level.tidy()
+    reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
+    if reason is not None:
+        return Certificate(reason=reason, seconds=time.perf_counter() - began)
+    return Certificate(
+        bound_h1=float(min(bound_h1, bound / np.sqrt(kappa.smallest))),
+        bound_energy_norm=float(bound),
+        bound_companion=float((far + np.sqrt(far**2 + 4 * contact)) / 2 + lift),
+        energy=(
+            float(energy - lift_energy - far**2 / 2 - contact),
+            float(energy + lift_energy),
+        ),
+        parts={
+            "flux": float(np.sqrt(total["flux"])),
+            "companion": float(np.sqrt(total["companion"])),
+            "contact": float(np.sqrt(contact)),
+            "load": float(np.sqrt(total["load"]) + hidden),
+            "neumann": float(np.sqrt(total["neumann"])),
+            "boundary": float(lift),
+            "solver": float(left + carried),
+        },
+        indicators=sums.indicators,
+        seconds=time.perf_counter() - began,
+        _made=_Made(
+            level=level,
+            w=w,
+            kappa=kappa.mean,
+            hats=load.hats,
+            segments=segments,
+            varies=kappa.values is not None,
+            excess=flux.excess,
+            vertices=v.vertices,
+            bumps=v.bumps,
+            cusps=v.cusps,
+            force=float(flux.contact.sum()),
+            reach=float(bound - near / 2 + loose + lift / 2),
+        ),
+    )
+
+
+_TOTALS = (
+    "flux",
+    "companion",
+    "cross",
+    "load",
+    "load_flux",
+    "load_companion",
+    "slack",
+    "energy",
+    "energy_slack",
+    "far",
+    "near",
+    "neumann",
+)
+
+
+def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux, slopes: FloatArray) -> float:
+    """About how large the bound will be: ‖p‖, but for κ within cells; collective.
+
+    Where that is next to nothing, as without a load, the jumps of u_h tell.
+    """
+    squares = field_squares(cells, flux.excess, slice(0, cells.number)) / kappa.mean
+    square, scale, number = cells.total(np.sum(squares), np.sum(kappa.mean * slopes), cells.number)
+    if square < 0.05 * scale / number:
+        index_map = cells.domain.mesh.topology.index_map(0)
+        size, flat = index_map.size_local + index_map.num_ghosts, cells.vertices.ravel()
+        total, count = (
+            cells.share(np.bincount(flat, values, minlength=size).astype(np.float64), 0)
+            for values in (w.ravel(), None)
+        )
+        change = (total / np.maximum(count, 1.0))[cells.vertices] - w
+        jumps = kappa.mean * dot_rows(change, cells.apply(change, slice(0, cells.number)))
+        square += float(cells.total(np.sum(np.maximum(jumps, 0.0)))[0])
+    return float(np.sqrt(max(square, 1e-16 * scale, 1e-200)))
+
+
+ROUNDING = 64 * np.finfo(np.float64).eps
+"""Relative error of what a cell adds to the certificate's norms."""
+
+
+def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load) -> float:
+    """What rounding may do to ‖p ± b‖; collective.
+
+    Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
+    is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller.
+    """
+    values = np.abs(w).max(axis=0)
+    trace = cells.trace(slice(0, cells.number))
+    square = kappa.high * trace * values**2
+    of_load = np.abs(load.mean)
+    if load.variance is not None:
+        of_load = of_load + np.sqrt(load.variance)
+    square += cells.diameter2 * cells.volume * of_load**2 / kappa.low
+    return float(ROUNDING * np.sqrt(cells.total(np.sum(square))[0]))
+
+
+def _hidden(
+    level: Level,
+    cells: Cells,
+    kappa: Coefficient,
+    certain: Certain,
+    segments: Segments,
+    v: Companion,
+    sums: Sums,
+) -> tuple[float, float]:
+    """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
+
+    On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
+    on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise.
+    """
+    counts = certain.missed is not None, bool(segments.missed.any())
+    if not any(cells.total(*counts)):
+        return 0.0, 0.0
+    missed, square, change = np.zeros(cells.number), 0.0, 0.0
+    if certain.missed is not None and certain.rough is not None:
+        missed = certain.missed
+        rough = poincare(cells.tdim) * np.sqrt(cells.diameter2 / kappa.low) * certain.rough
+        assert sums.steepness is not None
+        means = np.abs(v.vertices[cells.vertices].sum(axis=0) / (cells.tdim + 1))
+        if cells.tdim == 2:
+            means += np.abs(v.bumps[cells.facets]).sum(axis=0) / 3
+        if v.cusps is not None:
+            np.add.at(means, v.cusps.at, np.abs(v.cusps.means))
+        change = np.sum(means * missed + rough * np.sqrt(np.maximum(sums.steepness, 0.0)))
+        square = np.sum(rough**2)
+    at, sizes = segments.beyond()
+    on_edge = np.sqrt(np.sum(sizes**2 / pick(kappa.low, at)))
+    missed = missed + np.bincount(segments.facets.cells, segments.missed, minlength=cells.number)
+    change += segments.change(v.vertices, v.bumps)
+    square, on_edge, change = cells.total(square, on_edge**2, change)
+    loose = np.sqrt(square) + np.sqrt(on_edge)
+    return loose + unbalanced(level, cells, missed, kappa.low, False), float(change)
+
+
+def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
+    """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
+    values = u[cells.facets]
+    return sum_rows(values) - cells.tdim * values
+
+
+def _lifted(
+    cells: Cells, kappa: Coefficient, certain: Certain, v: Companion, sums: Sums
+) -> tuple[float, float, float, float]:
+    """Bounds of what ℓ changes, this rank's shares.
+
+    Returns:
+        ‖κ^{1/2} ∇ℓ‖², how far J(v + ℓ) may be from J(v), and what ‖p − b‖² and ‖p + b‖² grow by,
+        the last put into the cells' shares.
+    """
+    at, slope, size = v.lift
+    if not len(at):
+        return 0.0, 0.0, 0.0, 0.0
+    which, place = np.unique(at, return_inverse=True)
+    high = kappa.high[which] if kappa.high.ndim else kappa.high
+    steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
+    load = certain.load
+    f = np.abs(load.mean[which])
+    if load.variance is not None:
+        f = np.hypot(f, np.sqrt(load.variance[which]))
+    if certain.rough is not None:
+        f += certain.rough[which] / np.sqrt(cells.volume[which])
+    assert sums.steepness is not None
+    before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
+    assert sums.indicators is not None
+    change = before * steep + 0.5 * steep**2 + np.sqrt(cells.volume[which]) * f * area
+    assert sums.middle is not None and sums.across is not None
+    noise = 1e-14 * sums.indicators[which]
+    far, near = (
+        steep * (2.0 * np.sqrt(np.maximum(row[which], 0.0) + noise) + steep)
+        for row in (sums.across, sums.middle)
+    )
+    sums.middle[which] = np.maximum(sums.middle[which], 0.0) + near
+    sums.indicators[which] += steep**2
+    return float(np.sum(steep**2)), float(np.sum(change)), float(np.sum(far)), float(np.sum(near))

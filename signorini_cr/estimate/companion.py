@@ -1,0 +1,409 @@
+"""A conforming function near u_h: the primal half of the certificate.
+
+v is continuous, v = u_D on Γ0 and v ≥ α on Γ1. It is P1 with the means of u_h's vertex values,
+weighted by κ, plus (for d = 2) a quadratic bump b_F = 4 λ_j λ_k on each facet, whose heights are
+found by sweeps that bring ∇v nearer to ∇u_h. Where that leaves much to be gained, all of v is found
+by solving for it, see `nearest`, and single vertices that hold much of what is left get `cusps`.
+What u_D and α have beyond quadratic polynomials goes into a lifting ℓ in the boundary cells, of
+which the norm is known. `docs/certificate.md` has the mathematics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..data.admissible import differs
+from ..data.moments import Trace
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
+from ..mesh.domain import CONTACT, DIRICHLET
+from .cusps import Cusps
+from .flux import Flux
+from .lifting import Lift, Quadratic, affine, lift
+from .nearest import Slopes, nearest
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+JUMP = "u_D jumps where boundary facets meet: no function of finite energy has such values"
+BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
+
+PROMISE = 0.04
+"""Part of ‖κ^{1/2}(∇v − ∇u_h)‖² that a step must promise to take off for v to be solved for.
+
+A sweep leaves 0.005 to 0.03 on ordinary meshes with a smooth coefficient, also around singular
+points; 0.07 where the coefficient is a checkerboard, and 0.2 and more on thin cells.
+"""
+
+ROUNDS = 3
+"""How often v is solved for; after each time but the last what is below α is held there."""
+
+
+@dataclass(eq=False)
+class Companion:
+    """v, and what is needed of it.
+
+    Attributes:
+        vertices: v at the vertices, ghosts included.
+        bumps: Heights of v's bumps by facet dof, ghosts included.
+        excess: v − u_h at the cells' vertices, before the bumps, shape (d + 1, cells).
+        contact: Σ over Γ1 of ∫_F (y·n)(v + ℓ − α), by facet, shape (n,).
+        lift: Pairs of cells and bounds of ‖∇ℓ‖_T, ‖ℓ‖_T, shapes (n,).
+        reason: Why v is not admissible, if it isn't.
+        cusps: What v has beyond vertices and bumps; None if nothing, then on all ranks.
+    """
+
+    vertices: FloatArray
+    bumps: FloatArray
+    excess: FloatArray
+    contact: FloatArray
+    lift: tuple[npt.NDArray[np.intp], FloatArray, FloatArray]
+    reason: str | None
+    cusps: Cusps | None = None
+
+
+def companion(
+    cells: Cells,
+    kappa: FloatArray,
+    w: FloatArray,
+    u: FloatArray,
+    flux: Flux,
+    u_D: Trace,
+    alpha: Trace,
+    on_contact: tuple[FloatArray, FloatArray, FloatArray],
+    sweeps: int,
+    steady: BoolArray,
+    goal: float,
+) -> Companion:
+    """Make v.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        u: u_h by facet dof.
+        flux: y.
+        u_D: Values on Γ0.
+        alpha: Obstacle on Γ1.
+        on_contact: Its values.
+        sweeps: How often the bumps are improved.
+        steady: Where κ is constant on the cell, shape (cells,) or ().
+        goal: What ‖∇ℓ‖ need not be known better than.
+    """
+    fixed, contact = cells.sides[DIRICHLET], cells.sides[CONTACT]
+    on_fixed = u_D.at(cells.domain.mesh, fixed.entities)
+    obstacle, middle, _ = on_contact
+    touching = flux.touching
+    v = _at_vertices(cells, kappa, w, fixed, on_fixed[0], contact, obstacle, touching)
+    scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
+    scale = max(cells.comm.allgather(scale))
+    wrong = [
+        JUMP if differs(cells, fixed, np.abs(v[fixed.ends] - on_fixed[0]), scale, u_D) else None,
+        BELOW if differs(cells, contact, obstacle - v[contact.ends], scale, u_D, alpha) else None,
+    ]
+    bumps = np.zeros(len(u))
+    lowest = np.full(len(u), -np.inf)
+    free = np.ones(len(u), dtype=bool)
+    if cells.tdim == 2:
+        bumps[fixed.dofs] = on_fixed[1] - v[fixed.ends].mean(axis=0)
+        free[fixed.dofs] = False
+        lowest[contact.dofs] = _lowest(v[contact.ends], obstacle, middle)
+        free[contact.dofs[touching]] = False
+        bumps[contact.dofs] = np.maximum(lowest[contact.dofs], 0.0)
+        bumps[contact.dofs[touching]] = lowest[contact.dofs[touching]]
+        # A facet's values reach the ranks that share it
+        if cells.comm.size > 1:
+            cells.share(bumps)
+            taken = np.zeros(len(u))
+            taken[~free] = 1.0
+            free = cells.share(taken) == 0.0
+    excess = v[cells.vertices]
+    excess -= w
+    cusps = None
+    if cells.tdim == 2 and sweeps > 0:
+        energy, promise = _sweep(cells, kappa, excess, bumps, free, sweeps)
+        bumps[contact.dofs] = np.maximum(bumps[contact.dofs], lowest[contact.dofs])
+        held = np.zeros(len(v))
+        held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
+        loose = cells.share(held, 0) == 0.0
+        promise += _promise(cells, kappa, excess, bumps, loose)
+        if promise > PROMISE * energy:
+            v[:], bumps[:], cusps = _solved(
+                cells, kappa, steady, w, (v, bumps), (loose, free), contact, on_contact[:2]
+            )
+            excess = v[cells.vertices] - w
+    sides = ((fixed, u_D, on_fixed), (contact, alpha, on_contact))
+    lifts = [
+        _lift(cells, side, trace, values, v, bumps, scale, goal) for side, trace, values in sides
+    ]
+    wrong += [lift.reason for lift in lifts]
+    # y·n is constant on a facet: the mean of v + ℓ − α
+    above = v[contact.ends].mean(axis=0) - lifts[1].least
+    if cells.tdim == 2:
+        above += 2.0 / 3.0 * bumps[contact.dofs]
+    above += lifts[1].beyond / measures(cells, contact)
+    words = [word for word in wrong if word]
+    words = [word for rank in cells.comm.allgather(words) for word in rank]
+    return Companion(
+        v,
+        bumps,
+        excess,
+        np.where(flux.contact > 0, flux.contact * np.maximum(above, 0.0), 0.0),
+        (
+            np.concatenate([fixed.cells, contact.cells]),
+            np.concatenate([lift.steep for lift in lifts]),
+            np.concatenate([lift.area for lift in lifts]),
+        ),
+        words[0] if words else None,
+        cusps,
+    )
+
+
+def _at_vertices(
+    cells: Cells,
+    kappa: FloatArray,
+    w: FloatArray,
+    fixed: Side,
+    u_D: FloatArray,
+    contact: Side,
+    obstacle: FloatArray,
+    touching: npt.NDArray[np.bool_],
+) -> FloatArray:
+    """Means of u_h's values at the vertices, weighted by κ, raised to α on Γ1, u_D on Γ0."""
+    index_map = cells.domain.mesh.topology.index_map(0)
+    size = index_map.size_local + index_map.num_ghosts
+    flat = cells.vertices.ravel()
+
+    def collect(where: Any, values: Any) -> FloatArray:
+        return cells.share(np.bincount(where, values, minlength=size).astype(np.float64), 0)
+
+    if kappa.ndim:
+        weights = np.tile(kappa, len(w))
+        v = collect(flat, weights * w.ravel())
+        v /= np.maximum(collect(flat, weights), np.finfo(float).tiny)
+    else:
+        v = collect(flat, w.ravel())
+        v /= np.maximum(collect(flat, None), 1.0)
+    ends = contact.ends.ravel()
+    count = collect(ends, None)
+    value = collect(ends, obstacle.ravel()) / np.maximum(count, 1.0)
+    held = collect(contact.ends[:, touching].ravel(), None) > 0
+    np.copyto(v, np.where(held, value, np.maximum(v, value)), where=count > 0)
+    ends = fixed.ends.ravel()
+    count = collect(ends, None)
+    np.copyto(v, collect(ends, u_D.ravel()) / np.maximum(count, 1.0), where=count > 0)
+    return v
+
+
+def _solved(
+    cells: Cells,
+    kappa: FloatArray,
+    steady: BoolArray,
+    w: FloatArray,
+    start: tuple[FloatArray, FloatArray],
+    loosened: tuple[BoolArray, BoolArray],
+    contact: Side,
+    alpha: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray, Cusps | None]:
+    """The best v of degree 2, with cusps where they are called for, by solving; collective.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        steady: Where κ is constant on the cell, shape (cells,) or ().
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        start: v at the vertices and the heights of its bumps, to begin with.
+        loosened: Which values at vertices and which heights may be changed.
+        contact: The facets of Γ1.
+        alpha: α at their ends and at their midpoints.
+
+    Returns:
+        v at the vertices, the heights, and the cusps.
+    """
+    (v, bumps), (loose, free), (obstacle, middle) = start, loosened, alpha
+    ends = contact.ends.ravel()
+    total, count = (
+        cells.share(np.bincount(ends, values, minlength=len(v)).astype(np.float64), 0)
+        for values in (obstacle.ravel(), None)
+    )
+    floor = np.where(loose & (count > 0), total / np.maximum(count, 1.0), -np.inf)
+    cusps: Cusps | None = None
+    best = v, bumps, cusps
+    slopes = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
+    least = cells.total(np.sum(slopes.energies))[0]
+    for turn in range(ROUNDS):
+        step = nearest(cells, kappa, slopes, loose, free)
+        v, bumps, free = np.maximum(v + step[0], floor), bumps + step[1], free.copy()
+        lowest = _lowest(v[contact.ends], obstacle, middle)
+        low = free[contact.dofs] & (bumps[contact.dofs] <= lowest)
+        bumps[contact.dofs[low]] = lowest[low]
+        free[contact.dofs[low]] = False
+        down = loose & (v <= floor)
+        loose = loose & ~down
+        excess = v[cells.vertices] - w
+        slopes = Slopes.of(cells, kappa, excess, bumps)
+        if turn == 0:
+            cusps = Cusps.of(cells, kappa, steady, slopes.energies)
+        if cusps is not None:
+            cusps = cusps.fitted(cells, excess, bumps)
+            slopes.energies[cusps.at] += cusps.gains(cells, excess, bumps)
+            for rows, pull in zip(
+                (slopes.vertices, slopes.facets), cusps.pulls(cells), strict=True
+            ):
+                rows[:, cusps.at] -= pull
+        energy, changes = cells.total(np.sum(slopes.energies), float(low.sum() + down.sum()))
+        if energy < least:
+            best, least = (v, bumps, cusps), energy
+        if changes == 0.0 and cusps is None:
+            break
+    return best
+
+
+def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArray:
+    """Least heights of the bumps with which v stays above the quadratic through α's three values.
+
+    Args:
+        v: At the facets' ends, not below α, shape (2, n).
+        obstacle: α there.
+        middle: α at the midpoints, shape (n,).
+    """
+    room: FloatArray = np.sqrt(np.maximum(v - obstacle, 0.0)).sum(axis=0) ** 2 / 4
+    return middle - obstacle.mean(axis=0) - room
+
+
+def _sweep(
+    cells: Cells,
+    kappa: FloatArray,
+    excess: FloatArray,
+    bumps: FloatArray,
+    free: BoolArray,
+    steps: int,
+) -> tuple[float, float]:
+    """Conjugate gradients for E = ‖κ^{1/2}(∇v − ∇u_h)‖² in the heights of the bumps.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
+        bumps: Heights, improved in place.
+        free: Which of them may be.
+        steps: How many steps.
+
+    Returns:
+        E, and what it would fall by if each height were put right as if it were alone.
+    """
+    slope, diagonal = np.empty_like(excess), np.empty_like(excess)
+    energy = 0.0
+    for part in blocks(cells.number):
+        k, height = pick(kappa, part), bumps[cells.facets[:, part]]
+        diagonal[:, part] = k * cells.trace(part)
+        flow = k * cells.apply(excess[:, part], part)
+        slope[:, part] = flow - diagonal[:, part] * height - 2.0 * k * _across(cells, height, part)
+        energy += float(np.sum(dot_rows(excess[:, part], flow)))
+        energy -= 4 / 3 * float(np.sum(dot_rows(height, flow + slope[:, part])))
+    down = cells.over_facets(slope)
+    down *= free
+    weight = cells.over_facets(diagonal)
+    weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
+    owned = slice(cells.owned_facets())
+    way = down / weight
+    energy, square = cells.total(energy, down[owned] @ way[owned])
+    for _ in range(steps):
+        if not square > 0:
+            break
+        for part in blocks(cells.number):
+            k, step = pick(kappa, part), way[cells.facets[:, part]]
+            slope[:, part] = diagonal[:, part] * step + 2.0 * k * _across(cells, step, part)
+        image = cells.over_facets(slope)
+        image *= free
+        length = square / cells.total(way[owned] @ image[owned])[0]
+        bumps += length * way
+        down -= length * image
+        energy -= 4 / 3 * length * square
+        straight = down / weight
+        before, square = square, cells.total(down[owned] @ straight[owned])[0]
+        way *= square / before
+        way += straight
+    return float(energy), float(4 / 3 * square)
+
+
+def _promise(
+    cells: Cells, kappa: FloatArray, excess: FloatArray, bumps: FloatArray, loose: BoolArray
+) -> float:
+    """What ‖κ^{1/2}(∇v − ∇u_h)‖² would fall by if each vertex were put right as if it were alone.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
+        bumps: Their heights.
+        loose: Which values at vertices may be changed.
+    """
+    slope, diagonal = np.empty_like(excess), np.empty_like(excess)
+    for part in blocks(cells.number):
+        k, height = pick(kappa, part), bumps[cells.facets[:, part]]
+        slope[:, part] = k * cells.apply(excess[:, part] - 4 / 3 * height, part)
+        diagonal[:, part] = k * cells.squares(part)
+    owned = slice(cells.owned_vertices())
+    down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
+    return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
+
+
+def _across(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
+    """Σ_{j ≠ i} |T| ∇λ_i·∇λ_j height_j."""
+    out = np.zeros_like(height)
+    for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
+        out[i] += s * height[j]
+        out[j] += s * height[i]
+    return out
+
+
+def bump_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
+    """‖∇ Σ height_i b_i‖²_T for d = 2, shape (cells in the part,)."""
+    out = cells.trace(part) * dot_rows(height, height)
+    for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
+        out += 4.0 * s * height[i] * height[j]
+    out *= 4 / 3
+    return out
+
+
+def on_facet(
+    cells: Cells, side: Side, hats: FloatArray, v: FloatArray, bumps: FloatArray
+) -> FloatArray:
+    """Values of v at points of facets, shape (q, n).
+
+    Args:
+        cells: The mesh.
+        side: The facets.
+        hats: Barycentric coordinates, shape (q, d) or (q, d, n).
+        v: v at the vertices.
+        bumps: Heights of v's bumps.
+    """
+    hats = hats if hats.ndim == 3 else hats[:, :, None]
+    values = (hats * v[side.ends]).sum(axis=1)
+    if cells.tdim == 2:
+        values = values + 4.0 * hats.prod(axis=1) * bumps[side.dofs]
+    return values
+
+
+def _lift(
+    cells: Cells,
+    side: Side,
+    trace: Trace,
+    values: tuple[FloatArray, FloatArray, FloatArray],
+    v: FloatArray,
+    bumps: FloatArray,
+    scale: float,
+    goal: float,
+) -> Lift:
+    """Bring what u_D or α have beyond v into the cells."""
+    if cells.tdim != 2:
+        return affine(cells, side, trace, v[side.ends], values[0], scale)
+    ends, middle, _ = values
+    companion = Quadratic(v[side.ends], bumps[side.dofs])
+    obstacle = side is cells.sides[CONTACT]
+    base = Quadratic(ends, middle - ends.mean(axis=0)) if obstacle else companion
+    return lift(cells, side, trace, base, companion, scale, goal, obstacle)

@@ -1,0 +1,370 @@
+"""Integrals over the cells that the certificate is made of.
+
+All of them are quadratic forms in a handful of numbers per cell, in which the mesh appears through
+|T| ∇λ_i·∇λ_j and |X_i − X_j|² alone. With κ_T the mean of κ on T, and
+
+    p = κ^{-1/2} (y − κ∇u_h),   b = κ^{1/2} ∇(v − u_h),   σ: −div σ = f − f_T in T, σ·n = 0 on ∂T,
+
+‖σ‖_T ≤ C h_T ‖f − f_T‖_T by Poincaré's inequality, and ∫_T σ·∇φ = ∫_T (f − f_T) φ for any φ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+
+from ..data.loads import Load, Segments
+from ..data.moments import Coefficient
+from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
+from .companion import Companion, bump_squares, on_facet
+from .flux import Flux, field_squares
+from .sums import Sums
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def integrate(
+    cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux: Flux, v: Companion
+) -> Sums:
+    """Sum up the parts of the gap.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        load: Moments of f.
+        flux: y.
+        v: v.
+    """
+    d = cells.tdim
+    indicators, steepness, middle, across = np.empty((4, cells.number))
+    sums = Sums(indicators=indicators, steepness=steepness, middle=middle, across=across)
+    for part in blocks(cells.number):
+        P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
+        height = v.bumps[cells.facets[:, part]] if d == 2 else None
+        around, beside = np.zeros((2, part.stop - part.start))
+        if kappa.values is None:
+            pp, bb, pb, vv = _exact(cells, kappa, part, P, c, W, height)
+        else:
+            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(
+                cells, kappa, part, P, c, W, height
+            )
+            around += near
+            beside += far
+            sums.far += float(np.sum(far))
+            sums.near += float(np.sum(near))
+            sums.energy_slack += float(np.sum(of_energy))
+        volume, s = cells.volume[part], sum_rows(P)
+        total = sum_rows(c) + sum_rows(W)
+        fv = load.mean[part] * total / (d + 1)
+        if height is not None:
+            fv += load.mean[part] * sum_rows(height) / 3
+        share = pp + bb
+        around += pp + bb + 2.0 * pb
+        beside += pp + bb - 2.0 * pb
+        if load.hats is not None and load.bumps is not None and load.variance is not None:
+            hats, bumps = load.hats[:, part], load.bumps[:, part]
+            moment = dot_rows(hats, c)
+            fv += dot_rows(hats, W)
+            if height is not None:
+                moment += dot_rows(bumps, height)
+            fv += moment
+            square = poincare(d) ** 2 * cells.diameter2[part] * volume * load.variance[part]
+            osc = square / pick(kappa.low, part)
+            share += osc
+            against, slack = np.zeros_like(osc), np.zeros_like(osc)
+            if d == 2:
+                against = _against_potential(cells, P, s, hats, bumps, part)
+                against /= pick(kappa.mean, part)
+            else:
+                slack = np.sqrt(osc * pp)
+            if kappa.values is not None:
+                # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
+                slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
+            sums.load += float(np.sum(osc))
+            sums.load_companion += float(np.sum(volume * moment))
+            sums.load_flux += float(np.sum(against))
+            sums.slack += float(np.sum(slack))
+            around += osc + 2.0 * (against + slack + volume * moment)
+            beside += osc + 2.0 * (against + slack - volume * moment)
+        sums.flux += float(np.sum(pp))
+        sums.companion += float(np.sum(bb))
+        sums.cross += float(np.sum(pb))
+        sums.energy += float(np.sum(0.5 * vv - volume * fv))
+        indicators[part], steepness[part] = share, vv
+        middle[part], across[part] = around, beside
+    return sums
+
+
+def integrate_edge(
+    cells: Cells,
+    kappa: Coefficient,
+    w: FloatArray,
+    load: Load,
+    edge: Segments,
+    flux: Flux,
+    v: Companion,
+    sums: Sums,
+) -> float:
+    """Add what g has beyond its means on Γg.
+
+    σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
+    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        load: Moments of f.
+        edge: Values of g.
+        flux: y.
+        v: v.
+        sums: What to add to.
+
+    Returns:
+        This rank's share of the square of what goes into ω.
+    """
+    side, d = edge.side, cells.tdim
+    at, sizes = edge.oscillation()
+    low = pick(kappa.low, at)
+    assert sums.indicators is not None
+    assert sums.middle is not None and sums.across is not None
+    sums.indicators[at] += sizes**2 / low
+    sums.neumann = float(np.sum(sizes**2 / low))
+    if d != 2:
+        return sums.neumann
+    of_f: npt.NDArray[np.float64] = np.zeros(len(at))
+    if load.variance is not None:
+        square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
+        of_f = poincare(d) * np.sqrt(square)
+    more = (2.0 * of_f * sizes + sizes**2) / low
+    sums.load += float(np.sum(more))
+    for row in (sums.middle, sums.across):
+        row[at] += more
+    ends = cells.others[side.local].T, side.cells
+    weights = edge.measure * edge.weights[:, None] * edge.rest
+    jump = on_facet(cells, side, edge.hats, v.vertices, v.bumps)
+    jump -= np.einsum("qin,in->qn", edge.hats, w[ends])
+    sums.load_companion += float(np.sum(weights * jump))
+    # The potential of y − κ_T∇u_h, as in _against_potential
+    P = flux.excess[:, side.cells]
+    s = sum_rows(P)
+    a = P - s / (d + 1)
+    apex, base = corner_points(cells, side)
+    middle = (apex + base.sum(axis=0)) / (d + 1)
+    pull = a[side.local, np.arange(len(s))][:, None] * (apex - middle)
+    pull += np.einsum("in,ink->nk", a[ends[0], np.arange(len(s))], base - middle)
+    x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
+    potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
+    potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
+    sums.load_flux += float(np.sum(weights * potential))
+    np.add.at(sums.middle, side.cells, 2.0 * (weights * (potential + jump)).sum(axis=0))
+    np.add.at(sums.across, side.cells, 2.0 * (weights * (potential - jump)).sum(axis=0))
+    if kappa.values is not None:
+        slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], w[:, at])
+        sums.slack += float(np.sum(slack))
+        for row in (sums.middle, sums.across):
+            row[at] += 2.0 * slack
+    return 0.0
+
+
+def _twist(
+    cells: Cells,
+    kappa: Coefficient,
+    where: slice | npt.NDArray[np.intp],
+    P: FloatArray,
+    W: FloatArray,
+) -> FloatArray:
+    """max_T |κ⁻¹ − κ_T⁻¹| ‖y‖_T, or somewhat more.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        where: Which cells.
+        P: Fluxes of y − κ_T∇u_h out of them.
+        W: u_h at their vertices.
+    """
+    mean, low, high = (pick(k, where) for k in (kappa.mean, kappa.low, kappa.high))
+    spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
+    steep = np.sqrt(np.maximum(dot_rows(W, cells.apply(W, where)), 0.0))
+    return spread * (np.sqrt(np.maximum(field_squares(cells, P, where), 0.0)) + mean * steep)
+
+
+def _exact(
+    cells: Cells,
+    kappa: Coefficient,
+    part: slice,
+    P: FloatArray,
+    c: FloatArray,
+    W: FloatArray,
+    height: FloatArray | None,
+) -> tuple[FloatArray, ...]:
+    """∫_T of |p|², |b|², p·b and κ|∇v|² for κ constant on T, shapes (cells in the part,).
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        part: Which cells.
+        P: Fluxes of y − κ_T∇u_h out of the cells.
+        c: v − u_h at the vertices.
+        W: u_h at the vertices.
+        height: Heights of v's bumps.
+    """
+    d, k = cells.tdim, pick(kappa.mean, part)
+    s, c_sum = sum_rows(P), sum_rows(c)
+    z = c + W
+    Sc, Sz = cells.apply(c, part), cells.apply(z, part)
+    bb, vv = dot_rows(c, Sc), dot_rows(z, Sz)
+    # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
+    pb = (s * c_sum - dot_rows(P, c)) / d - s * c_sum / (d + 1)
+    if height is not None:
+        squares = bump_squares(cells, height, part)
+        bb += squares - 8 / 3 * dot_rows(height, Sc)
+        vv += squares - 8 / 3 * dot_rows(height, Sz)
+        pb += 2 / 3 * dot_rows(P, height) - s * sum_rows(height) / 3
+    return field_squares(cells, P, part) / k, k * bb, pb, k * vv
+
+
+def _by_quadrature(
+    cells: Cells,
+    kappa: Coefficient,
+    part: slice,
+    P: FloatArray,
+    c: FloatArray,
+    W: FloatArray,
+    height: FloatArray | None,
+) -> tuple[FloatArray, ...]:
+    """The same for any κ, and how far it may be from the truth.
+
+    Returns:
+        ∫_T of |p|², |b|², p·b and κ|∇v|²; and bounds of what quadrature may miss of ∫_T |p − b|²,
+        ∫_T |p + b|² and ½∫_T κ|∇v|².
+    """
+    values, cut = kappa.values, kappa.cut
+    assert values is not None and cut is not None
+    rule, mean = kappa.rule, kappa.mean
+    points = zip(values[:, part], rule.weights, rule.hats.T, strict=True)
+    rows = _at_points(cells, mean, part, P, c, W, height, points)
+    rows = _with_slack(rows, cut.errors[:, part], cells.tdim)
+    first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
+    if first < last:
+        pieces, within = cut.pieces[np.arange(first, last)], cut.errors_inside[:, first:last]
+        at = pieces.parent - part.start
+        hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
+        points = zip(kappa.inside[:, first:last], rule.weights, hats, strict=True)
+        of_cell = P[:, at], c[:, at], W[:, at], None if height is None else height[:, at]
+        there = _at_points(cells, mean, pieces.parent, *of_cell, points)
+        there = _with_slack(there, within, cells.tdim) * pieces.part
+        which, place = np.unique(at, return_inverse=True)
+        rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
+    return tuple(rows)
+
+
+def _with_slack(rows: FloatArray, errors: FloatArray, d: int) -> FloatArray:
+    """The first four rows, and what quadrature may miss; see `Coefficient.enclose` for the errors.
+
+    With z = v or 2u_h − v it is the smaller of two bounds of what it misses of ∫ κ⁻¹|y − κ∇z|²:
+    that of its three products, and what follows from ‖κ^{-1/2}(y − κ∇z)‖ ≤ N(y − κ∇z) + 2R N(∇z),
+    where N(·)² is 1 + t times the quadrature of κ⁻¹|·|².
+    """
+    pp, bb, pb, vv, yy, *at_z = rows
+    R, t, W, inverse_W, strip_low, strip_high, _ = errors
+    slack = []
+    for sign, (zz, steep) in ((-2.0, at_z[:2]), (2.0, at_z[2:])):
+        products = 2.0 * (inverse_W * yy + W * zz)
+        square = np.maximum(pp + bb + sign * pb, 0.0)
+        norm = (1.0 + t) * (np.sqrt(square) + 2.0 * R * np.sqrt(steep)) ** 2
+        # on strips κ may be what it is nowhere else, and an affine field (d + 1) times its norm
+        strips = strip_low * yy + strip_high * zz
+        slack.append(np.fmin(products, norm - square + 2.0 * (d + 1) ** 2 * strips))
+    return np.stack([pp, bb, pb, vv, *slack, W * at_z[0]])
+
+
+def _at_points(
+    cells: Cells,
+    mean: FloatArray,
+    where: slice | npt.NDArray[np.intp],
+    P: FloatArray,
+    c: FloatArray,
+    W: FloatArray,
+    height: FloatArray | None,
+    points: Iterable[tuple[FloatArray, float, FloatArray]],
+) -> FloatArray:
+    """Means over points of |T| times what the gap is made of.
+
+    It is |p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and κ⁻¹|∇z|² for z = v and z = 2u_h − v.
+
+    At a point with barycentric coordinates λ_k, y − κ_T∇u_h = Σ Q_k X_k / (d |T|) with
+    Q_k = λ_k ΣP − P_k, and ∇(v − u_h) = Σ γ_k ∇λ_k with γ_k = c_k + 4 Σ_l height_l λ_m, where
+    k, l, m are the three vertices. As Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
+
+    Args:
+        cells: The mesh.
+        mean: κ_T.
+        where: Which cells.
+        P: Fluxes of y − κ_T∇u_h out of the cells.
+        c: v − u_h at the vertices.
+        W: u_h at the vertices.
+        height: Heights of v's bumps.
+        points: κ, a weight, and the point's barycentric coordinates, shape (d + 1,) or (d + 1, n).
+    """
+    d, mean, volume = cells.tdim, pick(mean, where), cells.volume[where]
+    s = sum_rows(P)
+    gg = dot_rows(W, cells.apply(W, where))
+    rows = np.zeros((9, len(volume)))
+    for k, weight, hat in points:
+        hat = hat.reshape(len(hat), -1)
+        Q = hat * s - P
+        gamma = c.copy()
+        if height is not None:
+            for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
+                gamma[i] += 4.0 * hat[m] * height[j]
+                gamma[j] += 4.0 * hat[m] * height[i]
+        qq = np.zeros_like(s)
+        for (i, j), length in zip(cells.pairs, cells.lengths[:, where], strict=True):
+            qq -= Q[i] * Q[j] * length
+        qq /= d**2 * volume
+        S_gamma = cells.apply(gamma, where)
+        bend, along = dot_rows(gamma, S_gamma), dot_rows(W, S_gamma)
+        Qw = dot_rows(Q, W) / d
+        off = k - mean
+        pp, bb = (qq - 2.0 * off * Qw + off**2 * gg) / k, k * bend
+        pb = dot_rows(Q, gamma) / d - off * along
+        yy = qq + 2.0 * mean * Qw + mean**2 * gg
+        values = [pp, bb, pb, k * (gg + 2.0 * along + bend), yy]
+        for sign in (2.0, -2.0):
+            zz = gg + sign * along + bend
+            values += [zz, zz / k]
+        for row, value in zip(rows, values, strict=True):
+            row += weight * value
+    return rows
+
+
+def _against_potential(
+    cells: Cells,
+    P: FloatArray,
+    s: FloatArray,
+    hats: FloatArray,
+    bumps: FloatArray,
+    part: slice,
+) -> FloatArray:
+    """∫_T (f − f_T) φ for the φ with ∇φ = y − κ_T∇u_h and d = 2, shape (cells in the part,).
+
+    d |T| φ = s |x − x_T|²/2 − (x − x_T)·Σ a_i X_i up to a constant, a_i = P_i − s/(d + 1). With
+    x = Σ λ_i X_i, |x − x_T|² = Σ λ_i |X_i − x_T|² − Σ_{i<j} λ_i λ_j |X_i − X_j|².
+    """
+    d = cells.tdim
+    a = P - s / (d + 1)
+    lengths = cells.lengths[:, part]
+    arm, reach = np.zeros_like(a), np.zeros_like(a)  # Σ_j |X_i − X_j|² times a_j, and times 1
+    square = np.zeros_like(s)
+    for (i, j), length in zip(cells.pairs, lengths, strict=True):
+        reach[i] += length
+        reach[j] += length
+        arm[i] += a[j] * length
+        arm[j] += a[i] * length
+        square -= bumps[3 - i - j] * length / 4
+    square += dot_rows(hats, reach) / (d + 1)
+    return (s * square + dot_rows(hats, arm)) / (2 * d)

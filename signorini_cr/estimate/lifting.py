@@ -1,0 +1,276 @@
+"""What u_D and α have beyond quadratics on boundary facets, enclosed and lifted into the cells.
+
+δ is u_D − v on Γ0, and (α − α_I)⁺ on Γ1, where α_I ≤ v is the quadratic that α is interpolated by.
+It vanishes at the facets' ends, and ℓ(P + t(z − P)) = t^k δ(z) brings it into the cell, P opposite
+the facet. What is needed are bounds of |δ| and |δ'|, piece by piece; k is the best for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..data.jets import Enclosure, Jet, Unknown, indices
+from ..data.moments import Trace
+from ..data.ranges import Pieces, refine
+from ..fem.cells import Cells, Side, corner_points
+
+FloatArray = npt.NDArray[np.float64]
+
+ROUGH = "{} jumps on a boundary facet, or its derivative is not known to be bounded there"
+NO_RANGE = "{} holds an operator that has no enclosure: {}"
+CURVED = "u_D or α is not affine on the facets: their lifting is known for d = 2 only"
+
+QUARTERS = 2
+"""How often facets are halved to begin with."""
+POWERS = 0.5, 1e6
+"""Between which k is."""
+END = 1e-9
+"""Part of a facet where its data's limit at the end is looked for."""
+ROUNDING = 1e-11
+"""Part of the largest value that counts as rounding of data, and as 0."""
+JUMP = 1e-9
+"""Part of the largest value that counts as a jump."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """Quadratic polynomials on facets, (1 − s) a + s b + 4 s (1 − s) height for 0 ≤ s ≤ 1.
+
+    Attributes:
+        ends: a and b, shape (2, n).
+        height: Shape (n,).
+    """
+
+    ends: FloatArray
+    height: FloatArray
+
+    def at(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
+        """Values at s on some facets."""
+        a, b = self.ends[:, which]
+        return a + s * (b - a) + 4.0 * s * (1.0 - s) * self.height[which]
+
+    def slope(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
+        """Derivative in s."""
+        a, b = self.ends[:, which]
+        return b - a + 4.0 * (1.0 - 2.0 * s) * self.height[which]
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean over the facet, shape (n,)."""
+        return self.ends.mean(axis=0) + 2.0 / 3.0 * self.height
+
+
+@dataclass(frozen=True, eq=False)
+class Lift:
+    """Bounds for each facet of a part of the boundary.
+
+    Attributes:
+        steep: ‖∇ℓ‖_T, shape (n,).
+        area: ‖ℓ‖_T.
+        beyond: |∫_F δ|.
+        least: Lower bound of the data's mean.
+        reason: Why there are none, if there are none; this rank's.
+    """
+
+    steep: FloatArray
+    area: FloatArray
+    beyond: FloatArray
+    least: FloatArray
+    reason: str | None = None
+
+
+def lift(
+    cells: Cells,
+    side: Side,
+    trace: Trace,
+    base: Quadratic,
+    v: Quadratic,
+    scale: float,
+    goal: float,
+    obstacle: bool,
+) -> Lift:
+    """Enclose data less a quadratic, and bound the lifting; collective.
+
+    Args:
+        cells: The mesh, of triangles.
+        side: The facets.
+        trace: The data.
+        base: What δ is measured from.
+        v: The companion, for an obstacle; where the obstacle is below it δ is 0.
+        scale: Size of the values, by which rounding is told.
+        goal: What ‖∇ℓ‖ need not be known better than.
+        obstacle: Whether δ is the positive part of the difference.
+    """
+    n, name = len(side.cells), "α" if obstacle else "u_D"
+    if trace.constant is not None:
+        zero = np.zeros(n)
+        return Lift(zero, zero, zero, np.full(n, trace.constant))
+    apex, (a, b) = corner_points(cells, side)
+    length = np.linalg.norm(b - a, axis=1)
+    height = 2.0 * cells.volume[side.cells] / length
+    foot = np.einsum("nk,nk->n", a - apex, b - a) / length
+    whole = Pieces.of_facets(cells, side)
+
+    def parts(pieces: Pieces, size: FloatArray, steep: FloatArray) -> FloatArray:
+        """Bounds of |δ'|² + (kδ − sδ')²/H²: what goes with 1, k and k²."""
+        at = pieces.parent
+        reach = np.maximum(*np.abs(foot[at] + pieces.hats[:, 1] * length[at])) / height[at]
+        size = size / height[at]
+        return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
+
+    def steepness(pieces: Pieces) -> FloatArray:
+        bound = _bounds(trace, pieces, base, cells, length, scale)
+        return np.stack([parts(pieces, *bound[:2]).sum(axis=0), *bound])
+
+    weights = np.zeros((4, n))
+    weights[0] = 0.5 * height * length / goal**2
+    try:
+        pieces = whole
+        for _ in range(QUARTERS):
+            pieces = pieces.halves()
+        room = 8 * cells.comm.allreduce(n) + 1000
+        pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
+        jumps = _jump_at_ends(trace, whole, base, cells, JUMP * scale, obstacle)
+        clear = np.zeros(n, dtype=bool)
+        if obstacle:
+            below = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0] <= 0
+            clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
+    except Unknown as error:
+        zero = np.zeros(n)
+        return Lift(zero, zero, zero, zero, NO_RANGE.format(name, error))
+
+    def mean(values: FloatArray) -> FloatArray:
+        sums = np.bincount(pieces.parent, pieces.part * values, minlength=n)
+        return np.asarray(sums, dtype=np.float64)
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rows = (*parts(pieces, size, steep), size, size**2)
+        one, k, two, beyond, norm = (np.where(clear, 0.0, mean(row)) for row in rows)
+        power = np.clip(np.nan_to_num(np.sqrt(one / two), nan=1.0), *POWERS)
+        squares = one / power + k + power * two
+    reason = None
+    if not np.isfinite(squares).all() or (jumps & ~clear).any():
+        reason = ROUGH.format(name)
+    return Lift(
+        np.sqrt(0.5 * height * length * squares),
+        np.sqrt(height * length * norm / (2.0 * power + 2.0)),
+        beyond * length,
+        mean(least),
+        reason,
+    )
+
+
+def _bounds(
+    trace: Trace,
+    pieces: Pieces,
+    base: Quadratic,
+    cells: Cells,
+    length: FloatArray,
+    scale: float,
+    signed: bool = False,
+) -> FloatArray:
+    """Bounds of |δ|, |δ'| and of the data's mean from below, on pieces of facets, shape (3, n).
+
+    Taylor's formula about the middle m for δ', with what the orders 1, 2 and 3 say; whichever is
+    the best. With `signed` the first is an upper bound of δ itself.
+    """
+    boxes = pieces.boxes(cells, decide=True)
+    over = Enclosure(boxes)(trace.deviation.expression)
+    at, s = pieces.parent, pieces.hats[:, 1].mean(axis=0)
+    e = 0.5 * length[at] * pieces.part
+    there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(trace.deviation.expression)
+    c, m = _balls(over, len(at)), _balls(there, len(at))
+    slope = base.slope(at, s) / length[at]
+    bend = -4.0 * base.height[at] / length[at] ** 2
+    with np.errstate(invalid="ignore"):
+        first = np.abs(m[1][0] - slope) + m[1][1]
+        by_order = (
+            np.abs(c[1][0] - slope) + c[1][1] + 2.0 * e * np.abs(bend),
+            first + 2.0 * e * (np.abs(c[2][0] - bend) + c[2][1]),
+            first
+            + 2.0 * e * (np.abs(m[2][0] - bend) + m[2][1])
+            + 3.0 * e**2 * (np.abs(c[3][0]) + c[3][1]),
+        )
+        steep = np.where(np.isnan(d := np.fmin.reduce(by_order)), np.inf, d)
+        ends = np.stack([base.at(at, t) for t in (*pieces.hats[:, 1], s)])
+        swing = np.abs(bend) * e**2
+        above = over.high - ends.min(axis=0) + swing
+        below = ends.max(axis=0) - over.low + swing
+        middle = m[0][0] - ends[2]
+        if signed:
+            size = np.fmin(above, middle + m[0][1] + e * steep)
+        else:
+            size = np.fmin(np.maximum(above, below), np.abs(middle) + m[0][1] + e * steep)
+            rounding = np.isinf(steep) & (size <= ROUNDING * scale)
+            steep, size = np.where(rounding, 0.0, steep), np.where(rounding, 0.0, size)
+        low = m[0][0] - m[0][1]
+        least = np.fmax.reduce(
+            (
+                over.low + np.zeros_like(e),
+                low - 0.5 * e * c[1][1],
+                low + e**2 / 3.0 * (c[2][0] - c[2][1]),
+                low + e**2 / 3.0 * (m[2][0] - m[2][1]) - 0.25 * e**3 * (np.abs(c[3][0]) + c[3][1]),
+            )
+        )
+    return np.stack([size, steep, least])
+
+
+def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
+    zero = np.zeros(n)
+    return [(zero, zero) if ball is None else (ball[0] + zero, ball[1] + zero) for ball in jet.all]
+
+
+def _jump_at_ends(
+    trace: Trace, whole: Pieces, base: Quadratic, cells: Cells, jump: float, obstacle: bool
+) -> npt.NDArray[np.bool_]:
+    """Where δ does not vanish at a facet's end: the data's limit there is not the value there."""
+    found = np.zeros(len(whole.parent), dtype=bool)
+    for end in (0, 1):
+        corners = whole.corners.copy()
+        corners[1 - end] = corners[end] + END * (whole.corners[1 - end] - corners[end])
+        near = Pieces(whole.parent, corners, whole.hats, whole.part, whole.frame)
+        jet = Enclosure(near.boxes(cells, decide=True))(trace.deviation.expression)
+        found |= jet.low > base.ends[end] + jump
+        if not obstacle:
+            found |= jet.high < base.ends[end] - jump
+    return found
+
+
+def affine(
+    cells: Cells,
+    side: Side,
+    trace: Trace,
+    v: FloatArray,
+    values: FloatArray,
+    scale: float,
+) -> Lift:
+    """Insist on data that are affine on the facets of tetrahedra; v or more at their vertices.
+
+    Args:
+        cells: The mesh.
+        side: The facets.
+        trace: The data.
+        v: v at the facets' vertices, shape (d, n).
+        values: The data there.
+        scale: Size of the values, by which rounding is told.
+    """
+    zero = np.zeros(len(side.cells))
+    if trace.constant is not None:
+        return Lift(zero, zero, zero, zero + trace.constant)
+    whole = Pieces.of_facets(cells, side)
+    boxes = whole.boxes(cells, decide=True)
+    try:
+        jet = Enclosure(boxes)(trace.deviation.expression)
+    except Unknown as error:
+        return Lift(zero, zero, zero, zero, NO_RANGE.format("u_D or α", error))
+    off = zero.copy()
+    half = whole.half(boxes)
+    for index, ball in zip(indices(boxes.variables)[1:], jet.rest, strict=True):
+        if sum(index) == 2 and ball is not None:
+            size = np.prod([h**k for h, k in zip(half, index, strict=True)], axis=0)
+            off = off + 2.0 * (np.abs(ball[0]) + ball[1]) * size
+    curved = not (off <= JUMP * scale).all() or (values - v > JUMP * scale).any()
+    return Lift(zero, zero, zero, values.mean(axis=0) - off, CURVED if curved else None)

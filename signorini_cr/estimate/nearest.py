@@ -1,0 +1,118 @@
+"""The continuous function of degree 2 that is nearest to u_h, by algebraic multigrid.
+
+A function of degree 2 is given by its values at the vertices and the heights of its bumps
+b_F = 4 λ_j λ_k over the straight line through them, on each cell relative to u_h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
+from dolfinx.la import InsertMode
+from petsc4py import PETSc
+
+from ..fem.cells import Cells, blocks, dot_rows, pick, sum_rows
+from ..fem.space import ghosted_vector, shared_maximum
+from ..garbage import release
+from ..options import AMG
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+SHARE = 1e-6
+"""Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on
+any number of ranks."""
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """How fast E = ‖κ^{1/2}(∇v − ∇_h u_h)‖² falls, cell by cell.
+
+    Attributes:
+        vertices: −½ ∂E by v's values at the vertices with the bumps kept, shape (d + 1, cells).
+        facets: −½ ∂E by the heights of the bumps, shape (d + 1, cells).
+        energies: The cells' shares of E, shape (cells,).
+    """
+
+    vertices: FloatArray
+    facets: FloatArray
+    energies: FloatArray
+
+    @classmethod
+    def of(cls, cells: Cells, kappa: FloatArray, excess: FloatArray, bumps: FloatArray) -> Slopes:
+        """Compute them; collective.
+
+        Args:
+            cells: The mesh, d = 2.
+            kappa: Mean of κ, shape (cells,) or ().
+            excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
+            bumps: Heights by facet dof.
+        """
+        vertices, facets = np.empty_like(excess), np.empty_like(excess)
+        energies = np.empty(cells.number)
+        for part in blocks(cells.number):
+            k, c, height = pick(kappa, part), excess[:, part], bumps[cells.facets[:, part]]
+            rest = cells.trace(part) - 2.0 * cells.squares(part)
+            vertices[:, part] = -k * cells.apply(c - 4 / 3 * height, part)
+            facets[:, part] = 4 / 3 * k * (cells.apply(c - 2.0 * height, part) - rest * height)
+            energies[part] = -dot_rows(c, vertices[:, part]) - dot_rows(height, facets[:, part])
+        return cls(vertices, facets, energies)
+
+
+def nearest(
+    cells: Cells, kappa: FloatArray, slopes: Slopes, loose: BoolArray, free: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """The way from v to the function of degree 2 that is nearest to u_h; collective.
+
+    Args:
+        cells: The mesh, d = 2.
+        kappa: Mean of κ, shape (cells,) or ().
+        slopes: Those of v.
+        loose: Which values at vertices are free.
+        free: Which heights are free.
+
+    Returns:
+        What is to be added to v's values at the vertices and to the heights of its bumps.
+    """
+    mesh, d = cells.domain.mesh, cells.tdim
+    V = fem.functionspace(mesh, ("Lagrange", 2))
+    dofs = V.dofmap.list[: cells.number].T
+    b, x = fem.Function(V), fem.Function(V)
+    held = np.zeros_like(b.x.array)
+    held[dofs[: d + 1][~loose[cells.vertices]]] = 1.0
+    held[dofs[d + 1 :][~free[cells.facets]]] = 1.0
+    shared_maximum(V, held)
+    fixed = np.flatnonzero(held > 0.0).astype(np.int32)
+    # A nodal function of a vertex is λ_i less half the bumps of the two facets it belongs to
+    at_vertices = slopes.vertices - 0.5 * (sum_rows(slopes.facets) - slopes.facets)
+    rows = np.concatenate([at_vertices, slopes.facets])
+    b.x.array[:] = np.bincount(dofs.ravel(), rows.ravel(), minlength=len(held))
+    b.x.scatter_reverse(InsertMode.add)
+    b.x.array[fixed] = 0.0
+    k = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    k.x.array[: cells.number] = kappa
+    u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
+    form = fem.form(k * ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
+    A.assemble()
+    ksp = PETSc.KSP().create(mesh.comm)
+    ksp.setOperators(A)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.setNormType(PETSc.KSP.NormType.NATURAL)
+    ksp.getPC().setType(AMG)
+    ksp.setTolerances(rtol=SHARE, max_it=100)
+    vectors = [ghosted_vector(V, function.x.array) for function in (b, x)]
+    ksp.solve(*vectors)
+    release(ksp, A, *vectors)
+    x.x.scatter_forward()
+    nodal = x.x.array[dofs]
+    corners, middles = nodal[: d + 1], nodal[d + 1 :]
+    at_vertices, heights = np.zeros(len(loose)), np.zeros(len(free))
+    at_vertices[cells.vertices] = corners
+    heights[cells.facets] = middles - 0.5 * (sum_rows(corners) - corners)
+    return at_vertices, heights

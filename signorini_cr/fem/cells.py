@@ -1,0 +1,333 @@
+"""A mesh as arrays: what the certificate needs to know of cells, facets and vertices.
+
+Arrays over cells have the local number first: shape (d + 1, cells), owned cells only. Facet i is
+opposite vertex i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem, la
+
+from .. import compat
+from ..mesh.domain import DIRICHLET, PARTS, Domain
+from .space import facet_entities, shared_sum
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+BLOCK = 1 << 13
+"""Cells that are worked on at a time: as many as the processor's cache holds."""
+
+BESSEL = 3.8317059702
+"""First positive zero of J₁, rounded down."""
+
+
+def blocks(cells: int) -> Iterator[slice]:
+    """Consecutive ranges of cells."""
+    return (slice(a, min(a + BLOCK, cells)) for a in range(0, cells, BLOCK))
+
+
+def pick(values: FloatArray, where: slice | IntArray) -> FloatArray:
+    """Values on some cells of an array over all of them, or the one value that holds on all."""
+    return values if values.ndim == 0 else values[where]
+
+
+def sum_rows(a: FloatArray) -> FloatArray:
+    """Σ_i a_i, shape (n,); for few long rows much faster than ``a.sum(axis=0)``."""
+    out = a[0] + a[1]
+    for row in a[2:]:
+        out += row
+    return out
+
+
+def dot_rows(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Σ_i a_i b_i, shape (n,)."""
+    out = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        out += x * y
+    return out
+
+
+def poincare(tdim: int) -> float:
+    """C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
+
+    1/π for any convex cell (Payne and Weinberger); 1/j₁₁ for triangles (Laugesen and Siudeja).
+    """
+    return 1 / BESSEL if tdim == 2 else 1 / np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Boundary facets of one part, seen from their cells.
+
+    Attributes:
+        cells: The cell of each facet, shape (n,).
+        local: Number of the facet in its cell, shape (n,).
+        dofs: The facet's degree of freedom, shape (n,).
+        ends: The facet's vertices, in the order of the cell's closure, shape (d, n).
+    """
+
+    cells: IntArray
+    local: IntArray
+    dofs: IntArray
+    ends: IntArray
+
+    @property
+    def entities(self) -> npt.NDArray[np.int32]:
+        """Pairs (cell, local facet), as Expressions want them."""
+        return np.column_stack([self.cells, self.local]).astype(np.int32)
+
+
+class Cells:
+    """What the certificate needs to know of a mesh.
+
+    Attributes:
+        number: Owned cells.
+        facets: Facet dofs of each cell, shape (d + 1, cells).
+        vertices: Vertices of each cell, shape (d + 1, cells).
+        others: The vertices of facet i but vertex i, shape (d + 1, d).
+        pairs: The pairs i < j of local vertices, in the order of the next two arrays' rows.
+        lengths: |X_i − X_j|², shape (pairs, cells).
+        stiffness: |T| ∇λ_i·∇λ_j, shape (pairs, cells).
+        volume: |T|, shape (cells,).
+        sides: The boundary facets by part.
+    """
+
+    def __init__(self, domain: Domain, V: fem.FunctionSpace):
+        """Read a domain's mesh; V is its Crouzeix-Raviart space."""
+        mesh = domain.mesh
+        self.domain, self.V, self.comm = domain, V, mesh.comm
+        d = self.tdim = mesh.topology.dim
+        n = self.number = mesh.topology.index_map(d).size_local
+        self.facets = _rows(V.dofmap.list[:n])
+        corners = mesh.topology.connectivity(d, 0).array.reshape(-1, d + 1)
+        self.vertices = _rows(corners[:n])
+        self.others = np.array([[j for j in range(d + 1) if j != i] for i in range(d + 1)])
+        self.pairs = list(combinations(range(d + 1), 2))
+        self.lengths = np.empty((len(self.pairs), n))
+        self.stiffness = np.empty((len(self.pairs), n))
+        self.volume = np.empty(n)
+        x = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
+        nodes = _rows(compat.cell_nodes(mesh)[:n])
+        for part in blocks(n):
+            corner = [[row.take(i) for row in x] for i in nodes[:, part]]
+            edges = [[p - q for p, q in zip(c, corner[0], strict=True)] for c in corner[1:]]
+            for k, (i, j) in enumerate(self.pairs):
+                self.lengths[k, part] = sum(
+                    (p - q) ** 2 for p, q in zip(corner[i], corner[j], strict=True)
+                )
+            self.volume[part], self.stiffness[:, part] = _shape(edges, self.lengths[:, part])
+
+    @cached_property
+    def diameter2(self) -> FloatArray:
+        """h_T², shape (cells,)."""
+        return self.lengths.max(axis=0)
+
+    @cached_property
+    def sides(self) -> dict[int, Side]:
+        """Boundary facets of owned cells."""
+        mesh, d = self.domain.mesh, self.tdim
+        index_map = mesh.topology.index_map(d - 1)
+        mark = la.vector(index_map, dtype=np.float64)
+        for part in PARTS.values():
+            mark.array[self.domain.facets(part)] = part
+        mark.scatter_forward()
+        sides = {}
+        for part in PARTS.values():
+            found = np.flatnonzero(mark.array == part).astype(np.int32)
+            cells, local = facet_entities(mesh, found).T.astype(np.intp)
+            own = cells < self.number
+            cells, local = cells[own], local[own]
+            sides[part] = Side(
+                cells,
+                local,
+                self.facets[local, cells],
+                self.vertices[self.others[local].T, cells[None, :]],
+            )
+        return sides
+
+    @cached_property
+    def exterior(self) -> npt.NDArray[np.bool_]:
+        """Which facet dofs lie on the boundary, ghosts included."""
+        mark = la.vector(self.V.dofmap.index_map, dtype=np.float64)
+        for side in self.sides.values():
+            mark.array[side.dofs] = 1.0
+        self.share(mark.array)
+        return mark.array > 0
+
+    @cached_property
+    def layers(self) -> list[tuple[IntArray, IntArray]]:
+        """Cells by the number of facets between them and Γ0, nearest first.
+
+        Each layer has its cells and, for each, the local facet that leads back towards Γ0.
+        """
+        d = self.tdim
+        owners = np.full((2, len(self.exterior)), -1)
+        flat, cell = self.facets.ravel(), np.tile(np.arange(self.number), d + 1)
+        owners[0, flat] = cell
+        other = owners[0, flat] != cell
+        owners[1, flat[other]] = cell[other]
+        way_out = np.full(self.number, -1, dtype=np.intp)
+        front = np.zeros(len(self.exterior))
+        front[self.sides[DIRICHLET].dofs] = 1.0
+        seen = self.share(front) > 0
+        found, layers = np.flatnonzero(seen), []
+        while self.comm.allreduce(len(found)) > 0:
+            near = owners[:, found].ravel()
+            layer = np.unique(near[near >= 0])
+            layer = layer[way_out[layer] < 0]
+            facets = self.facets[:, layer]
+            way_out[layer] = np.argmax(seen[facets], axis=0)
+            layers.append((layer, way_out[layer]))
+            new = np.unique(facets[~seen[facets]])
+            if self.comm.size > 1:
+                theirs = self.from_others(new, np.ones(len(new))) > 0
+                new = np.union1d(new, self.between[theirs & ~seen[self.between]])
+            seen[new] = True
+            found = new
+        return layers
+
+    def over_facets(self, values: FloatArray, shared: bool = True) -> FloatArray:
+        """Add up local values, shape (d + 1, cells), for each facet dof.
+
+        Args:
+            values: One for each cell and facet.
+            shared: Whether to add the other ranks' shares, ghosts included.
+        """
+        index_map = self.V.dofmap.index_map
+        size = index_map.size_local + index_map.num_ghosts
+        total: FloatArray = np.bincount(self.facets.ravel(), values.ravel(), minlength=size).astype(
+            np.float64, copy=False
+        )
+        return self.share(total) if shared else total
+
+    def over_vertices(self, values: FloatArray) -> FloatArray:
+        """Add up local values, shape (d + 1, cells), for each vertex, ghosts included."""
+        index_map = self.domain.mesh.topology.index_map(0)
+        size = index_map.size_local + index_map.num_ghosts
+        total = np.bincount(self.vertices.ravel(), values.ravel(), minlength=size)
+        return self.share(total.astype(np.float64, copy=False), 0)
+
+    def share(self, values: FloatArray, dim: int | None = None) -> FloatArray:
+        """Sum the ranks' shares of facet dofs, or of vertices (``dim`` = 0), in place."""
+        topology = self.domain.mesh.topology
+        index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
+        return shared_sum(self.comm, index_map, values)
+
+    @cached_property
+    def between(self) -> IntArray:
+        """Facet dofs that other ranks see as well, shape (n,)."""
+        index_map = self.V.dofmap.index_map
+        mark = np.zeros(index_map.size_local + index_map.num_ghosts)
+        mark[index_map.size_local :] = 1.0
+        return np.flatnonzero(self.share(mark) > 0)
+
+    @cached_property
+    def _mailbox(self) -> la.Vector:
+        return la.vector(self.V.dofmap.index_map, dtype=np.float64)
+
+    def from_others(self, where: IntArray, values: FloatArray) -> FloatArray:
+        """Sums of what the other ranks have, in the order of ``between``; collective.
+
+        Args:
+            where: Dofs that this rank has something for, each once.
+            values: What it has, shape (n,).
+        """
+        box = self._mailbox
+        box.array[where] = values
+        mine = box.array[self.between]
+        box.scatter_reverse(la.InsertMode.add)
+        box.scatter_forward()
+        theirs = box.array[self.between] - mine
+        box.array[where] = 0.0
+        box.array[self.between] = 0.0
+        return theirs
+
+    def owned_facets(self) -> int:
+        """Number of facet dofs this rank owns."""
+        return self.V.dofmap.index_map.size_local
+
+    def owned_vertices(self) -> int:
+        """Number of vertices this rank owns."""
+        return self.domain.mesh.topology.index_map(0).size_local
+
+    def total(self, *values: float | np.floating | FloatArray) -> FloatArray:
+        """Sum over all ranks."""
+        return self.comm.allreduce(np.array(values, dtype=np.float64))
+
+    def apply(self, c: FloatArray, part: slice | IntArray) -> FloatArray:
+        """|T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
+        out = np.zeros_like(c)
+        for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
+            flow = (c[j] - c[i]) * s[part]
+            out[i] += flow
+            out[j] -= flow
+        return out
+
+    def opposite(self, side: Side) -> FloatArray:
+        """|T| |∇λ_i|² for the vertices opposite boundary facets, shape (n,)."""
+        out = np.zeros(len(side.cells))
+        for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
+            out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
+        return out
+
+    def squares(self, part: slice) -> FloatArray:
+        """|T| |∇λ_i|², shape (d + 1, cells in the part)."""
+        out = np.zeros((self.tdim + 1, len(self.volume[part])))
+        for (i, j), s in zip(self.pairs, self.stiffness[:, part], strict=True):
+            out[i] -= s
+            out[j] -= s
+        return out
+
+    def trace(self, part: slice) -> FloatArray:
+        """|T| Σ |∇λ_i|²."""
+        return -2.0 * sum_rows(self.stiffness[:, part])
+
+
+def corner_points(cells: Cells, side: Side) -> tuple[FloatArray, FloatArray]:
+    """Coordinates of the opposite vertex, shape (n, gdim), and of the ends, shape (d, n, gdim)."""
+    mesh = cells.domain.mesh
+    nodes = compat.cell_nodes(mesh)[side.cells]
+    x = mesh.geometry.x[:, : mesh.geometry.dim]
+    apex = x[np.take_along_axis(nodes, side.local[:, None], axis=1)[:, 0]]
+    return apex, x[np.take_along_axis(nodes, cells.others[side.local], axis=1).T]
+
+
+def measures(cells: Cells, side: Side) -> FloatArray:
+    """|F|, shape (n,)."""
+    _, ends = corner_points(cells, side)
+    edges = ends[1:] - ends[:1]
+    gram = np.einsum("ind,jnd->nij", edges, edges)
+    return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, cells.tdim))
+
+
+def _rows(table: npt.NDArray[np.int32]) -> IntArray:
+    """The transpose of a table of indices, row by row in memory."""
+    return np.ascontiguousarray(table.T, dtype=np.intp)
+
+
+def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Volumes and |T| ∇λ_i·∇λ_j of cells given by the edges from their first vertex."""
+    if len(edges) == 2:
+        (a, b), (c, d) = edges
+        volume = 0.5 * np.abs(a * d - b * c)
+        scale = 0.125 / volume
+        half = sum_rows(lengths)
+        return volume, (2.0 * lengths - half) * scale
+    jacobian = np.stack([np.stack(e, axis=-1) for e in edges], axis=-2)
+    size = len(edges)
+    volume = np.abs(np.linalg.det(jacobian)) / np.prod(np.arange(1, size + 1))
+    inverse = np.linalg.inv(jacobian)
+    gradients = np.concatenate([-inverse.sum(axis=-1, keepdims=True), inverse], axis=-1)
+    rows = [
+        volume * (gradients[..., i] * gradients[..., j]).sum(axis=-1)
+        for i, j in combinations(range(size + 1), 2)
+    ]
+    return volume, np.stack(rows)

@@ -1,0 +1,267 @@
+"""The data of the Signorini problem and the forms of the paper.
+
+Find u with −∇·(κ∇u) = f in Ω, u = u_D on Γ0, κ∂ₙu = g on Γg and, on the contact boundary Γ1,
+
+    u ≥ α,  κ∂ₙu ≥ 0,  κ∂ₙu (u − α) = 0                                              (1.4)
+
+with κ = 1 unless a coefficient is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import basix.ufl
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from ufl.core.expr import Expr
+
+from ..errors import InputError
+from ..mesh.domain import NEUMANN, Domain
+from .space import facet_entities, ufl_element
+
+Data: TypeAlias = float | Expr | Callable[[Expr], Any]
+"""A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Data of the problem, free of any mesh.
+
+    Attributes:
+        f: Volume load, the right-hand side of (1.4).
+        g: Normal flux κ∂ₙu on Γg.
+        obstacle: α, the lower bound of u on Γ1.
+        dirichlet: u_D, the value of u on Γ0.
+        coefficient: κ, positive scalar (or symmetric positive definite tensor).
+        exact: The exact solution, where it is known. f, g and u_D that are None are then
+            derived from it by differentiation; without it, None means 0.
+        quadrature_degree: Polynomial degree up to which loads and coefficient are integrated
+            exactly, 0 or more.
+        error_degree: The same for the errors against ``exact``.
+    """
+
+    f: Data | None = None
+    g: Data | None = None
+    obstacle: Data = 0.0
+    dirichlet: Data | None = None
+    coefficient: Data = 1.0
+    exact: Data | None = None
+    quadrature_degree: int = 4
+    error_degree: int = 6
+
+    def __post_init__(self) -> None:
+        """Refuse degrees that Basix would stop the process for."""
+        for name in ("quadrature_degree", "error_degree"):
+            degree = getattr(self, name)
+            if not isinstance(degree, int | np.integer) or degree < 0:
+                raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
+
+
+def as_expression(data: Data, x: Expr) -> Expr:
+    """Turn ``data`` into a UFL expression in the coordinates x.
+
+    Raises:
+        InputError: That is not possible.
+    """
+    try:
+        return ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"data: {data!r} does not give a number or a UFL expression ({error}); functions of x "
+            "take theirs from ufl, as in ufl.sin(x[0])"
+        ) from error
+
+
+class Kernel:
+    """A form compiled once and bound to any number of meshes of the same cell type.
+
+    Args:
+        form: UFL form on the mesh that the data were written for.
+        mesh: That mesh.
+        stand_ins: The UFL coefficients in ``form`` that get their values when it is bound.
+    """
+
+    def __init__(self, form: ufl.Form, mesh: Mesh, stand_ins: Sequence[ufl.Coefficient] = ()):
+        self._compiled = fem.compile_form(mesh.comm, form)
+        self._mesh = mesh
+        self._stand_ins = tuple(stand_ins)
+        self._own = {
+            w: w
+            for w in ufl.algorithms.extract_coefficients(form)
+            if not any(w is s for s in self._stand_ins)
+        }
+        self._constants = {c: c for c in ufl.algorithms.analysis.extract_constants(form)}
+        self._types = {i.integral_type() for i in form.integrals()}
+
+    def on(
+        self,
+        domain: Domain,
+        spaces: Sequence[fem.FunctionSpace] = (),
+        functions: Sequence[fem.Function] = (),
+    ) -> fem.Form:
+        """Bind to a mesh, argument spaces and one function per stand-in."""
+        subdomains: dict[Any, list[tuple[int, npt.NDArray[np.int32]]]] = {}
+        if "exterior_facet" in self._types:
+            entities = facet_entities(domain.mesh, domain.facets(NEUMANN))
+            subdomains[fem.IntegralType.exterior_facet] = [(NEUMANN, entities.ravel())]
+        return fem.create_form(
+            self._compiled,
+            list(spaces),
+            domain.mesh,
+            subdomains,
+            self._own | dict(zip(self._stand_ins, functions, strict=True)),
+            self._constants,
+        )
+
+
+class Forms:
+    """The forms of the paper for one problem and element, compiled when first asked for.
+
+    Args:
+        problem: The data.
+        mesh: A mesh of the kind they will be used on; data tied to a mesh must be tied to this one.
+        element: "CR" or "P1".
+    """
+
+    def __init__(self, problem: Problem, mesh: Mesh, element: str = "CR"):
+        self.problem, self.mesh, self.element = problem, mesh, element
+        cell = mesh.ufl_domain()
+        self.space = ufl.FunctionSpace(cell, ufl_element(mesh, element))
+        self.w = ufl.Coefficient(self.space)
+        self.dx, self.ds = ufl.Measure("dx", cell), ufl.Measure("ds", cell)
+        self.x = ufl.SpatialCoordinate(cell)
+        self.kappa = as_expression(problem.coefficient, self.x)
+        if self.uniform and not float(self.kappa) > 0.0:
+            raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
+        self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
+        # UFL can't differentiate a number
+        level = self.exact is None or number(self.exact) is not None
+        flux = None if level else self.kappa * ufl.grad(self.exact)
+        n = ufl.FacetNormal(cell)
+
+        def given(data: Data | None, derived: Callable[[], Expr]) -> Expr:
+            if data is not None:
+                return as_expression(data, self.x)
+            return ufl.as_ufl(0.0) if flux is None else derived()
+
+        self.f = given(problem.f, lambda: -ufl.div(flux))
+        self.g = given(problem.g, lambda: ufl.dot(flux, n))
+        boundary = self.exact if problem.dirichlet is None else problem.dirichlet
+        self.dirichlet = as_expression(0.0 if boundary is None else boundary, self.x)
+        self.source = "exact.u" if boundary is self.exact is not None else "data.dirichlet"
+        self.obstacle = as_expression(problem.obstacle, self.x)
+        d = mesh.geometry.dim
+        for key, data in self._data.items():
+            if data.ufl_shape != () and (key, data.ufl_shape) != ("coefficient", (d, d)):
+                raise InputError(f"data: {key} has the shape {data.ufl_shape}; a scalar is needed")
+            if any(found != cell for found in ufl.domain.extract_domains(data)):
+                raise InputError(f"data: {key} is given on another mesh than the one to solve on")
+
+    @property
+    def _data(self) -> dict[str, Expr]:
+        """What the user has given, or what was derived from it, by the names of `Problem`."""
+        data = {
+            "coefficient": self.kappa,
+            "f": self.f,
+            "g": self.g,
+            "dirichlet": self.dirichlet,
+            "obstacle": self.obstacle,
+            "exact": self.exact,
+        }
+        return {key: expression for key, expression in data.items() if expression is not None}
+
+    @cached_property
+    def a(self) -> Kernel:
+        """a_h(u, v) = Σ_T ∫_T κ∇u·∇v, (1.9)."""
+        u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        return Kernel(self._stiffness(u, v), self.mesh)
+
+    def insist_on_mesh(self, mesh: Mesh) -> None:
+        """Refuse a mesh on which the data are not to be had.
+
+        Raises:
+            InputError: The data hold a Function on another mesh.
+        """
+        held = (ufl.algorithms.extract_coefficients(each) for each in self._data.values())
+        if mesh is not self.mesh and any(held):
+            raise InputError(
+                "data given as a dolfinx Function live on one mesh only; give a function of x "
+                "to solve on a sequence of meshes"
+            )
+
+    @property
+    def uniform(self) -> bool:
+        """Whether κ is a number."""
+        return number(self.kappa) is not None
+
+    @property
+    def loaded(self) -> bool:
+        """Whether f or g is more than the number 0."""
+        return number(self.f) != 0.0 or number(self.g) != 0.0
+
+    @cached_property
+    def chi(self) -> Kernel | None:
+        """χ(v) = ∫_Ω f v + ∫_Γg g v, (1.10); None where f and g vanish."""
+        v = ufl.TestFunction(self.space)
+        degree = {"quadrature_degree": self.problem.quadrature_degree}
+        terms = [
+            data * v * measure(metadata=degree)
+            for data, measure in ((self.f, self.dx), (self.g, self.ds(NEUMANN)))
+            if number(data) != 0.0
+        ]
+        return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
+
+    @cached_property
+    def a_of_w(self) -> Kernel:
+        """a_h(w, w)."""
+        return Kernel(self._stiffness(self.w, self.w), self.mesh, [self.w])
+
+    def _stiffness(self, u: Expr, v: Expr) -> ufl.Form:
+        """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
+        rule = {} if self.uniform else {"quadrature_degree": self.problem.quadrature_degree}
+        return ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
+
+    @cached_property
+    def _squared_errors(self) -> Kernel:
+        """|∇(u − w)|² and (u − w)², tested by constants on each cell, u the exact solution."""
+        if self.exact is None:
+            raise InputError("errors need an exact solution")
+        v = ufl.TestFunction(ufl.FunctionSpace(self.mesh.ufl_domain(), self._pair))
+        difference = self.exact - self.w
+        slope = ufl.grad(difference)
+        squares = ufl.as_vector([ufl.inner(slope, slope), difference**2])
+        degree = {"quadrature_degree": self.problem.error_degree}
+        return Kernel(ufl.inner(squares, v) * self.dx(metadata=degree), self.mesh, [self.w])
+
+    @property
+    def _pair(self) -> Any:
+        """Two numbers on each cell."""
+        return basix.ufl.element("DG", self.mesh.basix_cell(), 0, shape=(2,))
+
+    def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:
+        """‖u − w‖_h in the broken norm (1.6) and ‖u − w‖ in L2; collective.
+
+        One form has both, as the exact solution and its gradient take most of the time and have
+        much in common.
+
+        Raises:
+            InputError: The exact solution u is not known.
+        """
+        form = self._squared_errors.on(domain, [fem.functionspace(domain.mesh, self._pair)], [w])
+        squares = np.asarray(fem.assemble_vector(form).array).reshape(-1, 2)
+        h1, l2 = np.sqrt(domain.mesh.comm.allreduce(squares.sum(axis=0)))
+        return float(h1), float(l2)
+
+
+def number(expression: Expr) -> float | None:
+    """The number that an expression is, or None."""
+    if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
+        return float(expression)
+    return None

@@ -1,0 +1,181 @@
+"""The discrete spaces: V_h of Crouzeix and Raviart (1.5), and conforming P1 to compare with.
+
+A CR function is affine on each cell and has one degree of freedom per facet: its value at the
+facet's midpoint, which is its mean over the facet.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import basix.ufl
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from ..compat import cell_nodes
+from ..errors import InputError
+
+Int32Array = npt.NDArray[np.int32]
+FloatArray = npt.NDArray[np.float64]
+
+ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
+
+
+def ufl_element(mesh: Mesh, element: str) -> Any:
+    """The Basix element called ``element`` ("CR" or "P1") on the mesh's cell.
+
+    Raises:
+        InputError: There is no element of that name.
+    """
+    if element not in ELEMENTS:
+        raise InputError(f"element {element!r} is unknown; allowed: {', '.join(ELEMENTS)}")
+    return basix.ufl.element(ELEMENTS[element], mesh.basix_cell(), 1)
+
+
+def function_space(mesh: Mesh, element: str = "CR") -> fem.FunctionSpace:
+    """V_h on a mesh; boundary values are not built in."""
+    return fem.functionspace(mesh, ufl_element(mesh, element))
+
+
+def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
+    """The cell and the local facet index of boundary facets.
+
+    Args:
+        mesh: The mesh.
+        facets: Local indices of exterior facets, shape (n,).
+
+    Returns:
+        Pairs (cell, facet's number in the cell), shape (n, 2).
+    """
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    mesh.topology.create_connectivity(tdim, tdim - 1)
+    f2c = mesh.topology.connectivity(tdim - 1, tdim)
+    c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
+    cells = f2c.array[f2c.offsets[facets]]
+    return np.column_stack([cells, np.argmax(c2f[cells] == facets[:, None], axis=1)]).astype(
+        np.int32
+    )
+
+
+def facet_corners(mesh: Mesh) -> npt.NDArray[np.intp]:
+    """The vertices of a cell's facets by local number, shape (d + 1, d)."""
+    return np.array(basix.topology(mesh.basix_cell())[-2])
+
+
+def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
+    """The dofs that fix a function on boundary facets.
+
+    One per facet, its midpoint's, for CR; the d of its vertices for P1, in the order in which
+    `moments.Trace` gives values at vertices.
+
+    Args:
+        V: CR or P1.
+        facets: Local indices of exterior facets, shape (n,).
+
+    Returns:
+        Local dofs, shape (n, 1) or (n, d).
+    """
+    closure = np.array(V.element.basix_element.entity_closure_dofs[-2])
+    cells, local = facet_entities(V.mesh, facets).T
+    return np.take_along_axis(V.dofmap.list[cells], closure[local], axis=1)
+
+
+def facet_to_dof(V: fem.FunctionSpace) -> Int32Array:
+    """The CR dof of every facet, shape (facets,), ghosts included."""
+    tdim = V.mesh.topology.dim
+    c2f = V.mesh.topology.connectivity(tdim, tdim - 1)
+    facets = V.mesh.topology.index_map(tdim - 1)
+    dofs = np.empty(facets.size_local + facets.num_ghosts, dtype=np.int32)
+    dofs[c2f.array.reshape(-1, tdim + 1)] = V.dofmap.list
+    return dofs
+
+
+def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArray]:
+    """Vertex coordinates and measures (lengths, for d = 2) of exterior facets.
+
+    Returns:
+        Coordinates of shape (n, d, 3), vertices in the order of the cell's closure, and measures
+        of shape (n,).
+    """
+    tdim = mesh.topology.dim
+    cells, local = facet_entities(mesh, facets).T
+    corners = facet_corners(mesh)
+    x = mesh.geometry.x[np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)]
+    edges = x[:, 1:] - x[:, :1]
+    gram = np.einsum("nid,njd->nij", edges, edges)
+    return x, np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, tdim))
+
+
+def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> FloatArray:
+    """Values at the vertices of each cell, where a CR function is discontinuous.
+
+    With c_i the value on the facet opposite vertex i, vertex i has Σ_j c_j − d c_i.
+
+    Args:
+        u: CR or P1.
+        cells: Local cells; all, ghosts included, if left out.
+
+    Returns:
+        Shape (cells, d + 1).
+    """
+    values = u.x.array[u.function_space.dofmap.list[cells]]
+    if u.function_space.element.basix_element.family is basix.ElementFamily.CR:
+        return values.sum(axis=1, keepdims=True) - u.function_space.mesh.topology.dim * values
+    return values
+
+
+def ghosted(comm: MPI.Comm, index_map: Any, array: FloatArray | None = None) -> PETSc.Vec:
+    """A PETSc vector with room for ghosts.
+
+    Args:
+        comm: The ranks.
+        index_map: How they share its entries.
+        array: Memory for it, one number for each local entry, ghosts included (no copy).
+    """
+    size = (index_map.size_local, index_map.size_global)
+    ghosts = index_map.ghosts.astype(PETSc.IntType)
+    if array is None:
+        return PETSc.Vec().createGhost(ghosts, size, comm=comm)
+    return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=comm)
+
+
+def ghosted_vector(V: fem.FunctionSpace, array: FloatArray) -> PETSc.Vec:
+    """A PETSc vector with room for the ghosts of V, on an array (no copy)."""
+    return ghosted(V.mesh.comm, V.dofmap.index_map, array)
+
+
+def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray) -> FloatArray:
+    """Sum up, in place, what the ranks have for each shared entity.
+
+    Args:
+        comm: The ranks.
+        index_map: How they share the entities.
+        array: One number for each local entity, ghosts included.
+    """
+    if comm.size > 1:
+        vector = ghosted(comm, index_map, array)
+        vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        vector.destroy()
+    return array
+
+
+def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Points on the reference facet, shape (q, d − 1), and weights that add up to 1."""
+    facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
+    points, weights = basix.make_quadrature(facet, degree)
+    return points, weights / weights.sum()
+
+
+def shared_maximum(V: fem.FunctionSpace, array: FloatArray) -> None:
+    """Give every copy of a shared dof, in place, the largest value any rank has for it."""
+    vector = ghosted_vector(V, array)
+    vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
+    vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+    vector.destroy()

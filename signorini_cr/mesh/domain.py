@@ -1,0 +1,291 @@
+r"""Domains: a mesh and the parts of its boundary.
+
+The boundary of Ω consists of Γ0 (Dirichlet), Γ1 (contact) and, beyond the paper, Γg (Neumann).
+A `Domain` comes from a `Polygon`, from a gmsh file or from a mesh and facet tags of the user's own.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import basix.ufl
+import numpy as np
+import numpy.typing as npt
+from dolfinx.graph import adjacencylist
+from dolfinx.io.utils import distribute_entity_data
+from dolfinx.mesh import (
+    Mesh,
+    MeshTags,
+    create_mesh,
+    exterior_facet_indices,
+    meshtags,
+    meshtags_from_entities,
+)
+from mpi4py import MPI
+
+from ..compat import coordinate_map
+from ..errors import InputError, on_root, raise_together
+from . import gmshmesh
+from .partition import by_position
+from .polygon import check_labels, check_loops, coordinates
+
+CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
+PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """A mesh whose exterior facets are sorted into Γ0, Γ1 and Γg.
+
+    Attributes:
+        mesh: Affine simplices; no ghost cells when we make it.
+        tags: Facet tags; each exterior facet has one value of `PARTS`.
+    """
+
+    mesh: Mesh
+    tags: MeshTags
+
+    def facets(self, part: int) -> npt.NDArray[np.int32]:
+        """Local indices of the facets of one part that this rank owns.
+
+        Args:
+            part: CONTACT, DIRICHLET or NEUMANN.
+        """
+        found = self.tags.find(part)
+        return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
+
+    @classmethod
+    def from_tags(
+        cls,
+        mesh: Mesh,
+        facet_tags: MeshTags,
+        *,
+        contact: int | Sequence[int] = CONTACT,
+        dirichlet: int | Sequence[int] = DIRICHLET,
+        neumann: int | Sequence[int] | None = None,
+    ) -> Domain:
+        """Take a mesh and facet tags of the user's own; collective.
+
+        Exterior facets that are neither contact nor Dirichlet are Neumann facets, the weak
+        form's natural condition. Other values on interior facets are ignored. Each contact
+        and Dirichlet value must be there; and where Neumann values are given, they must be all that
+        is left, but for facets without a tag or with the value 0.
+
+        Args:
+            mesh: Triangles or tetrahedra, straight-sided, any ghost mode.
+            facet_tags: Values on facets.
+            contact: The value or values that stand for Γ1.
+            dirichlet: The value or values that stand for Γ0.
+            neumann: The value or values that stand for Γg; named so that they can be checked.
+
+        Raises:
+            InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
+                another, are not all there, or leave Γ0 or Γ1 empty.
+        """
+        fdim = mesh.topology.dim - 1
+        wanted = {
+            part: np.unique(np.atleast_1d(np.asarray(values, dtype=np.int32)))
+            for part, values in (
+                (CONTACT, contact),
+                (DIRICHLET, dirichlet),
+                (NEUMANN, [] if neumann is None else neumann),
+            )
+        }
+        for a, b in itertools.combinations(wanted, 2):
+            if len(both := np.intersect1d(wanted[a], wanted[b])):
+                raise InputError(
+                    f"the facet value {both[0]} stands for {part_name(a)} and for {part_name(b)}: "
+                    "a value can stand for one part only"
+                )
+        raise_together(mesh.comm, _unfit(mesh, facet_tags))
+        exterior = _exterior(mesh)
+        values = np.full(_count(mesh, fdim), NEUMANN, dtype=np.int32)
+        inside = np.ones(len(values), dtype=bool)
+        inside[exterior] = False
+        complaint = None
+        owned = mesh.topology.index_map(fdim).size_local
+        for part, numbers in wanted.items():
+            chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]
+            chosen = chosen[chosen < owned]
+            values[chosen] = part
+            if np.any(inside[chosen]):
+                complaint = (
+                    f"{np.count_nonzero(inside[chosen])} facets tagged {part_name(part)} lie "
+                    "inside the domain: only exterior facets can be tagged"
+                )
+        raise_together(mesh.comm, complaint)
+        at = exterior[exterior < owned]
+        mine = set(facet_tags.values[np.isin(facet_tags.indices, at)].tolist())
+        there = set().union(*mesh.comm.allgather(mine))
+        known = {0}
+        for part, numbers in wanted.items():
+            known.update(int(value) for value in numbers)
+            missing = [int(value) for value in numbers if value not in there]
+            if part != NEUMANN and (missing or not len(numbers)):
+                raise InputError(
+                    f"no exterior facet is tagged {part_name(part)} (value {_list(missing)}): the"
+                    f" values there are {_list(sorted(there))}"
+                )
+        if neumann is not None and (left := sorted(there - known)):
+            raise InputError(
+                f"exterior facets are tagged {_list(left)}, which stands for nothing: contact is"
+                f" {_list(wanted[CONTACT])}, dirichlet {_list(wanted[DIRICHLET])} and neumann"
+                f" {_list(wanted[NEUMANN])}"
+            )
+        return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
+
+
+def part_name(part: int) -> str:
+    """The key of `PARTS` that a number stands for."""
+    return next(name for name, value in PARTS.items() if value == part)
+
+
+def _list(items: Iterable[object]) -> str:
+    return ", ".join(str(item) for item in items) or "none"
+
+
+def _count(mesh: Mesh, dim: int) -> int:
+    index_map = mesh.topology.index_map(dim)
+    return index_map.size_local + index_map.num_ghosts
+
+
+def _exterior(mesh: Mesh) -> npt.NDArray[np.int32]:
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    mesh.topology.create_connectivity(tdim, tdim - 1)
+    return exterior_facet_indices(mesh.topology)
+
+
+def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
+    """What keeps a user's mesh and tags from being used, if anything."""
+    tdim = mesh.topology.dim
+    kind = mesh.topology.cell_type.name
+    if kind not in ("triangle", "tetrahedron"):
+        return f"the mesh consists of {kind} cells: triangles or tetrahedra are needed"
+    if mesh.geometry.dim != tdim:
+        return f"{kind} cells in {mesh.geometry.dim} dimensions: the mesh has to fill its space"
+    if coordinate_map(mesh).degree != 1:
+        return "the mesh has curved cells: straight-sided ones are needed"
+    if mesh.geometry.x.dtype != np.float64:
+        return f"the mesh has coordinates of type {mesh.geometry.x.dtype}: float64 is needed"
+    if facet_tags.dim != tdim - 1:
+        return f"the tags have dimension {facet_tags.dim}: facets have dimension {tdim - 1}"
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon:
+    """A polygonal domain, holes allowed, with a boundary part for every edge.
+
+    Attributes:
+        vertices: Shape (n, 2), in either orientation.
+        boundary: Part of edge i, which runs from vertex i to vertex i + 1: a key of `PARTS`.
+        holes: Polygons inside this one, apart from each other.
+
+    Raises:
+        InputError: An outline crosses itself or another one, or a label is not known.
+    """
+
+    vertices: npt.NDArray[np.float64]
+    boundary: tuple[str, ...]
+    holes: tuple[Polygon, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Take lists as well as arrays and check everything that can be checked at once."""
+        object.__setattr__(self, "vertices", coordinates(self.vertices))
+        object.__setattr__(self, "boundary", tuple(self.boundary))
+        object.__setattr__(self, "holes", tuple(self.holes))
+        check_labels(self.boundary, len(self.vertices), tuple(PARTS))
+        check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
+        if any(hole.holes for hole in self.holes):
+            raise InputError("a hole has holes of its own: describe what lies in them separately")
+
+    def check_parts(self) -> None:
+        """Insist on a Dirichlet and a contact part (a hole alone needs neither)."""
+        labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
+        for part in ("contact", "dirichlet"):
+            if part not in labels:
+                raise InputError(
+                    f"no edge is labelled {part!r}: the boundary needs a contact part and a "
+                    f"dirichlet part, found {_list(sorted(labels))}"
+                )
+
+    @property
+    def diameter(self) -> float:
+        """Largest distance between two points."""
+        return max(float(np.hypot(*(self.vertices - x).T).max()) for x in self.vertices)
+
+    def mesh(self, size: float, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
+        """Triangulate with facets of about the length `size`; collective.
+
+        Every vertex becomes a mesh vertex; an edge is cut into equal facets no longer than
+        `size`. The same polygon and size give the same mesh.
+
+        Args:
+            size: Facet length wanted; from the diameter upwards, the mesh is as coarse as can be.
+            comm: The ranks that share the mesh.
+
+        Raises:
+            InputError: The size is no positive number, no edge is contact or none is Dirichlet, or
+                gmsh can't make the mesh.
+        """
+        if not (np.isfinite(size) and size > 0):
+            raise InputError(f"size is {size}: a positive number is needed")
+        self.check_parts()
+        loops = [self.vertices, *(hole.vertices for hole in self.holes)]
+        names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
+        labels = np.array([PARTS[name] for name in names], dtype=np.int32)
+        return _distribute(comm, gmshmesh.triangulate, loops, labels, float(size))
+
+
+def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
+    """Read a gmsh file (2.2 or 4.1, ASCII or binary) with named physical curves; collective.
+
+    The physical curves named dirichlet, contact and neumann (in any case) are Γ0, Γ1 and Γg.
+    Exterior facets in no physical curve are Neumann facets, the weak form's natural condition;
+    curves of other names may lie inside the domain.
+
+    Args:
+        path: A planar mesh of straight-sided triangles.
+        comm: The ranks that share the mesh.
+
+    Raises:
+        InputError: The file can't be read, or is no such mesh; the message says where.
+    """
+    return _distribute(comm, gmshmesh.read, Path(path), PARTS)
+
+
+def _distribute(
+    comm: MPI.Comm, make: Callable[..., gmshmesh.Triangulation], *args: object
+) -> Domain:
+    """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
+    raw: gmshmesh.Triangulation | None = None
+
+    def on_rank_0() -> None:
+        nonlocal raw
+        raw = make(*args)  # kept there: what on_root returns goes to every rank
+
+    on_root(comm, on_rank_0)
+    if raw is None:
+        none = np.empty(0, dtype=np.int64)
+        raw = gmshmesh.Triangulation(
+            np.empty((0, 2)), none.reshape(0, 3), none.reshape(0, 2), none.astype(np.int32)
+        )
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
+    mesh = create_mesh(
+        comm,
+        cells=raw.triangles,
+        x=raw.points,
+        e=element,
+        partitioner=by_position(raw.points, raw.triangles),
+    )
+    exterior = _exterior(mesh)
+    ends, labels = distribute_entity_data(mesh, 1, raw.facets, raw.labels)
+    mesh.topology.create_connectivity(1, 0)
+    found = meshtags_from_entities(mesh, 1, adjacencylist(ends), labels)
+    values = np.full(_count(mesh, 1), NEUMANN, dtype=np.int32)
+    values[found.indices] = found.values
+    return Domain(mesh, meshtags(mesh, 1, exterior, values[exterior]))

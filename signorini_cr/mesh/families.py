@@ -1,0 +1,164 @@
+"""Families of meshes on a polygon: structured, mapped, and with vertices moved at random.
+
+Unstructured ones come from gmsh, `Polygon.mesh`. All are made on one rank and then shared out,
+so that they are the same whatever the number of ranks.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..errors import InputError
+from .domain import PARTS, Domain, Polygon, _distribute
+from .gmshmesh import Triangulation
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def structured(
+    polygon: Polygon,
+    n: int,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    *,
+    shift: float = 0.0,
+    jitter: float = 0.0,
+    seed: int = 0,
+) -> Domain:
+    """Squares of side 1/n, each cut in two by its rising diagonal; collective.
+
+    Refining such a mesh gives the one with 2 n. With ``shift`` it is mapped by
+
+        x ↦ x + shift (1 − x²)
+
+    (the middle of the polygon and half its width taken for 0 and 1), so that points which the
+    squares have at a corner come to lie inside a facet. With ``jitter`` every vertex is moved at
+    random by up to so many sides of a square in x and in y; one on the boundary along its edge
+    only, and the polygon's own vertices stay.
+
+    Args:
+        polygon: Its edges must lie on the squares' sides.
+        n: Squares per unit length.
+        comm: The ranks that share the mesh.
+        shift: Less than ½ in absolute value.
+        jitter: Less than ¼.
+        seed: Different seeds give different movements.
+
+    Raises:
+        InputError: The polygon doesn't consist of such squares, or a number is out of range.
+    """
+    if n < 1:
+        raise InputError(f"n is {n}: a mesh has 1 square or more per unit length")
+    if not abs(shift) < 0.5 or not 0.0 <= jitter < 0.25:
+        raise InputError(
+            f"shift is {shift} and jitter {jitter}: less than 0.5 and 0.25 keep triangles upright"
+        )
+    return _distribute(comm, _squares, polygon, n, shift, jitter, seed)
+
+
+def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -> Triangulation:
+    polygon.check_parts()
+    starts, ends, labels = _edges(polygon)
+    low, high = polygon.vertices.min(axis=0), polygon.vertices.max(axis=0)
+    number = np.rint((high - low) * n).astype(np.int64)
+    grid = (starts - low) * n
+    flat = np.isclose(starts, ends, rtol=0, atol=1e-12).any(axis=1)
+    if not (np.allclose(grid, np.rint(grid), atol=1e-9) and flat.all()):
+        raise InputError(
+            f"the polygon's edges don't lie on squares of side 1/{n}: give a polygon of upright "
+            "and level edges, and an n that its vertices fit"
+        )
+    columns, rows = number
+    i, j = (index.ravel() for index in np.meshgrid(np.arange(columns), np.arange(rows)))
+    corner = i + (columns + 1) * j
+    right, up, across = corner + 1, corner + columns + 1, corner + columns + 2
+    triangles = np.stack([corner, right, across, corner, across, up], axis=1).reshape(-1, 3)
+    x, y = np.meshgrid(np.arange(columns + 1), np.arange(rows + 1))
+    points = low + np.stack([x.ravel(), y.ravel()], axis=1) * ((high - low) / number)
+    inside = _contains(starts, ends, points[triangles].mean(axis=1))
+    used, triangles = np.unique(triangles[inside], return_inverse=True)
+    points, triangles = points[used], triangles.reshape(-1, 3)
+    facets = _boundary(triangles)
+    edge = _edge_of(starts, ends, points[facets].mean(axis=1))
+    if jitter:
+        points = points + _moves(
+            points, facets, ends[edge] - starts[edge], polygon, n, jitter, seed
+        )
+    if shift:
+        middle, half = 0.5 * (low[0] + high[0]), 0.5 * (high[0] - low[0])
+        points[:, 0] += shift * half * (1.0 - ((points[:, 0] - middle) / half) ** 2)
+        _require_kept(polygon, middle, half)
+    return Triangulation(points, triangles, facets, labels[edge])
+
+
+def _require_kept(polygon: Polygon, middle: float, half: float) -> None:
+    """A mapped mesh has the polygon's shape if no vertex lies between its left and right end."""
+    loops = [polygon.vertices, *(hole.vertices for hole in polygon.holes)]
+    if not np.allclose(np.abs(np.concatenate(loops)[:, 0] - middle), half):
+        raise InputError("shift would move a vertex of the polygon: give a rectangle")
+
+
+def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int32]]:
+    """Starts and ends of all edges, shapes (n, 2), and the numbers of their parts."""
+    loops = [polygon, *polygon.holes]
+    starts = np.concatenate([loop.vertices for loop in loops])
+    ends = np.concatenate([np.roll(loop.vertices, -1, axis=0) for loop in loops])
+    names = [name for loop in loops for name in loop.boundary]
+    return starts, ends, np.array([PARTS[name] for name in names], dtype=np.int32)
+
+
+def _contains(starts: FloatArray, ends: FloatArray, points: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which points lie inside: a level ray to the right meets the edges oddly often."""
+    spans = (starts[:, 1] > points[:, None, 1]) != (ends[:, 1] > points[:, None, 1])
+    beyond = np.maximum(starts[:, 0], ends[:, 0]) > points[:, None, 0]
+    inside: npt.NDArray[np.bool_] = np.count_nonzero(spans & beyond, axis=1) % 2 == 1
+    return inside
+
+
+def _boundary(triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Ends of the facets of one triangle only, shape (facets, 2)."""
+    facets = np.sort(triangles[:, [[1, 2], [0, 2], [0, 1]]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(facets, axis=0, return_counts=True)
+    single: npt.NDArray[np.int64] = unique[count == 1]
+    return single
+
+
+def _edge_of(starts: FloatArray, ends: FloatArray, points: FloatArray) -> npt.NDArray[np.int64]:
+    """The edge that each point lies on, or is nearest to."""
+    along = ends - starts
+    offset = points[:, None] - starts
+    share = np.clip((offset * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    nearest: npt.NDArray[np.int64] = np.argmin(
+        np.linalg.norm(offset - share[..., None] * along, axis=2), axis=1
+    )
+    return nearest
+
+
+def _moves(
+    points: FloatArray,
+    facets: npt.NDArray[np.int64],
+    along: FloatArray,
+    polygon: Polygon,
+    n: int,
+    jitter: float,
+    seed: int,
+) -> FloatArray:
+    """Random movements of the vertices that keep the polygon's shape.
+
+    Args:
+        points: The vertices, shape (points, 2).
+        facets: Ends of the boundary facets, shape (facets, 2).
+        along: Direction of the edge under each, level or upright, shape (facets, 2).
+        polygon: Whose vertices stay.
+        n: Squares per unit length.
+        jitter: Largest movement, in squares.
+        seed: Of the random numbers.
+    """
+    moves = np.random.default_rng(seed).uniform(-jitter / n, jitter / n, points.shape)
+    for end in facets.T:
+        moves[end] *= along != 0.0
+    loops = [polygon.vertices, *(hole.vertices for hole in polygon.holes)]
+    for corner in np.concatenate(loops):  # few
+        moves[np.linalg.norm(points - corner, axis=1) < 0.5 / n] = 0.0
+    return moves

@@ -1,0 +1,366 @@
+"""Triangulating polygons with gmsh, and taking what gmsh has written, on one rank, into arrays.
+
+gmsh is loaded on first use, so a mesh of the user's own works without it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from . import mshfile
+from .mshfile import KINDS, MshFile
+from .planar import overlap, pieces
+
+_MOST_TRIANGLES = 2e7
+_MOST_FACETS = 1e5  # on the boundary
+_UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
+_LINE, _TRIANGLE = 1, 2  # gmsh's element types
+_GROWTH = 0.3  # of the size, per length, away from short facets
+_OPTIONS = {
+    "General.Terminal": 0,
+    "General.AbortOnError": 2,  # raise instead of going on
+    "General.NumThreads": 1,  # the same mesh every time
+    "Mesh.Algorithm": 6,  # Frontal-Delaunay: the best angles
+    "Mesh.ElementOrder": 1,
+    "Mesh.RandomSeed": 1,
+    "Mesh.MeshSizeFromPoints": 1,
+    "Mesh.MeshSizeFromCurvature": 0,
+    "Mesh.MeshSizeExtendFromBoundary": 1,
+    "Mesh.MeshSizeFactor": 1,
+    "Mesh.MeshSizeMin": 0,
+    "Mesh.MeshSizeMax": 1e22,
+    "Mesh.RecombineAll": 0,
+}
+
+
+class Triangulation(NamedTuple):
+    """A triangle mesh as arrays, all on one rank.
+
+    Attributes:
+        points: Coordinates, shape (points, 2).
+        triangles: Corners, shape (triangles, 3).
+        facets: Ends of the labelled facets, shape (facets, 2).
+        labels: Index of each facet's label, shape (facets,).
+    """
+
+    points: npt.NDArray[np.float64]
+    triangles: npt.NDArray[np.int64]
+    facets: npt.NDArray[np.int64]
+    labels: npt.NDArray[np.int32]
+
+
+def _keep_sigpipe() -> None:
+    """Handle SIGPIPE as Python does again: under some gmsh a closed pipe ends the process."""
+    handler = signal.getsignal(signal.SIGPIPE)
+    if handler is not None:
+        with suppress(ValueError):  # not the main thread, whose business signals are
+            signal.signal(signal.SIGPIPE, handler)
+
+
+@contextmanager
+def _session() -> Iterator[Any]:
+    """A silent gmsh with an empty model; a session of the user's own is left as it was."""
+    try:
+        import gmsh
+    except (ImportError, OSError) as error:  # the wheel wants libraries of the system
+        raise InputError(f"this needs gmsh, which cannot be loaded: {error}") from None
+
+    ours = not gmsh.isInitialized()
+    if ours:
+        gmsh.initialize(argv=[], readConfigFiles=False, interruptible=False)
+        _keep_sigpipe()
+        current = None
+        before = {}
+    else:
+        current = gmsh.model.getCurrent()
+        before = {name: gmsh.option.getNumber(name) for name in _OPTIONS}
+    try:
+        for name, value in _OPTIONS.items():
+            gmsh.option.setNumber(name, value)
+        gmsh.model.add("signorini_cr")
+        yield gmsh
+    finally:
+        if ours:
+            gmsh.finalize()
+        else:
+            gmsh.model.remove()
+            gmsh.model.setCurrent(current)
+            for name, value in before.items():
+                gmsh.option.setNumber(name, value)
+
+
+def triangulate(
+    loops: Sequence[npt.NDArray[np.float64]], labels: npt.NDArray[np.int32], size: float
+) -> Triangulation:
+    """Triangulate a polygon with holes; its vertices become mesh vertices.
+
+    Edges are cut into equal facets. Only an edge beside one with much shorter facets is graded
+    towards it, since the angles would suffer otherwise.
+
+    Args:
+        loops: Vertices of the polygon and of each hole, shapes (n, 2).
+        labels: Label of every edge, one loop after the other.
+        size: Facet length wanted; shorter edges get one facet.
+    """
+    lengths = [np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1) for loop in loops]
+    counts = [np.maximum(1, np.ceil(length / size - 1e-9)) for length in lengths]
+    triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
+    if sum(map(np.sum, counts)) > _MOST_FACETS or triangles > _MOST_TRIANGLES:
+        raise InputError(
+            f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
+        )
+    facets = [length / count for length, count in zip(lengths, counts)]
+    shortest = min(map(np.min, facets))
+    with _session() as gmsh:
+        geo = gmsh.model.geo
+        curves: list[int] = []
+        rings = []
+        for loop, facet, count, near in zip(loops, facets, counts, _sizes(loops, facets)):
+            even = np.minimum(near, np.roll(near, -1)) > _UNEVEN * facet
+            points = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(loop, near)]
+            lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1])]
+            for i in np.flatnonzero(even):
+                geo.mesh.setTransfiniteCurve(lines[i], int(count[i]) + 1)
+            rings.append(geo.addCurveLoop(lines))
+            curves += lines
+        surface = geo.addPlaneSurface(rings)
+        geo.synchronize()
+        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+        if shortest < _UNEVEN * size:
+            _widen_inwards(gmsh, curves, surface, size)
+        try:
+            gmsh.model.mesh.generate(2)
+        except Exception as error:
+            raise InputError(f"gmsh could not triangulate the polygon: {error}") from error
+        found = [_elements(gmsh, 1, _LINE, curve) for curve in curves]
+        tags, points, _ = gmsh.model.mesh.getNodes()
+        return _compact(
+            tags,
+            points,
+            _elements(gmsh, 2, _TRIANGLE),
+            np.concatenate(found),
+            np.repeat(labels, [len(ends) for ends in found]),
+        )
+
+
+def _sizes(
+    loops: Sequence[npt.NDArray[np.float64]], facets: Sequence[npt.NDArray[np.float64]]
+) -> list[npt.NDArray[np.float64]]:
+    """Facet length at every vertex: the shorter of its edges', growing slowly.
+
+    Args:
+        loops: Vertices of the polygon and of each hole, shapes (n, 2).
+        facets: Facet length of every edge, shapes (n,).
+    """
+    near = [np.minimum(facet, np.roll(facet, 1)) for facet in facets]
+    x, h = np.concatenate(loops), np.concatenate(near)
+    slow = np.array([np.min(h + _GROWTH * np.hypot(*(x - p).T)) for p in x])
+    return np.split(slow, np.cumsum([len(loop) for loop in loops])[:-1])
+
+
+def read(path: Path, parts: dict[str, int]) -> Triangulation:
+    """Read a planar triangle mesh with named physical curves.
+
+    Args:
+        path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
+        parts: Label of each name; case does not matter.
+    """
+    file = mshfile.load(path)
+    _check_cells(file, path)
+    names = [(tag, file.names.get((1, tag), "")) for tag in file.groups(1)]
+    found: dict[str, list[npt.NDArray[np.int64]]] = {name: [] for name in parts}
+    others: dict[str, list[npt.NDArray[np.int64]]] = {}
+    for tag, name in names:
+        key = name.strip().lower()
+        group = found[key] if key in parts else others.setdefault(name or f"{tag}", [])
+        group.append(file.elements(_LINE, tag))
+    for needed in ("contact", "dirichlet"):
+        if not sum(map(len, found[needed])):
+            there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
+            raise InputError(
+                f"{path}: no physical curve is named {needed!r}; the physical curves there "
+                f"are: {there}"
+            )
+    facets = np.concatenate([part for key in parts for part in found[key]])
+    labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])
+    triangles = file.elements(_TRIANGLE)
+    raw = _compact(file.tags, file.points, triangles, facets, labels)
+    _check_names(triangles, facets, others, path, tuple(parts))
+    _check_facets(raw, path, {label: name for name, label in parts.items()})
+    return raw
+
+
+def _check_names(
+    triangles: npt.NDArray[np.int64],
+    labelled: npt.NDArray[np.int64],
+    others: dict[str, list[npt.NDArray[np.int64]]],
+    path: Path,
+    allowed: Sequence[str],
+) -> None:
+    """Refuse physical curves of other names where they would become Neumann facets unasked.
+
+    They may lie inside the domain, and on facets that one of the allowed names has, too.
+
+    Args:
+        triangles: Node tags, shape (triangles, 3).
+        labelled: Node tags of the facets of allowed names, shape (facets, 2).
+        others: Node tags of the facets of each other name.
+        path: For the message.
+        allowed: The names.
+    """
+    curves = {name: np.concatenate(group) for name, group in others.items() if group}
+    if not curves:
+        return
+
+    def keys(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return ends.min(axis=-1) * (int(triangles.max()) + 1) + ends.max(axis=-1)
+
+    sides, cells = np.unique(keys(triangles[:, [[1, 2], [0, 2], [0, 1]]]), return_counts=True)
+    loose = np.setdiff1d(sides[cells == 1], keys(labelled))
+    for name, ends in curves.items():
+        number = np.count_nonzero(np.isin(keys(ends), loose))
+        if number:
+            near = [part for part in allowed if part in name.lower()]
+            near += difflib.get_close_matches(name.strip().lower(), allowed, n=1)
+            what = (
+                f"the physical curve {name!r}"
+                if not name.isdigit()
+                else (f"the physical curve with the number {name} and no name")
+            )
+            hint = f"did you mean {near[0]}? Allowed there" if near else "allowed there"
+            raise InputError(
+                f"{path}: {what} has {number} facets on the boundary; {hint} are"
+                f" {', '.join(allowed)}; a curve without a physical group is neumann"
+            )
+
+
+def _check_cells(file: MshFile, path: Path) -> None:
+    """Insist on triangles in the x-y plane, with straight sides, and nothing else."""
+    kinds = sorted({block.kind for block in file.blocks if len(block.nodes)})
+    properties = [(kind, *KINDS[kind][:2]) for kind in kinds]
+    wrong = [name for _, name, dim in properties if dim == 3]
+    if wrong:
+        raise InputError(f"{path}: a mesh in three dimensions ({wrong[0]}): a planar one is needed")
+    plane = [(kind, name) for kind, name, dim in properties if dim == 2]
+    if not plane:
+        raise InputError(
+            f"{path}: no triangles: gmsh saves what has a physical group, so that the surface "
+            "needs one as soon as the curves have one"
+        )
+    lines = [(kind, name) for kind, name, dim in properties if dim == 1]
+    for kind, name in plane + lines:
+        if kind not in (_TRIANGLE, _LINE):
+            raise InputError(
+                f"{path}: it contains cells of the kind {name!r}: only straight-sided triangles "
+                "are possible"
+            )
+    used = np.concatenate([block.nodes.ravel() for block in file.blocks])
+    if np.ptp(file.points[np.searchsorted(file.tags, used), 2]) > 0:
+        raise InputError(f"{path}: the mesh does not lie in the x-y plane: z takes several values")
+
+
+def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None:
+    """Insist on labels of exterior facets, one each, and on something that holds every piece."""
+    count = len(raw.points)
+    u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
+    area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    flat = np.flatnonzero(~(area > 1e-14 * ((u**2).sum(axis=1) + (v**2).sum(axis=1))))
+    if len(flat):
+        x, y = raw.points[raw.triangles[flat[0], 0]]
+        raise InputError(f"{path}: the triangle at ({x:g}, {y:g}) has no area")
+
+    def key(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return ends.min(axis=-1) * count + ends.max(axis=-1)
+
+    def facet(number: int) -> str:
+        a, b = raw.points[raw.facets[number]]
+        return f"the facet from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g})"
+
+    sides = key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]])
+    edges, where, cells = np.unique(sides, return_inverse=True, return_counts=True)
+    where = where.reshape(sides.shape)
+    labelled = key(raw.facets)
+    position = np.minimum(np.searchsorted(edges, labelled), len(edges) - 1)
+    strange = np.flatnonzero(edges[position] != labelled)
+    inside = np.flatnonzero(cells[position] > 1)
+    for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
+        if len(bad):
+            name = names[int(raw.labels[bad[0]])]
+            raise InputError(f"{path}: {facet(bad[0])} is labelled {name} but {fault}")
+    order = np.lexsort((raw.labels, labelled))
+    one, two = order[:-1], order[1:]
+    twice = np.flatnonzero((labelled[one] == labelled[two]) & (raw.labels[one] != raw.labels[two]))
+    if len(twice):
+        i, j = one[twice[0]], two[twice[0]]
+        raise InputError(
+            f"{path}: {facet(i)} belongs to {names[int(raw.labels[i])]} and to "
+            f"{names[int(raw.labels[j])]}: only one is possible"
+        )
+    if cells.max() > 2:
+        raise InputError(f"{path}: {cells.max()} triangles meet in one facet: at most 2 can")
+    piece = pieces(where, len(edges))
+    if (found := overlap(raw.points, raw.triangles, where, cells, piece)) is not None:
+        raise InputError(f"{path}: {found}")
+    holding = [number for number, name in names.items() if name in ("dirichlet", "contact")]
+    fixed = np.zeros(len(edges), dtype=bool)
+    fixed[position[np.isin(raw.labels, holding)]] = True
+    held = np.zeros(len(raw.triangles), dtype=bool)
+    held[piece[fixed[where].any(axis=1)]] = True
+    loose = np.flatnonzero(~held[piece])
+    if len(loose):
+        x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
+        raise InputError(
+            f"{path}: the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
+            "Dirichlet facet and no contact facet"
+        )
+
+
+def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> npt.NDArray[np.int64]:
+    """Node tags of the elements of one type, shape (elements, dim + 1)."""
+    tags = gmsh.model.mesh.getElementsByType(kind, entity)[1]
+    return tags.astype(np.int64).reshape(-1, dim + 1)
+
+
+def _compact(
+    tags: npt.NDArray[np.int64],
+    points: npt.NDArray[np.float64],
+    triangles: npt.NDArray[np.int64],
+    facets: npt.NDArray[np.int64],
+    labels: npt.NDArray[np.int32],
+) -> Triangulation:
+    """Renumber gmsh's node tags from 0, leaving out the nodes of no triangle and of no facet."""
+    used = np.unique(np.concatenate([triangles.ravel(), facets.ravel()]))
+    order = np.argsort(tags)
+    rows = order[np.searchsorted(tags, used, sorter=order)]
+    return Triangulation(
+        points.reshape(-1, 3)[rows, :2].copy(),
+        np.searchsorted(used, triangles),
+        np.searchsorted(used, facets),
+        labels.astype(np.int32),
+    )
+
+
+def _widen_inwards(gmsh: Any, curves: list[int], surface: int, size: float) -> None:
+    """Let triangles grow from short facets on the boundary to `size` inside."""
+    field = gmsh.model.mesh.field.add("Extend")
+    gmsh.model.mesh.field.setNumbers(field, "CurvesList", curves)
+    gmsh.model.mesh.field.setNumbers(field, "SurfacesList", [surface])
+    gmsh.model.mesh.field.setNumber(field, "SizeMax", size)
+    gmsh.model.mesh.field.setNumber(field, "DistMax", size / _GROWTH)
+    gmsh.model.mesh.field.setAsBackgroundMesh(field)
+    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+    gmsh.option.setNumber("Mesh.Algorithm", 5)  # Delaunay: Frontal-Delaunay can give up early here
+
+
+def _area(loop: npt.NDArray[np.float64]) -> float:
+    x, y = (loop - loop[0]).T
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2

@@ -1,0 +1,4 @@
+"""A V-cycle in the active set.
+
+Nesting of meshes, transfers, constrained matrices, smoothing.
+"""

@@ -1,0 +1,175 @@
+"""Fine cells in their parents: the parents' shape functions at the fine dofs.
+
+All that is known of two nested meshes is the coarse cell that each fine cell lies in. On regular
+refinements the same pattern repeats in every parent, and one copy of it does for all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import basix
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from petsc4py import PETSc
+
+from .. import compat
+from ..fem.space import facet_corners, facet_entities, function_space, shared_sum
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+_DIRECTION = np.sqrt([2.0, 3.0, 5.0])
+"""No edge or median of a cell is at right angles to it, unless on purpose."""
+
+ROUNDING = 1e-6
+"""Barycentric coordinates below this are 0: far from the origin few digits of a cell are left."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where the dofs of CR or P1 are.
+
+    Attributes:
+        mesh: The mesh.
+        cells: Local dofs of the local cells, shape (cells, d + 1); dof i of a cell belongs to its
+            vertex i (P1) or to the facet opposite (CR).
+        index_map: Their distribution over the ranks.
+        cr: Whether it is CR.
+    """
+
+    mesh: Mesh
+    cells: IntArray
+    index_map: Any
+    cr: bool
+
+    @classmethod
+    def of_space(cls, V: fem.FunctionSpace) -> Layout:
+        """The dofs of a CR or P1 space."""
+        cr = V.element.basix_element.family is basix.ElementFamily.CR
+        return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr)
+
+    @classmethod
+    def of_p1(cls, mesh: Mesh) -> Layout:
+        """P1 without new numbers: the nodes of a straight-sided mesh are its vertices."""
+        if compat.coordinate_map(mesh).degree == 1:
+            return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False)
+        return cls.of_space(function_space(mesh, "P1"))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of owned dofs, and of all on all ranks, as PETSc takes them."""
+        return self.index_map.size_local, self.index_map.size_global
+
+    def numbers(self, dofs: IntArray) -> IntArray:
+        """Global numbers of local dofs."""
+        if self.mesh.comm.size == 1:
+            return dofs
+        numbers = self.index_map.local_to_global(dofs.ravel())
+        return numbers.astype(PETSc.IntType).reshape(dofs.shape)
+
+    def ends(self, facets: IntArray) -> IntArray:
+        """The dofs of P1 at the vertices of exterior facets, shape (n, d)."""
+        cells, local = facet_entities(self.mesh, facets).T
+        ends: IntArray = self.cells[cells[:, None], facet_corners(self.mesh)[local]]
+        return ends
+
+    def owned_ends(self, facets: IntArray) -> IntArray:
+        """The owned dofs of P1 at the vertices of any rank's exterior facets, ascending."""
+        return self.owned_among(self.ends(facets))
+
+    def owned_among(self, dofs: IntArray) -> IntArray:
+        """The owned dofs among those that any rank names, local numbers, ascending."""
+        named = np.zeros(self.size[0] + self.index_map.num_ghosts)
+        named[dofs] = 1.0
+        # numpy is ten times as fast over truth values as over numbers
+        return np.flatnonzero(self.shared_sum(named)[: self.size[0]] > 0.0).astype(np.int32)
+
+    def shared_sum(self, array: FloatArray) -> FloatArray:
+        """Sum up, in place, what the ranks have for each shared dof."""
+        return shared_sum(self.mesh.comm, self.index_map, array)
+
+
+class Parents:
+    """Which coarse cell each fine cell lies in, and where.
+
+    Attributes:
+        cell: For each local fine cell the local coarse cell that holds it.
+    """
+
+    def __init__(self, coarse: Mesh, fine: Mesh, cell: IntArray):
+        """Relate two nested meshes."""
+        self.cell = cell
+        self._coarse, self._fine = coarse, fine
+
+    @cached_property
+    def regular(self) -> bool:
+        """Whether every coarse cell has its 2^d children in a row, on this rank."""
+        topology = self._coarse.topology
+        cells = topology.index_map(topology.dim).size_local
+        children = 2**topology.dim
+        return len(self.cell) == children * cells and np.array_equal(
+            self.cell, np.arange(len(self.cell)) // children
+        )
+
+    @cached_property
+    def barycentric(self) -> FloatArray:
+        """The parent's barycentric coordinates of the vertices of each fine cell.
+
+        Shape (cells, d + 1, d + 1): vertex, coordinate. Shorter where the pattern repeats: with m
+        rows, those of fine cell c are in row c % m.
+        """
+        coarse, fine, d = self._coarse, self._fine, self._fine.topology.dim
+        children = 2**d
+        x, x_coarse = (mesh.geometry.x[:, : mesh.geometry.dim] for mesh in (fine, coarse))
+        nodes = compat.cell_nodes(fine)[: len(self.cell)]
+        parents = compat.cell_nodes(coarse)
+        if len(self.cell) > 0 and self.regular:
+            # Does the pattern of the first cell repeat? One coordinate of each vertex tells, in a
+            # direction where no two points of a cell are at the same place
+            first = x_coarse[parents[:1].repeat(children, axis=0)]
+            pattern = barycentric_coordinates(first, x[nodes[:children]])
+            theirs, own = (points @ _DIRECTION[: points.shape[1]] for points in (x_coarse, x))
+            inner = theirs[parents[: len(nodes) // children]]
+            deviation = max(
+                np.abs(inner @ pattern[:, k].T - own[nodes[:, k].reshape(-1, children)]).max()
+                for k in range(d + 1)
+            )
+            if deviation <= 1e-10 * np.abs(x_coarse).max():
+                return pattern
+        return barycentric_coordinates(x_coarse[parents[self.cell]], x[nodes])
+
+    def weights(self, coarse: Layout, fine: Layout) -> FloatArray:
+        """The parent's shape functions at the dofs of each fine cell.
+
+        Returns:
+            Shape (cells, d + 1, d + 1): dof of the fine cell, dof of its parent; as many rows as
+            `barycentric`.
+        """
+        at = self.barycentric
+        d = at.shape[-1] - 1
+        if fine.cr:  # facet midpoints
+            at = (at.sum(axis=1, keepdims=True) - at) / d
+        weights = 1.0 - d * at if coarse.cr else at.copy()
+        weights[np.abs(weights) < ROUNDING] = 0.0
+        return weights
+
+
+def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:
+    """Barycentric coordinates of points in simplices.
+
+    Args:
+        simplices: Vertices, shape (n, d + 1, 3).
+        points: Shape (n, m, 3).
+
+    Returns:
+        Shape (n, m, d + 1).
+    """
+    edges = simplices[:, 1:] - simplices[:, :1]
+    inverse = np.linalg.pinv(edges)
+    rest = np.einsum("nmx,nxd->nmd", points - simplices[:, :1], inverse)
+    return np.concatenate([1.0 - rest.sum(axis=2, keepdims=True), rest], axis=2)

@@ -1,0 +1,221 @@
+"""From coarse to fine: prolongation between nested meshes, and P1 as a subspace of CR.
+
+On nested meshes every fine cell lies in one coarse cell, its parent, and nothing else has to be
+known: the value at a fine dof is the average, over the fine cells that touch it, of the parents'
+affine functions there. That holds for any pattern of refinement and any dimension; for P1, which is
+continuous, the average is that of equal numbers. Parents live on their children's rank, so each
+rank adds its own cells' share.
+
+P1 is contained in CR: a conforming function's mean over a facet is the mean of its d vertex values.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from ..fem.space import ghosted
+from ..garbage import release
+from .masking import rows_of
+from .parents import FloatArray, IntArray, Layout, Parents
+
+
+class Transfer:
+    """What writes functions of a P1 space in a finer space.
+
+    A rank has the rows of its own fine dofs. Their columns are local coarse dofs, ghosts included,
+    so that none has to be given another number, and no matrix of several ranks is put together.
+    """
+
+    def __init__(
+        self,
+        coarse: Layout,
+        fine: Layout,
+        lengths: IntArray | int,
+        dofs: IntArray,
+        values: FloatArray,
+    ):
+        """Take the entries as they are, one row after the other.
+
+        Args:
+            coarse: The coarse dofs.
+            fine: The fine dofs.
+            lengths: Number of entries of each owned fine dof's row.
+            dofs: The entries' local coarse dofs, in each row in any order.
+            values: The entries.
+        """
+        self._coarse, self._fine = coarse, fine
+        rows = fine.size[0]
+        if isinstance(lengths, int):
+            start = np.arange(0, (rows + 1) * lengths, lengths, dtype=PETSc.IntType)
+        else:
+            start = np.zeros(rows + 1, dtype=PETSc.IntType)
+            np.cumsum(lengths, out=start[1:])
+        self._csr = start, dofs.ravel().astype(PETSc.IntType, copy=False), values
+        sizes = rows, coarse.size[0] + coarse.index_map.num_ghosts
+        self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
+        self._own = self._rows.createVecLeft()
+        self._marks = ghosted(coarse.mesh.comm, coarse.index_map)
+
+    def coarse_vector(self) -> PETSc.Vec:
+        """A vector for coarse functions, with room for ghosts."""
+        return self._marks.duplicate()
+
+    def add(self, x_coarse: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Add a coarse function to x."""
+        x_coarse.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        x.getLocalVector(self._own)
+        with x_coarse.localForm() as local:
+            self._rows.multAdd(local, self._own, self._own)
+        x.restoreLocalVector(self._own)
+
+    def restrict(self, b: PETSc.Vec, b_coarse: PETSc.Vec) -> None:
+        """Multiply b by the transposed matrix."""
+        b.getLocalVector(self._own, readonly=True)
+        with b_coarse.localForm() as local:
+            self._rows.multTranspose(self._own, local)
+        b.restoreLocalVector(self._own, readonly=True)
+        b_coarse.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+
+    def touched(self, dofs: IntArray) -> IntArray:
+        """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
+        _, columns, values = rows_of(self._rows, dofs)
+        with self._marks.localForm() as local:
+            local.set(0.0)
+            local.array[columns[values != 0.0]] = 1.0
+        self._marks.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+        # numpy is ten times as fast over truth values as over numbers
+        return np.flatnonzero(self._marks.array_r > 0.0).astype(np.int32)
+
+    def matrix(self) -> PETSc.Mat:
+        """As a matrix of all ranks, for products."""
+        start, dofs, values = self._csr
+        numbers = self._coarse.numbers(dofs.astype(np.int32, copy=False))
+        csr = start, numbers.astype(PETSc.IntType, copy=False), values
+        sizes = self._fine.size, self._coarse.size
+        return PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._fine.mesh.comm)
+
+    def free(self) -> None:
+        """Free the rows."""
+        release(self._rows, self._own, self._marks)
+
+
+def inclusion(p1: Layout, cr: Layout) -> Transfer:
+    """P1 in CR on the same mesh: d entries 1/d in each row."""
+    d = cr.cells.shape[1] - 1
+    owned = cr.size[0]
+    columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
+    for i in range(d + 1):
+        others = [j for j in range(d + 1) if j != i]
+        for k, j in enumerate(others):
+            columns[cr.cells[:, i], k] = p1.cells[:, j]
+    return Transfer(p1, cr, d, columns[:owned], np.full(owned * d, 1.0 / d))
+
+
+def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
+    """P1 on a coarse mesh in P1 or CR on a nested one: any fine cell of a dof tells all.
+
+    Args:
+        coarse: The coarse dofs.
+        fine: The fine dofs.
+        parents: The coarse cells that hold the fine ones.
+    """
+    weights, parent_cell = parents.weights(coarse, fine), parents.cell
+    corners = fine.cells.shape[1]
+    slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
+    slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
+    slot = slot[: fine.size[0]]
+    if len(weights) < len(parent_cell):  # the same in each parent, whose children are in a row
+        parent = slot // (len(weights) * corners)
+        slot = slot - parent * (len(weights) * corners)
+    else:
+        parent = parent_cell.take(slot // corners)
+    values = weights.reshape(-1, corners).take(slot, axis=0)
+    dofs = coarse.cells.take(parent, axis=0)
+    if fine.cr:  # few zeros: leave them
+        return Transfer(coarse, fine, corners, dofs, values.ravel())
+    kept = values != 0.0
+    return Transfer(coarse, fine, kept.sum(axis=1, dtype=np.int32), dofs[kept], values[kept])
+
+
+def averaging(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
+    """The matrix of the prolongation from CR to CR, which `prolongate` applies without it.
+
+    Args:
+        coarse: The coarse dofs.
+        fine: The fine dofs.
+        parents: The coarse cells that hold the fine ones.
+    """
+    weights, parent_cell = parents.weights(coarse, fine), parents.cell
+    repeats = len(parent_cell) // max(len(weights), 1)
+    touching = _sums(fine, np.ones(fine.cells.size))
+    values = np.tile(weights, (repeats, 1, 1)) / touching[fine.cells][:, :, None]
+    kept = values != 0.0
+    columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)
+    start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
+    np.cumsum(kept.sum(axis=2), out=start[1:])
+    # no facet touches more than two cells
+    most = 2 * fine.cells.shape[1]
+    matrix = PETSc.Mat().createAIJ((fine.size, coarse.size), nnz=(most, most), comm=fine.mesh.comm)
+    rows = fine.numbers(fine.cells).ravel().astype(PETSc.IntType, copy=False)
+    columns = columns[kept].astype(PETSc.IntType, copy=False)
+    matrix.setValuesIJV(start, columns, values[kept], PETSc.InsertMode.ADD_VALUES, rows)
+    matrix.assemble()
+    return matrix
+
+
+def prolongate(
+    u: fem.Function,
+    V: fem.FunctionSpace,
+    parents: Parents,
+    below: tuple[fem.Function, Parents] | None = None,
+) -> FloatArray:
+    """Apply the prolongation once, without its matrix, and extrapolate if there is what it takes.
+
+    What u has beyond the prolongation of its predecessor is, where the solution is smooth, h²
+    times a function of the place and of the kind of facet: which child, which of its facets. The
+    next mesh adds a quarter of that, to each family of children what its parent's family got.
+
+    Args:
+        u: A CR or P1 function on the coarse mesh, ghosts up to date.
+        V: The same kind of space on the fine mesh.
+        parents: The coarse cells that hold the fine ones.
+        below: u's predecessor on the mesh below, and the cells there that hold the coarse ones.
+            Not used where either of the meshes is not a regular refinement.
+
+    Returns:
+        Values of all local dofs, ghosts included.
+    """
+    coarse, fine = Layout.of_space(u.function_space), Layout.of_space(V)
+    weights, parent_cell = parents.weights(coarse, fine), parents.cell
+    corners = fine.cells.shape[1]
+    local = u.x.array[coarse.cells]
+    if len(weights) == len(parent_cell):
+        values = np.einsum("cij,cj->ci", weights, local[parent_cell])
+    else:  # the same pattern in each parent
+        values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+    if below is not None:
+        repeats = len(weights) < len(parent_cell) and below[1].regular
+        # A rank without cells has no say, but a part in what follows
+        if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
+            gain = 0.25 * (u.x.array - prolongate(below[0], u.function_space, below[1]))
+            if repeats:
+                of_families = gain[coarse.cells].reshape(-1, 1, values.shape[1])
+                values.reshape(len(of_families), len(weights), -1)[:] += of_families
+    values = values.ravel()
+    total = _sums(fine, values)
+    values[:] = 1.0
+    return total / _sums(fine, values)
+
+
+def _sums(layout: Layout, values: FloatArray) -> FloatArray:
+    """Sum of what all ranks' cells have for each local dof; PETSc's loop needs no copies."""
+    result = np.zeros(layout.index_map.size_local + layout.index_map.num_ghosts)
+    vector = PETSc.Vec().createWithArray(result, comm=PETSc.COMM_SELF)
+    dofs = layout.cells.ravel().astype(PETSc.IntType, copy=False)
+    vector.setValues(dofs, values, PETSc.InsertMode.ADD_VALUES)
+    vector.assemble()
+    vector.destroy()
+    return layout.shared_sum(result)

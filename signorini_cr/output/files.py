@@ -1,0 +1,169 @@
+"""Files that appear whole or not at all, written by all ranks together."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from mpi4py import MPI
+
+from ..errors import InputError, on_root
+
+Writer = Callable[[Path], object]
+"""Writes one file; called on every rank, and raises on every rank if at all."""
+
+STAGE = ".signorini-cr-"
+"""What the names of hidden folders begin with in which files are written at first."""
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn the system's refusal to write `path` into the InputError a user understands."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write {path.name}: {error.strerror or error}") from error
+
+
+def check_writable(
+    folder: str | os.PathLike[str], names: Iterable[str] = (), comm: MPI.Comm = MPI.COMM_WORLD
+) -> None:
+    """Raise InputError on all ranks if files could not be put into a folder; leave no trace.
+
+    Args:
+        folder: Need not be there.
+        names: The files to come; none of them may be a folder.
+        comm: The ranks that take part; all must call.
+    """
+
+    def look() -> None:
+        path = Path(folder)
+        anchor = _nearest(path)
+        if not anchor.is_dir():
+            raise InputError(f"cannot write to {path}: {anchor} is not a folder")
+        try:
+            path.lstat()
+        except FileNotFoundError:
+            pass
+        except OSError as error:  # a name that is too long, for one
+            raise InputError(f"cannot write to {path}: {error.strerror}") from error
+        try:  # permissions don't tell all, of /proc for one
+            _clear(anchor)
+            _leave(*_enter(anchor))
+        except OSError as error:
+            raise InputError(
+                f"cannot write to {path}: {anchor} is not writable ({error.strerror})"
+            ) from error
+        for name in names:
+            if (path / name).is_dir():
+                raise InputError(f"cannot write {path / name}: a folder of that name is there")
+
+    on_root(comm, look)
+
+
+def write_files(
+    folder: str | os.PathLike[str],
+    writers: Mapping[str, Writer],
+    removed: Iterable[str] = (),
+    comm: MPI.Comm = MPI.COMM_WORLD,
+) -> None:
+    """Put files into a folder: all of them or, if a writer raises, none.
+
+    They are written into a hidden folder on the same file system and renamed into place. Where the
+    process is killed before it has taken that folder away, the next `check_writable` does.
+
+    Args:
+        folder: Made if it is not there. Other files in it are left alone.
+        writers: What writes the file of each name to the path that it is given. The first file
+            vouches for the others: it goes before any of `removed` and comes last, so that
+            wherever it is found, there is nothing of a former run beside it.
+        removed: Names that shall not be there afterwards unless they are among `writers`.
+        comm: The ranks that take part; all must call.
+
+    Raises:
+        InputError: The system refuses to write.
+    """
+    path = Path(folder)
+
+    held: list[int] = []
+
+    def prepare() -> str:
+        with disk_errors(path):
+            stage, lock = _enter(_nearest(path))
+        held.append(lock)
+        return str(stage)
+
+    def publish() -> None:
+        first, *others = writers
+        obsolete = [path / name for name in set(removed) - set(writers)]
+        with disk_errors(path):
+            path.mkdir(parents=True, exist_ok=True)
+            if any(map(os.path.lexists, obsolete)):
+                (path / first).unlink(missing_ok=True)
+                for each in obsolete:
+                    each.unlink(missing_ok=True)
+            for name in (*others, first):
+                os.replace(stage / name, path / name)
+
+    stage = Path(on_root(comm, prepare))
+    try:
+        for name, write in writers.items():
+            write(stage / name)
+        on_root(comm, publish)
+    finally:
+        if comm.rank == 0:
+            _leave(stage, *held)
+
+
+def _enter(folder: Path) -> tuple[Path, int]:
+    """Make a hidden folder, and the lock that says that its process is alive."""
+    while True:
+        stage = Path(tempfile.mkdtemp(prefix=STAGE, dir=folder))
+        lock = os.open(stage, os.O_RDONLY)
+        _locks(lock)
+        if stage.exists():  # another run can take it away before it is locked
+            return stage, lock
+        os.close(lock)
+
+
+def _leave(stage: Path, lock: int) -> None:
+    shutil.rmtree(stage, ignore_errors=True)
+    os.close(lock)
+
+
+def _locks(lock: int) -> bool:
+    """Lock a folder unless another process holds it or the file system knows no locks."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _clear(folder: Path) -> None:
+    """Remove the hidden folders that processes which were killed have left behind."""
+    for stage in folder.glob(STAGE + "*"):
+        try:
+            lock = os.open(stage, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:  # not ours, or gone meanwhile
+            continue
+        if _locks(lock):
+            shutil.rmtree(stage, ignore_errors=True)
+        os.close(lock)
+
+
+def write_text(path: Path, make: Callable[[], str]) -> None:
+    """Write what `make` returns; called on one rank."""
+    with disk_errors(path):
+        path.write_text(make(), encoding="utf-8")
+
+
+def _nearest(path: Path) -> Path:
+    """The path itself if it is there, or else the nearest of the folders it would be made in."""
+    # a link that leads nowhere is there, too
+    return next(place for place in (path, *path.absolute().parents) if os.path.lexists(place))

@@ -1,0 +1,264 @@
+"""Pictures: the mesh and its boundary parts, u_h, what happens on Γ1, convergence.
+
+Matplotlib is loaded when a picture is drawn, on rank 0 alone, and used through its objects:
+nothing global is touched. Functions that take a domain or a solution are collective.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx.mesh import Mesh, entities_to_geometry
+from mpi4py import MPI
+
+from ..errors import InputError, on_root
+from ..fem.space import facet_measures
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from .canvas import (
+    BLUE,
+    GREY,
+    RED,
+    YELLOW,
+    draw_lines,
+    grouped,
+    headline,
+    legend,
+    new_figure,
+    plane_axes,
+    save,
+)
+from .contactpage import contact_page
+from .raster import raster
+
+if TYPE_CHECKING:
+    from ..solution import Solution
+
+FloatArray = npt.NDArray[np.float64]
+Where = str | os.PathLike[str]
+
+STYLES: dict[int, dict[str, Any]] = {
+    DIRICHLET: {"color": BLUE, "linewidth": 2.5, "label": r"$\Gamma_0$: Dirichlet"},
+    NEUMANN: {"color": YELLOW, "linewidth": 3.5, "label": r"$\Gamma_g$: Neumann"},
+    CONTACT: {"color": RED, "linewidth": 4.5, "label": r"$\Gamma_1$: contact"},
+}
+SERIES = {
+    "error_h1": {"color": BLUE, "marker": "o", "label": r"$\|\nabla_h(u-u_h)\|$"},
+    "bound_h1": {
+        "color": YELLOW,
+        "marker": "D",
+        "linestyle": "--",
+        "label": r"certified bound of $\|\nabla_h(u-u_h)\|$",
+    },
+    "error_l2": {"color": RED, "marker": "s", "label": r"$\|u-u_h\|$"},
+}
+MOST_EDGES = 40_000
+"""A mesh with more edges is drawn without those inside."""
+
+
+def can_draw(comm: MPI.Comm) -> bool:
+    """Whether rank 0 has Matplotlib; collective."""
+    return on_root(comm, lambda: find_spec("matplotlib") is not None)
+
+
+def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
+    """Draw the mesh with Γ0, Γ1 and Γg.
+
+    Args:
+        domain: A plane domain.
+        path: The PNG to write.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: The domain is not plane, or the file can't be written.
+    """
+    mesh = _plane(domain)
+    cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
+    parts = {part: _segments(domain, part) for part in STYLES}
+
+    def draw() -> None:
+        figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2))
+        draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
+        for part, style in STYLES.items():
+            if len(parts[part]):
+                draw_lines(axes, parts[part], zorder=3, capstyle="round", **style)
+        legend(figure, ncols=3)
+        hidden = "" if len(edges) else ", inner edges not drawn"
+        axes.set_title(headline(title, f"mesh of {grouped(cells)} cells{hidden}"), fontsize=14)
+        save(figure, path)
+
+    on_root(mesh.comm, draw)
+
+
+def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
+    """Draw u_h as it is, jumps across the edges included, and where it is in contact.
+
+    Args:
+        solution: On a plane domain.
+        path: The PNG to write.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: The domain is not plane, or the file can't be written.
+    """
+    domain, contact = solution.domain, solution.contact
+    mesh = _plane(domain)
+    image, box, limits = raster(solution.u)
+    edges = _edges(mesh) if solution.cells <= 2000 else np.zeros((0, 2, 2))
+    boundary = np.concatenate([_segments(domain, part) for part in STYLES])
+    touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
+
+    def draw() -> None:
+        figure, axes, width = plane_axes(box, room=1.2)
+        shown = axes.imshow(
+            image,
+            extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
+            origin="lower",
+            aspect=axes.get_aspect(),
+            vmin=limits[0],
+            vmax=limits[1],
+        )
+        draw_lines(axes, edges, color="white", linewidth=0.3, alpha=0.5)
+        draw_lines(axes, boundary, color="black", linewidth=1.2, capstyle="round")
+        where = " at facet midpoints" if solution.element == "CR" else ""
+        if len(touching):
+            draw_lines(axes, touching, color=RED, linewidth=5.0, zorder=3,
+                       label=rf"contact: $u_h = \alpha${where}")  # fmt: skip
+        else:
+            axes.plot([], [], linestyle="none", label="no contact")
+        points = contact.transitions
+        if len(points):
+            axes.plot(points[:, 0], points[:, 1], linestyle="none", marker="o", markersize=7,
+                      color="white", markeredgecolor="black", zorder=4, clip_on=False,
+                      label="contact begins or ends")  # fmt: skip
+        beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
+        bar = figure.colorbar(shown, cax=beside)
+        bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=2, ha="left", va="center")
+        bar.ax.tick_params(labelsize=11)
+        bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+        legend(figure, ncols=2)
+        axes.set_title(headline(title, f"$u_h$ on {grouped(solution.cells)} cells"), fontsize=14)
+        save(figure, path)
+
+    on_root(mesh.comm, draw)
+
+
+def plot_contact(solution: Solution, path: Where, title: str = "") -> None:
+    """Draw u_h with the obstacle, and the pressure λ_h below it, along Γ1.
+
+    Args:
+        solution: On a plane domain with a contact boundary.
+        path: The PNG to write.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: The domain is not plane or has no Γ1, or the file can't be written.
+    """
+    comm, contact = _plane(solution.domain).comm, solution.contact
+    table = contact.table()
+    if contact.number == 0:
+        raise InputError("a picture of the contact needs a contact boundary")
+    size = comm.allreduce(float(np.abs(solution.u.x.array).max(initial=0.0)), op=MPI.MAX)
+
+    def draw() -> None:
+        assert table is not None
+        figure = contact_page(table, contact.transitions, size)
+        count = f"{grouped(contact.number_active)} of {grouped(contact.number)} facets in contact"
+        figure.suptitle(headline(title, count), fontsize=14)
+        save(figure, path)
+
+    on_root(comm, draw)
+
+
+def convergence_series(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The keys of the records that `plot_convergence` has something to draw of."""
+    return [key for key in SERIES if sum(bool(record[key]) for record in records) > 1]
+
+
+def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: str = "") -> None:
+    """Draw errors, and the certified bound, with the slopes of an undisturbed convergence.
+
+    They are drawn against h, or against the number of dofs where refinement was adaptive and h
+    says little.
+
+    Args:
+        records: From `output.level_record`; two at least with an error or a bound.
+        path: The PNG to write, by this rank.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: There is nothing to draw, or the file can't be written.
+    """
+    keys = convergence_series(records)
+    if not keys:
+        raise InputError("a picture of convergence needs two levels with an error or a bound")
+    sizes = np.array([record["h"] for record in records])
+    uniform = bool(np.all(sizes[1:] < 0.7 * sizes[:-1]))
+    figure = new_figure(7.5, 6.0)
+    axes = figure.subplots()
+    for key in keys:
+        used = [record for record in records if record[key]]
+        x = np.array([record["h" if uniform else "dofs"] for record in used])
+        values = np.array([record[key] for record in used])
+        style = dict(SERIES[key])
+        rate = used[-1].get(key.replace("error", "rate")) if uniform else None
+        style["label"] += (
+            f", last rate {rate:.2f}" if rate is not None and key != "bound_h1" else ""
+        )
+        axes.loglog(x, values, markersize=7, linewidth=2, **style)
+        if key == "bound_h1" and "error_h1" in keys:
+            continue
+        # A slope below the curve, touching it but for the factor
+        order = (2 if key == "error_l2" else 1) * (1.0 if uniform else -0.5)
+        slope = x**order
+        slope *= 0.6 * np.min(values / slope)
+        power = {1.0: "$h$", 2.0: "$h^2$", -0.5: "$N^{-1/2}$", -1.0: "$N^{-1}$"}[order]
+        axes.loglog(x, slope, ":", color="black")
+        axes.annotate(power, (np.sqrt(x[0] * x[-1]), np.sqrt(slope[0] * slope[-1])), fontsize=14,
+                      xytext=(8 * np.sign(order), -5), textcoords="offset points",
+                      ha="left" if uniform else "right", va="top")  # fmt: skip
+    if uniform and len(sizes) <= 8:
+        axes.set_xticks(sizes, [f"{h:.2g}" for h in sizes])
+        axes.set_xticks([], minor=True)
+    axes.set_xlabel("$h$" if uniform else "number $N$ of degrees of freedom", fontsize=14)
+    axes.set_ylabel("error", fontsize=13)
+    axes.tick_params(labelsize=11)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(fontsize=12)
+    axes.set_title(headline(title, "convergence"), fontsize=14)
+    save(figure, path)
+
+
+def _plane(domain: Domain) -> Mesh:
+    if domain.mesh.geometry.dim != 2 or domain.mesh.topology.dim != 2:
+        raise InputError("pictures are of plane domains only; for others open solution.vtu")
+    return domain.mesh
+
+
+def _gather(comm: MPI.Comm, array: FloatArray) -> FloatArray:
+    """The rows of all ranks on rank 0, none elsewhere."""
+    pieces = comm.gather(array, root=0)
+    return array[:0] if pieces is None else np.concatenate(pieces)
+
+
+def _edges(mesh: Mesh) -> FloatArray:
+    """Ends of all edges, on rank 0, shape (n, 2, 2); none if there are too many to draw."""
+    mesh.topology.create_entities(1)
+    mesh.topology.create_connectivity(1, 2)
+    mesh.topology.create_connectivity(2, 1)
+    edges = mesh.topology.index_map(1)
+    number = edges.size_local if edges.size_global <= MOST_EDGES else 0
+    ends = np.zeros((0, 2), dtype=np.int32)
+    if number:  # entities_to_geometry divides by it
+        ends = entities_to_geometry(mesh, 1, np.arange(number, dtype=np.int32)).reshape(-1, 2)
+    return _gather(mesh.comm, mesh.geometry.x[ends, :2])
+
+
+def _segments(domain: Domain, part: int) -> FloatArray:
+    """Ends of the facets of a boundary part, on rank 0, shape (n, 2, 2)."""
+    ends, _ = facet_measures(domain.mesh, domain.facets(part))
+    return _gather(domain.mesh.comm, ends[..., :2])

@@ -1,0 +1,265 @@
+"""What a run leaves behind: the report, the tables, the fields and the pictures.
+
+`level_record` turns a solution into numbers, `table_header` and `table_row` show them on a
+terminal, `write_levels` keeps what is finished, `write_output` fills a folder. Nothing here prints.
+Functions that take a solution or a communicator are collective: every rank calls them.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import dolfinx
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from .. import __version__
+from ..errors import on_root
+from ..estimate.certificate import SHARES
+from . import plots
+from .files import Writer, write_files, write_text
+from .tables import contact_csv, levels_csv, markdown_table
+from .tables import table_header as table_header
+from .tables import table_row as table_row
+from .vtu import write_vtu
+
+if TYPE_CHECKING:
+    from ..solution import Solution
+
+FILES = (
+    "report.json",
+    "levels.csv",
+    "levels.md",
+    "contact.csv",
+    "solution.vtu",
+    "mesh.png",
+    "solution.png",
+    "contact.png",
+    "convergence.png",
+)
+"""All that `write_output` may leave in a folder; what a run does not give is taken away."""
+
+PHASES = ("mesh", "assemble", "solve", "estimate")
+Record = dict[str, Any]
+
+
+def level_record(
+    solution: Solution,
+    previous: Mapping[str, Any] | None = None,
+) -> Record:
+    """The numbers of one level, as they stand in report.json.
+
+    Args:
+        solution: What was found on this mesh.
+        previous: The record of the level before, for the rates.
+
+    Returns:
+        Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
+        are None. The same on all ranks.
+    """
+    contact, kkt = solution.contact, solution.contact.kkt
+    h1, l2 = solution.errors or (None, None)
+    gdim = solution.domain.mesh.geometry.dim
+    certificate = solution.certificate
+    bound = certificate.bound_h1
+    seconds = {phase: solution.seconds.get(phase, 0.0) for phase in PHASES}
+    seconds["estimate"] += certificate.seconds
+    return plain(
+        {
+            "level": solution.level.number,
+            "cells": solution.cells,
+            "dofs": solution.dofs,
+            "h": solution.h,
+            "newton_iterations": solution.iterations.newton,
+            "linear_iterations": solution.iterations.linear,
+            "energy": solution.energy,
+            "kkt": {
+                "min_gap": kkt.min_gap,
+                "min_pressure": kkt.min_pressure,
+                "complementarity": kkt.complementarity,
+                "residual": kkt.residual,
+                "force_error": kkt.force_error,
+            },
+            "contact": {
+                "facets": contact.number,
+                "active": contact.number_active,
+                "length": contact.length,
+                "force": contact.force,
+                "transitions": contact.transitions[:, :gdim],
+            },
+            "error_h1": h1,
+            "error_l2": l2,
+            "rate_h1": _rate("error_h1", h1, solution, previous),
+            "rate_l2": _rate("error_l2", l2, solution, previous),
+            "bound_h1": bound,
+            "effectivity": bound / h1 if bound is not None and h1 else None,
+            "bound_reason": certificate.reason,
+            "bound_parts": {name: certificate.parts.get(name) for name in SHARES},
+            "energy_bounds": dict(
+                zip(("lower", "upper"), certificate.energy or (None, None), strict=True)
+            ),
+            "seconds": seconds,
+        }
+    )
+
+
+def make_report(
+    title: str, element: str, comm: MPI.Comm, records: Sequence[Record], complete: bool = True
+) -> Record:
+    """The whole of report.json from the records of its levels.
+
+    Args:
+        title: The problem's.
+        element: "CR" or "P1".
+        comm: The ranks that solved it.
+        records: From `level_record`, coarsest level first.
+        complete: Whether these are all the levels that were asked for.
+    """
+    versions = {
+        "signorini_cr": __version__,
+        "dolfinx": dolfinx.__version__,
+        "petsc": ".".join(str(number) for number in PETSc.Sys.getVersion()),
+        "gmsh": _version("gmsh"),
+    }
+    return {
+        "title": title,
+        "element": element,
+        "ranks": comm.size,
+        "versions": versions,
+        "complete": complete,
+        "levels": list(records),
+    }
+
+
+def plain(value: Any) -> Any:
+    """`value` with nothing in it that JSON does not know (NumPy, NaN, infinities)."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def write_levels(folder: str | os.PathLike[str], report: Record, solution: Solution) -> list[str]:
+    """Write what costs next to nothing, so that it outlives whatever ends the run; collective.
+
+    These are the report, the tables, and contact.csv. Fields and pictures of a former run are
+    removed.
+
+    Args:
+        folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
+            touched.
+        report: From `make_report`.
+        solution: The finest level so far.
+
+    Returns:
+        The names of the files written.
+
+    Raises:
+        InputError: The folder can't be written to.
+    """
+    comm = solution.domain.mesh.comm
+    writers = _texts(report, solution)
+    write_files(folder, writers, removed=FILES, comm=comm)
+    return list(writers)
+
+
+def write_output(
+    folder: str | os.PathLike[str], report: Record, solution: Solution, pictures: bool = True
+) -> list[str]:
+    """Write everything a run leaves behind, whole or not at all; collective.
+
+    Args:
+        folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
+            touched: those that this run does not give (the `convergence.png` of a former run)
+            are removed.
+        report: From `make_report`.
+        solution: The finest level: contact.csv, the field and the pictures are of this one.
+        pictures: Whether to draw. There are none of three-dimensional domains, and none where
+            Matplotlib is not installed.
+
+    Returns:
+        The names of the files written.
+
+    Raises:
+        InputError: The folder can't be written to.
+    """
+    comm, title, records = solution.domain.mesh.comm, report["title"], report["levels"]
+    writers = _texts(report, solution)
+    writers["solution.vtu"] = lambda path: write_vtu(solution.u, path)
+    drawable = pictures and solution.domain.mesh.geometry.dim == 2
+    if drawable and plots.can_draw(comm):
+        writers["mesh.png"] = lambda path: plots.plot_mesh(solution.domain, path, title)
+        writers["solution.png"] = lambda path: plots.plot_solution(solution, path, title)
+        if solution.contact.number:
+            writers["contact.png"] = lambda path: plots.plot_contact(solution, path, title)
+        if plots.convergence_series(records):
+            writers["convergence.png"] = lambda path: on_root(
+                comm, plots.plot_convergence, records, path, title
+            )
+    write_files(folder, writers, removed=FILES, comm=comm)
+    return list(writers)
+
+
+def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
+    """The report, which vouches for what lies beside it, and the tables; collective."""
+    comm, records = solution.domain.mesh.comm, report["levels"]
+    table = solution.contact.table()
+
+    def text(make: Callable[[], str]) -> Writer:
+        return lambda path: on_root(comm, write_text, path, make)
+
+    return {
+        "report.json": text(lambda: report_json(report)),
+        "levels.csv": text(lambda: levels_csv(records)),
+        "levels.md": text(lambda: markdown_table(records)),
+        "contact.csv": text(lambda: contact_csv(table or {})),
+    }
+
+
+def report_json(report: Mapping[str, Any]) -> str:
+    """The text of report.json."""
+    return json.dumps(plain(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _rate(
+    key: str, value: float | None, solution: Solution, previous: Mapping[str, Any] | None
+) -> float | None:
+    """log(e/e') / log(h/h'), None where there are no two errors to compare.
+
+    On meshes that are not refined everywhere h, the largest diameter, says nothing; N^(−1/d) with
+    the number N of dofs takes its place.
+    """
+    before = None if previous is None else previous[key]
+    if previous is None or not value or not before:
+        return None
+    d = solution.domain.mesh.topology.dim
+    if solution.cells == 2**d * previous["cells"]:
+        finer = math.log(solution.h / previous["h"])
+    else:
+        finer = math.log(previous["dofs"] / solution.dofs) / d
+    return math.log(value / before) / finer if finer else None
+
+
+@functools.cache  # looking takes longer than writing the report of a level
+def _version(package: str) -> str | None:
+    """The installed version, None if it can't be told."""
+    module = sys.modules.get(package)
+    if (version := getattr(module, "__version__", None)) is not None:
+        return str(version)
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,148 @@
+"""Pieces that the domain falls into, and what holds those that have no Dirichlet facet.
+
+Only the obstacle can hold such a piece, and only where the net force ∫ f + ∫ g over it is below 0,
+which presses it on: then the solution exists and is unique, as J(u + c) − J(u) = −c (∫ f + ∫ g)
+grows with c, and admissible functions are bounded below. The reduced matrices are definite as long
+as each such piece has an active dof. A start with one is enough: where all other equations hold,
+the forces of the active dofs add up to −(∫ f + ∫ g) > 0, so that one of them stays active.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from petsc4py import PETSc
+
+from .. import compat
+from ..errors import raise_together
+from ..fem.space import shared_maximum
+from ..garbage import release
+from ..mesh.planar import pieces
+from .stopping import NOISE
+from .system import System
+
+BELOW = 4.0
+"""A piece is put so far below its obstacle, in parts of what its loads could lift it by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loose:
+    """Pieces without a Dirichlet facet.
+
+    Attributes:
+        count: How many there are, over all ranks.
+        piece: Piece of each local dof, from 1; 0 where a Dirichlet facet holds it, shape (dofs,).
+    """
+
+    count: int
+    piece: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(cls, V: fem.FunctionSpace, dirichlet: npt.NDArray[np.int32]) -> Loose:
+        """Find them; collective.
+
+        Args:
+            V: The discrete space: dofs of a cell are connected.
+            dirichlet: Local dofs on Γ0, ghosts included.
+        """
+        comm, labels = V.mesh.comm, _labels(V)
+        held, own = (
+            np.unique(np.concatenate(comm.allgather(np.unique(found))))
+            for found in (labels[dirichlet], labels)
+        )
+        loose = np.setdiff1d(own, held)
+        number = np.searchsorted(loose, labels)
+        found = np.append(loose, np.inf)[number] == labels
+        return cls(len(loose), np.where(found, number + 1, 0))
+
+    def check(self, system: System) -> None:
+        """Insist on pieces that are pressed onto the obstacle; collective.
+
+        Args:
+            system: The variational inequality.
+
+        Raises:
+            InputError: One is not.
+        """
+        V = system.chi.function_space
+        owned, comm = V.dofmap.index_map.size_local, V.mesh.comm
+        piece, chi = self.piece[:owned], system.chi.x.array[:owned]
+        sums = [
+            np.bincount(piece, values, self.count + 1) for values in (chi, np.abs(chi), piece > 0)
+        ]
+        bounded = np.bincount(piece[system.bounded], minlength=self.count + 1)
+        net, size, number, contact = comm.allreduce(np.array([*sums, bounded]))
+        adrift = (contact == 0.0) | (net >= -NOISE * np.sqrt(number) * size)
+        adrift[0] = False
+        complaint, bad = None, int(np.argmax(adrift))
+        if adrift.any() and len(dofs := np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == bad)):
+            nodes = compat.cell_nodes(V.mesh)[dofs[0]]
+            middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
+            complaint = (
+                "the domain falls into pieces, and the one around "
+                f"({', '.join(f'{x:g}' for x in middle)}) has no Dirichlet facet and "
+            ) + (
+                f"a net force ∫f + ∫g of {net[bad]:g}: only one below 0, which presses it onto the "
+                "obstacle, would hold it"
+                if contact[bad]
+                else "no contact facet: nothing holds it"
+            )
+        raise_together(comm, complaint)
+
+    def hold(self, system: System, start: fem.Function) -> None:
+        """Put pieces of which no dof is active onto the obstacle; collective.
+
+        All their contact dofs go on their bounds, and all others so far below that the residual
+        makes the former active.
+
+        Args:
+            system: The variational inequality.
+            start: The start, ghosts up to date as on return.
+        """
+        x, comm = start.x.array, start.function_space.mesh.comm
+        residual = fem.Function(start.function_space)
+        system.residual(start, residual)
+        bounded, lower = system.bounded, system.lower
+        pushed = (x[bounded] <= lower[bounded]) & (residual.x.array[bounded] > 0.0)
+        active = np.bincount(self.piece[bounded], pushed, self.count + 1)
+        entries = system.A.getDiagonal()
+        lift = np.abs(system.b.x.array[: entries.local_size]) / entries.array_r
+        release(entries)
+        bottom, depth = np.full(self.count + 1, np.inf), np.zeros(self.count + 1)
+        top = -bottom
+        np.maximum.at(depth, self.piece[: len(lift)], lift)
+        np.minimum.at(bottom, self.piece[bounded], lower[bounded])
+        np.maximum.at(top, self.piece[bounded], lower[bounded])
+        active = comm.allreduce(active)
+        bottom = np.min(comm.allgather(bottom), axis=0)
+        top, depth = np.max(comm.allgather([top, depth]), axis=0)
+        for piece in range(1, self.count + 1):
+            if active[piece] == 0.0:
+                below = BELOW * depth[piece] + (top[piece] - bottom[piece])
+                there = self.piece == piece
+                x[there] = np.where(lower > PETSc.NINFINITY, lower, bottom[piece] - below)[there]
+
+
+def _cell_dofs(V: fem.FunctionSpace) -> npt.NDArray[np.int32]:
+    """Dofs of the owned cells, shape (cells, dofs of a cell)."""
+    topology = V.mesh.topology
+    dofs: npt.NDArray[np.int32] = V.dofmap.list[: topology.index_map(topology.dim).size_local]
+    return dofs
+
+
+def _labels(V: fem.FunctionSpace) -> npt.NDArray[np.float64]:
+    """For each local dof the largest number of all dofs that it is connected with; collective."""
+    dofs, index_map = _cell_dofs(V), V.dofmap.index_map
+    local = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    piece = pieces(dofs, len(local))
+    labels = index_map.local_to_global(local).astype(np.float64)
+    total = -1.0
+    while total != (total := V.mesh.comm.allreduce(float(labels.sum()))):
+        largest = np.full(len(dofs), -1.0)
+        np.maximum.at(largest, piece, labels[dofs].max(axis=1, initial=-1.0))
+        labels[dofs] = largest[piece][:, None]
+        shared_maximum(V, labels)
+    return labels

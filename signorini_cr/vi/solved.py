@@ -1,0 +1,36 @@
+"""What the streets above may ask of a solve, whoever keeps its results."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from dolfinx import fem
+
+from ..fem.problem import Problem
+from ..mesh.domain import Domain
+from .assembly import Level
+from .contact import Contact
+
+
+class Solved(Protocol):
+    """u_h on one mesh; the attributes are those of :class:`~signorini_cr.solution.Solution`."""
+
+    level: Level
+    u: fem.Function
+    residual: fem.Function
+    contact: Contact
+    energy: float
+    before: fem.Function | None
+    seconds: dict[str, float]
+
+    @property
+    def domain(self) -> Domain:
+        """Mesh and boundary parts."""
+
+    @property
+    def problem(self) -> Problem:
+        """The data."""
+
+    @property
+    def element(self) -> str:
+        """The element's name."""

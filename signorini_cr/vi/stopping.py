@@ -1,0 +1,186 @@
+"""When the solution of the variational inequality is good enough.
+
+The residual as a whole says little where the coefficient varies by orders of magnitude: what is
+small against the stiff part's flows may be all there is in the soft part. So three things are
+asked for:
+
+1. ‖r‖₂ ≤ τ · load for the equations as a whole, τ = 1e-8 unless set otherwise.
+2. The contact forces are known: the sum of the errors that the solver left in them is at most
+   1e-7 of their sum.
+3. Each part is converged for itself. Dofs whose diagonal entries are of the same magnitude, up to a
+   factor of 100, make a class. In each, 2. holds for its own forces; and where there is more than
+   one, ‖r‖₂ over the class is at most τ times the norm of what its rows are made of,
+   Σ_j |a_ij| |u_j − u_i| + |χ_i|.
+
+How well forces are known is measured, not concluded from a norm: a step of the linear solver, or
+one more Newton step in the same active set, which refines u_h with its true residual, changes the
+forces by what was wrong with them before. Where rounding does not allow for 2., 1e-6 is enough, and
+what is known less well is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from ..garbage import release
+from ..multigrid.cycle import Grid
+
+FloatArray = npt.NDArray[np.float64]
+
+DECADES = 2.0
+"""Dofs whose diagonal entries are within so many powers of ten make a class."""
+
+FORCES = 1e-7
+"""What may be wrong with the contact forces, in parts of their sum."""
+
+FLOWS = 1e-8
+"""What the residual of a class of stiffness may be, in parts of its flows."""
+
+ROUNDED = 1e-6
+"""What both may be where rounding allows for no better."""
+
+NOISE = 4.0 * 2.0**-53
+"""Rounding of a row of A x, in parts of |A| |x|; measured are 1 to 2 of these 4."""
+
+STORED = NOISE / 32.0
+"""What a row of A x is off, in parts of |A| |x|, as x is stored with 53 digits: as measured."""
+
+LOST = 10.0
+"""Forces whose sum is below so many times their rounding are no forces."""
+
+
+class Stiffness:
+    """Classes of dofs of like diagonal entries, and whether the equations of each are solved.
+
+    Where there are several, A x is summed up from differences: a stiff part that only a soft one
+    holds moves by what rounding leaves of its rows' sum, and Σ_j a_ij (x_j − x_i) leaves nothing,
+    as what dof j gets from dof i is what i gives to j.
+
+    Attributes:
+        number: How many classes there are, over all ranks; some may be empty.
+        contrast: Largest diagonal entry over the smallest.
+        bounded: Class of each dof with a bound, shape (n,).
+    """
+
+    def __init__(self, grid: Grid, row_sums: Callable[[], FloatArray] | None = None):
+        """Sort the dofs; collective, the matrix must be whole.
+
+        Args:
+            grid: Matrix and dofs.
+            row_sums: Returns the sums of the owned rows of A, which are 0 but where a dof on Γ0 has
+                been taken out, shape (dofs,); it is asked if there are several classes.
+        """
+        self._grid, self._comm = grid, grid.matrix.getComm().tompi4py()
+        diagonal = grid.matrix.getDiagonal()
+        free = np.ones(diagonal.local_size, dtype=bool)
+        free[grid.dirichlet] = False
+        entries = diagonal.array_r
+        low = self._comm.allreduce(float(entries.min(initial=np.inf, where=free)), op=MPI.MIN)
+        high = self._comm.allreduce(float(entries.max(initial=0.0, where=free)), op=MPI.MAX)
+        self._smallest, self.contrast = low, max(high / low, 1.0)
+        self.number = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
+        self.bounded = self._classes(grid.operator.diagonal)
+        self._differences: PETSc.Mat | None = None
+        if row_sums is not None and self.number > 1:
+            self._free, self._class = free, self._classes(entries)
+            self._diagonal = entries.copy()
+            self._row_sums = row_sums()
+            self._differences, self._weights = _differences(grid.matrix)
+        release(diagonal)
+
+    def _classes(self, diagonal: FloatArray) -> npt.NDArray[np.intp]:
+        decades = np.log10(diagonal / self._smallest) / DECADES
+        return np.maximum(decades, 0.0).astype(np.intp)
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Sum values of the bounded dofs over this rank's part of each class, shape (classes,)."""
+        sums = np.bincount(self.bounded, values, minlength=self.number)
+        return sums.astype(np.float64, copy=False)
+
+    def magnitude(self, x: PETSc.Vec, which: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+        """Sum up |A| |x| over the bounded dofs of each class, shape (classes,); collective.
+
+        Args:
+            x: A vector.
+            which: The bounded dofs that count, shape (n,); None for all.
+        """
+        values = self._grid.operator.magnitude(x)
+        sums = self.sums(values if which is None else np.where(which, values, 0.0))
+        total: FloatArray = self._comm.allreduce(sums)
+        return total
+
+    def residual(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> None:
+        """Compute r = A x − b."""
+        if self._differences is None:
+            self._grid.operator.mult(x, r)
+            r.axpy(-1.0, b)
+            return
+        flows = self._differences.createVecLeft()
+        self._differences.mult(x, flows)
+        flows.array[:] *= self._weights
+        self._differences.multTranspose(flows, r)
+        r.array[:] += self._row_sums * x.array_r - b.array_r
+        release(flows)
+
+    def imbalance(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> float:
+        """Compute the largest ‖r‖ / ‖flows‖ of all classes, 0 for what is lost in rounding.
+
+        Args:
+            x: The iterate.
+            b: Right-hand side.
+            r: A x − b; only dofs outside the present active set count.
+        """
+        if self._differences is None:
+            return 0.0
+        sizes, flows = self._differences.createVecs()
+        self._differences.mult(x, flows)
+        flows.array[:] = np.abs(self._weights * flows.array_r)
+        made_of = self._differences.duplicate(copy=True)
+        start, column, value = made_of.getValuesCSR()
+        made_of.setValuesCSR(start, column, np.abs(value))
+        made_of.assemble()
+        made_of.multTranspose(flows, sizes)
+        counted = self._free.copy()
+        counted[self._grid.operator.out] = False
+        facts = [
+            np.bincount(self._class[counted], values[counted] ** 2, minlength=self.number)
+            for values in (
+                r.array_r,
+                sizes.array_r + np.abs(self._row_sums * x.array_r - b.array_r),
+                NOISE * self._diagonal * x.array_r,
+            )
+        ]
+        release(sizes, flows, made_of)
+        left, flow, noise = np.sqrt(self._comm.allreduce(np.array(facts)))
+        return float(np.max(left / np.maximum(flow, 1e-300), initial=0.0, where=left > noise))
+
+    def free(self) -> None:  # "destroy" is what PETSc calls a context with
+        """Free the differences."""
+        release(self._differences)
+
+
+def _differences(A: PETSc.Mat) -> tuple[PETSc.Mat, FloatArray]:
+    """The matrix whose rows take differences x_j − x_i, j > i with a_ij ≠ 0, and the a_ij.
+
+    D the first and w the second, A = −Dᵀ diag(w) D but for row sums.
+    """
+    start, column, value = A.getValuesCSR()
+    first, end = A.getOwnershipRange()
+    row = np.repeat(np.arange(first, end, dtype=column.dtype), np.diff(start))
+    chosen = (column > row) & (value != 0.0)
+    row, column, value = row[chosen], column[chosen], -value[chosen]
+    number = len(row)
+    signs = np.empty((number, 2))
+    signs[:, 0], signs[:, 1] = -1.0, 1.0
+    csr = (
+        np.arange(0, 2 * number + 1, 2, dtype=PETSc.IntType),
+        np.stack([row, column], axis=1).ravel().astype(PETSc.IntType),
+        signs.ravel(),
+    )
+    sizes = (number, PETSc.DECIDE), A.getSizes()[1]
+    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm), value
