@@ -158,7 +158,8 @@ NAMES["where"] = lambda condition, yes, no: yes if condition else no
 
 def by_python(text: str, x: float, y: float) -> float:
     """The value that Python finds."""
-    tree = ast.fix_missing_locations(_Floats().visit(ast.parse(" ".join(text.split()), mode="eval")))
+    tree = _Floats().visit(ast.parse(" ".join(text.split()), mode="eval"))
+    ast.fix_missing_locations(tree)
     names = {**NAMES, "x": np.float64(x), "y": np.float64(y), "pi": np.float64(math.pi)}
     with np.errstate(all="ignore"), suppress(Undefined):
         return float(eval(compile(tree, "text", "eval"), {"__builtins__": {}}, names))
