@@ -161,7 +161,8 @@ def by_python(text: str, x: float, y: float) -> float:
     tree = _Floats().visit(ast.parse(" ".join(text.split()), mode="eval"))
     ast.fix_missing_locations(tree)
     names = {**NAMES, "x": np.float64(x), "y": np.float64(y), "pi": np.float64(math.pi)}
-    with np.errstate(all="ignore"), suppress(Undefined):
+    # Constants are folded, 0 times what is not finite to 0
+    with np.errstate(all="raise", under="ignore"), suppress(Undefined, FloatingPointError):
         return float(eval(compile(tree, "text", "eval"), {"__builtins__": {}}, names))
     return math.nan
 
@@ -190,8 +191,8 @@ def check_expression(text: str) -> None:
     assert values.dtype == np.float64 and values.shape == (len(POINTS),)
     for (x, y), value in zip(POINTS, values, strict=True):
         truth = by_python(text, x, y)
-        # Constants are folded: 0 times what is not finite is 0 here. Rounding may decide a
-        # comparison, or be all that is left of a difference, in one order of sums and not another.
+        # Rounding may decide a comparison, or be all that is left of a difference, in one order of
+        # sums and not in another.
         if not (math.isfinite(truth) and math.isfinite(value)):
             continue
         if not math.isclose(value, truth, rel_tol=1e-9, abs_tol=1e-9):
