@@ -4,7 +4,7 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify test ranks test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz test ranks test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -17,6 +17,11 @@ studies:
 verify:
 	$(run) timeout --kill-after=20 3600 python3 verification --out docs/verification.md
 	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 verification
+
+# What the tests draw a few of, in numbers; every seed that fails is to become a test.
+fuzz:
+	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --files 20000 --problems 3000
+	$(run) python3 tests/mesh_mutations.py --count 5000
 
 test:
 	$(run) $(limit) python3 -m pytest
