@@ -4,7 +4,7 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify test ranks test-package test-wheels lint types clean purge
+.PHONY: demo studies verify docs test ranks test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -17,6 +17,10 @@ studies:
 verify:
 	$(run) timeout --kill-after=20 3600 python3 verification --out docs/verification.md
 	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 verification
+
+# The site, from docs/ and the docstrings: docs/_build/index.html
+docs:
+	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
 
 test:
 	$(run) $(limit) python3 -m pytest
