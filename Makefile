@@ -4,7 +4,7 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify fuzz test ranks test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz docs test ranks test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -22,6 +22,10 @@ verify:
 fuzz:
 	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --files 20000 --problems 3000
 	$(run) python3 tests/mesh_mutations.py --count 5000
+
+# The site, from docs/ and the docstrings: docs/_build/index.html
+docs:
+	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
 
 test:
 	$(run) $(limit) python3 -m pytest
