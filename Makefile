@@ -23,8 +23,12 @@ fuzz:
 	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --files 20000 --problems 3000
 	$(run) python3 tests/mesh_mutations.py --count 5000
 
-test:
+test: test-alone test-pair
+
+test-alone:
 	$(run) $(limit) python3 -m pytest
+
+test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
 
 # What depends on how a mesh is shared out, on more ranks than that.
