@@ -4,7 +4,8 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify fuzz docs test ranks test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz docs test test-alone test-pair ranks test-package test-wheels lint \
+    types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -27,8 +28,12 @@ fuzz:
 docs:
 	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
 
-test:
+test: test-alone test-pair
+
+test-alone:
 	$(run) $(limit) python3 -m pytest
+
+test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
 
 # What depends on how a mesh is shared out, on more ranks than that.
