@@ -21,6 +21,7 @@ from .. import compat
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient, Sampled
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
+from ..jit import compiled
 from ..mesh.domain import CONTACT
 from .companion import Companion, companion, on_facet
 from .cusps import Cusps
@@ -89,7 +90,8 @@ class Certificate:
         y = fem.Function(fem.functionspace(mesh, ("RT", 1)))
         points = y.function_space.element.interpolation_points
         points = points() if callable(points) else points
-        y.interpolate(fem.Expression(slope * ufl.SpatialCoordinate(mesh) + shift, points))
+        field = slope * ufl.SpatialCoordinate(mesh) + shift
+        y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 
     @cached_property
