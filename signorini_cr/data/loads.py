@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..fem.cells import Cells, Side, blocks, measures, pick, poincare
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare
 from ..fem.space import facet_quadrature
 from ..mesh.domain import NEUMANN
 from .jets import Boxes, Unknown
@@ -43,6 +43,15 @@ class Load:
         half = 0 if rows is None else len(rows) // 2
         self.hats = None if rows is None else rows[:half]
         self.bumps = None if rows is None else rows[half:]
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """Means of (f − f_T − ℓ)², d = 2, shape (cells,), with the affine function ℓ nearest to f.
+
+        ℓ is 12 times its moment (f − f_T) λ_i at the vertex i.
+        """
+        assert self.variance is not None and self.hats is not None
+        return np.maximum(self.variance - 12.0 * dot_rows(self.hats, self.hats), 0.0)
 
     def shares(self, cells: Cells, part: slice) -> FloatArray:
         """∫_T f ψ_i for the Crouzeix-Raviart functions ψ_i = 1 − d λ_i, shape (d + 1, n)."""

@@ -23,6 +23,7 @@ from ..data.moments import Coefficient, Sampled
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from ..mesh.domain import CONTACT
 from .companion import Companion, companion, on_facet
+from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, unbalanced
 from .gap import integrate, integrate_edge
@@ -207,6 +208,9 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps, steady, goal
     )
     sums = integrate(cells, kappa, w, load, flux, v)
+    if promising(cells, kappa.mean, flux, sums):
+        improve(cells, kappa.mean, load, flux, v)
+        sums = integrate(cells, kappa, w, load, flux, v)
     cusps, known = v.cusps, (v.excess, v.bumps)
     unsure = 0.0 if cusps is None else cusps.add(cells, w, load, kappa.low, flux, known, sums)
     assert sums.indicators is not None

@@ -131,6 +131,13 @@ class Cells:
         return self.lengths.max(axis=0)
 
     @cached_property
+    def turns(self) -> FloatArray:
+        """1 for cells whose vertices turn left, −1 for others, for d = 2 in the plane, shape (n,)."""
+        x = self.domain.mesh.geometry.x[compat.cell_nodes(self.domain.mesh)[: self.number]]
+        (a, b), (c, d) = (x[:, 1:, :2] - x[:, :1, :2]).transpose(1, 2, 0)
+        return np.where(a * d > b * c, 1.0, -1.0)
+
+    @cached_property
     def sides(self) -> dict[int, Side]:
         """Boundary facets of owned cells."""
         mesh, d = self.domain.mesh, self.tdim

@@ -1,0 +1,69 @@
+"""What y has beyond a Raviart-Thomas field of lowest order on thin cells, see `curl`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+import numpy.typing as npt
+
+from ..fem.cells import Cells
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Beyond:
+    """curl of ω's bumps, and τ = ⅓ Σ_{i<j} (ℓ_j − ℓ_i) (X_j − X_i) λ_i λ_j on each cell.
+
+    Attributes:
+        heights: Heights of ω's bumps by facet dof.
+        vertices: ω's values at the vertices, which y has in its fluxes.
+        rise: ℓ_i, the values at the vertices of the affine part of f − f_T, shape (3, cells);
+            None where f is constant on each cell.
+    """
+
+    heights: FloatArray
+    vertices: FloatArray
+    rise: FloatArray | None
+
+    def through(
+        self, cells: Cells, where: slice | npt.NDArray[np.intp], hat: FloatArray
+    ) -> FloatArray:
+        """The numbers Q_i = 2|T| (curl ω + τ)·∇λ_i at a point of each cell, shape (3, n).
+
+        Args:
+            cells: The mesh.
+            where: Which cells.
+            hat: The point's barycentric coordinates, shape (3, 1) or (3, n).
+        """
+        height = self.heights[cells.facets[:, where]]
+        out = cells.turns[where] * turn(bump_slopes(cells, height, hat))
+        if self.rise is not None:
+            rise, scale = self.rise[:, where], 2 / 3 * cells.volume[where]
+            for i, j in cells.pairs:
+                amount = scale * hat[i] * hat[j] * (rise[j] - rise[i])
+                out[i] -= amount
+                out[j] += amount
+        return out
+
+
+def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
+    """Numbers γ_k with ∇ Σ height_i b_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    gamma = np.zeros_like(height)
+    for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
+        gamma[i] += 4.0 * hat[m] * height[j]
+        gamma[j] += 4.0 * hat[m] * height[i]
+    return gamma
+
+
+def turn(gamma: FloatArray) -> FloatArray:
+    """2|T| curl φ·∇λ_i for ∇φ = Σ γ_k ∇λ_k if the vertices turn left."""
+    return np.stack([gamma[1] - gamma[2], gamma[2] - gamma[0], gamma[0] - gamma[1]])
+
+
+def quadrature() -> tuple[FloatArray, FloatArray]:
+    """Points and weights of a rule that is exact for |y|², shapes (q, 3) and (q,)."""
+    points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
+    return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
