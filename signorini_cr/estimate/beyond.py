@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import basix
 import numpy as np
 import numpy.typing as npt
+import ufl
+from dolfinx import fem
 
+from .. import compat
 from ..fem.cells import Cells
 
 FloatArray = npt.NDArray[np.float64]
@@ -47,6 +50,33 @@ class Beyond:
                 out[i] -= amount
                 out[j] += amount
         return out
+
+    def largest(self, cells: Cells) -> FloatArray:
+        """About the largest |ω| on each cell, shape (cells,)."""
+        of_bumps = np.abs(self.heights[cells.facets]).max(axis=0)
+        return np.asarray(np.abs(self.vertices[cells.vertices]).max(axis=0) + of_bumps)
+
+    def field(self, cells: Cells) -> ufl.core.expr.Expr:
+        """The curl of the bumps and τ = ⅓ (Σ ℓ_i λ_i X_i − ℓ x) as an expression; collective."""
+        mesh = cells.domain.mesh
+        omega = fem.Function(fem.functionspace(mesh, ("Lagrange", 2)))
+        dofs = omega.function_space.dofmap.list[: cells.number]
+        omega.x.array[dofs[:, 3:]] = self.heights[cells.facets].T
+        omega.x.scatter_forward()
+        x, y = ufl.grad(omega)
+        curl = ufl.as_vector([y, -x])
+        if self.rise is None:
+            return curl
+        corners = mesh.geometry.x[compat.cell_nodes(mesh)[: cells.number], :2]
+        rise = fem.Function(fem.functionspace(mesh, ("DG", 1)))
+        moved = fem.Function(fem.functionspace(mesh, ("DG", 1, (2,))))
+        dofs = rise.function_space.dofmap.list[: cells.number]
+        rise.x.array[dofs] = self.rise.T
+        for axis in range(2):
+            moved.x.array[2 * dofs + axis] = self.rise.T * corners[..., axis]
+        for function in (rise, moved):
+            function.x.scatter_forward()
+        return curl + (moved - rise * ufl.SpatialCoordinate(mesh)) / 3
 
 
 def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient, Sampled
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from ..mesh.domain import CONTACT
+from .beyond import Beyond
 from .companion import Companion, companion, on_facet
 from .curl import improve, promising
 from .cusps import Cusps
@@ -68,7 +69,10 @@ class Certificate:
 
     @cached_property
     def flux(self) -> fem.Function | None:
-        """The flux y as a function in the Raviart-Thomas space of lowest order; collective."""
+        """The flux y; collective.
+
+        It is in the Raviart-Thomas space of lowest order, on thin cells perhaps in the next one.
+        """
         if self._made is None:
             return None
         made = self._made
@@ -87,10 +91,13 @@ class Certificate:
         ).ravel()
         for function in (slope, shift):
             function.x.scatter_forward()
-        y = fem.Function(fem.functionspace(mesh, ("RT", 1)))
+        field, beyond = slope * ufl.SpatialCoordinate(mesh) + shift, made.beyond
+        if beyond is not None:
+            field += beyond.field(cells)
+        y = fem.Function(fem.functionspace(mesh, ("RT", 1 if beyond is None else 2)))
         points = y.function_space.element.interpolation_points
         points = points() if callable(points) else points
-        y.interpolate(fem.Expression(slope * ufl.SpatialCoordinate(mesh) + shift, points))
+        y.interpolate(fem.Expression(field, points))
         return y
 
     @cached_property
@@ -132,6 +139,7 @@ class _Made:
     bumps: FloatArray
     hats: FloatArray | None
     segments: Segments
+    beyond: Beyond | None
     cusps: Cusps | None
     varies: bool
     force: float
@@ -226,7 +234,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     )
     lift = np.sqrt(lift)
     hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums)
-    rounding = _rounding(cells, kappa, w, load)
+    rounding = _rounding(cells, kappa, w, load, flux)
     loose = np.sqrt(edge_square) + left + hidden + rounding
     same = total["flux"] + total["companion"] + total["load"]
     same += 2 * (total["load_flux"] + total["slack"])
@@ -275,6 +283,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
             segments=segments,
             varies=kappa.values is not None,
             excess=flux.excess,
+            beyond=flux.beyond,
             vertices=v.vertices,
             bumps=v.bumps,
             cusps=v.cusps,
@@ -324,11 +333,12 @@ ROUNDING = 64 * np.finfo(np.float64).eps
 """Relative error of what a cell adds to the certificate's norms."""
 
 
-def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load) -> float:
+def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux: Flux) -> float:
     """What rounding may do to ‖p ± b‖; collective.
 
     Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
-    is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller.
+    is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
+    with ω, of which y may have the curl.
     """
     values = np.abs(w).max(axis=0)
     trace = cells.trace(slice(0, cells.number))
@@ -337,6 +347,8 @@ def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load) -> fl
     if load.variance is not None:
         of_load = of_load + np.sqrt(load.variance)
     square += cells.diameter2 * cells.volume * of_load**2 / kappa.low
+    if flux.beyond is not None:
+        square += trace * flux.beyond.largest(cells) ** 2 / kappa.low
     return float(ROUNDING * np.sqrt(cells.total(np.sum(square))[0]))
 
 

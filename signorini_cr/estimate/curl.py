@@ -64,7 +64,7 @@ def improve(cells: Cells, kappa: FloatArray, load: Load, flux: Flux, v: Companio
     flux.beyond = Beyond(nothing, nothing, rise)
     loose, free = _loosened(cells, len(v.vertices))
     slopes = _slopes(cells, kappa, flux, flux.beyond, v)
-    vertices, heights = nearest(cells, 1.0 / kappa, slopes, loose, free)
+    vertices, heights = nearest(cells, np.asarray(1.0 / kappa), slopes, loose, free)
     vertices[~loose] = 0.0
     heights[~free] = 0.0
     flux.excess -= cells.turns * turn(vertices[cells.vertices])

@@ -325,8 +325,9 @@ def _at_points(
     It is |p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and κ⁻¹|∇z|² for z = v and z = 2u_h − v.
 
     At a point with barycentric coordinates λ_k, y − κ_T∇u_h = Σ Q_k X_k / (d |T|) with
-    Q_k = λ_k ΣP − P_k but for what y has beyond, and ∇(v − u_h) = Σ γ_k ∇λ_k with γ_k = c_k + 4 Σ_l height_l λ_m, where
-    k, l, m are the three vertices. As Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
+    Q_k = λ_k ΣP − P_k plus what y has beyond, and ∇(v − u_h) = Σ γ_k ∇λ_k with
+    γ_k = c_k + 4 Σ_l height_l λ_m, where k, l, m are the three vertices. As Σ Q_k = 0,
+    (Σ Q_k X_k)·∇λ_i = Q_i.
 
     Args:
         cells: The mesh.

@@ -132,7 +132,7 @@ class Cells:
 
     @cached_property
     def turns(self) -> FloatArray:
-        """1 for cells whose vertices turn left, −1 for others, for d = 2 in the plane, shape (n,)."""
+        """1 for triangles whose vertices turn left, −1 for others, shape (cells,)."""
         x = self.domain.mesh.geometry.x[compat.cell_nodes(self.domain.mesh)[: self.number]]
         (a, b), (c, d) = (x[:, 1:, :2] - x[:, :1, :2]).transpose(1, 2, 0)
         return np.where(a * d > b * c, 1.0, -1.0)
