@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import basix
 import numpy as np
 import numpy.typing as npt
 import ufl
@@ -12,6 +11,7 @@ from dolfinx import fem
 
 from .. import compat
 from ..fem.cells import Cells
+from .shapes import bump_slopes
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -79,21 +79,6 @@ class Beyond:
         return curl + (moved - rise * ufl.SpatialCoordinate(mesh)) / 3
 
 
-def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
-    """Numbers γ_k with ∇ Σ height_i b_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
-    gamma = np.zeros_like(height)
-    for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
-        gamma[i] += 4.0 * hat[m] * height[j]
-        gamma[j] += 4.0 * hat[m] * height[i]
-    return gamma
-
-
 def turn(gamma: FloatArray) -> FloatArray:
     """2|T| curl φ·∇λ_i for ∇φ = Σ γ_k ∇λ_k if the vertices turn left."""
     return np.stack([gamma[1] - gamma[2], gamma[2] - gamma[0], gamma[0] - gamma[1]])
-
-
-def quadrature() -> tuple[FloatArray, FloatArray]:
-    """Points and weights of a rule that is exact for |y|², shapes (q, 3) and (q,)."""
-    points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
-    return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()

@@ -24,6 +24,7 @@ from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from ..mesh.domain import CONTACT
 from .beyond import Beyond
 from .companion import Companion, companion, on_facet
+from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, unbalanced
@@ -102,9 +103,10 @@ class Certificate:
 
     @cached_property
     def companion(self) -> fem.Function | None:
-        """The companion v of degree 2 for d = 2, affine else; collective.
+        """The companion v; collective.
 
-        Without its lifting and, where there are some, its cusps.
+        It is of degree 2 for d = 2, on thin cells perhaps 3, and affine else; without its lifting
+        and, where there are some, its cusps.
         """
         if self._made is None:
             return None
@@ -119,7 +121,7 @@ class Certificate:
             middle = (values.sum(axis=0) - values) / 2 + made.bumps[cells.facets]
             v.x.array[dofs[:, 3:]] = middle.T
         v.x.scatter_forward()
-        return v
+        return v if made.thirds is None else with_thirds(cells, v, made.thirds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +142,7 @@ class _Made:
     hats: FloatArray | None
     segments: Segments
     beyond: Beyond | None
+    thirds: FloatArray | None
     cusps: Cusps | None
     varies: bool
     force: float
@@ -217,6 +220,8 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     )
     sums = integrate(cells, kappa, w, load, flux, v)
     if promising(cells, kappa.mean, flux, sums):
+        if kappa.values is None and v.cusps is None:
+            v = cubed(cells, kappa.mean, flux, v)
         improve(cells, kappa.mean, load, flux, v)
         sums = integrate(cells, kappa, w, load, flux, v)
     cusps, known = v.cusps, (v.excess, v.bumps)
@@ -286,6 +291,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
             beyond=flux.beyond,
             vertices=v.vertices,
             bumps=v.bumps,
+            thirds=v.thirds,
             cusps=v.cusps,
             force=float(flux.contact.sum()),
             reach=float(bound - near / 2 + loose + lift / 2),

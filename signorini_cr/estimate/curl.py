@@ -15,10 +15,11 @@ import numpy.typing as npt
 from ..data.loads import Load
 from ..fem.cells import Cells, blocks, pick
 from ..mesh.domain import CONTACT, NEUMANN
-from .beyond import Beyond, bump_slopes, quadrature, turn
+from .beyond import Beyond, turn
 from .companion import Companion
 from .flux import Flux, field_squares
 from .nearest import Slopes, nearest
+from .shapes import quadrature
 from .sums import Sums
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,13 +93,13 @@ def _slopes(cells: Cells, kappa: FloatArray, flux: Flux, beyond: Beyond, v: Comp
     hats, weights = quadrature()
     vertices, facets = np.zeros((2, 3, cells.number))
     for part in blocks(cells.number):
-        k, P, c = pick(kappa, part), flux.excess[:, part], v.excess[:, part]
-        height, volume = v.bumps[cells.facets[:, part]], cells.volume[part]
+        k, P, volume = pick(kappa, part), flux.excess[:, part], cells.volume[part]
+        slopes = v.slopes(cells, part)
         opposite = dict(zip(cells.pairs, cells.lengths[:, part], strict=True))
         l0, l1, l2 = opposite[1, 2], opposite[0, 2], opposite[0, 1]
         for hat, weight in zip(hats[:, :, None], weights, strict=True):
             Q = hat * P.sum(axis=0) - P + beyond.through(cells, part, hat)
-            Q -= 2.0 * k * cells.apply(c + bump_slopes(cells, height, hat), part)
+            Q -= 2.0 * k * cells.apply(slopes(hat), part)
             pull = np.stack(
                 [
                     (Q[2] - Q[1]) * l0 + Q[0] * (l2 - l1),

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from ..data.loads import Load, Segments
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
-from .beyond import Beyond, bump_slopes, quadrature
 from .companion import Companion, bump_squares, on_facet
 from .flux import Flux, field_squares
+from .shapes import local_thirds, quadrature
 from .sums import Sums
 
 FloatArray = npt.NDArray[np.float64]
@@ -49,9 +49,7 @@ def integrate(
         if kappa.values is None and flux.beyond is None:
             pp, bb, pb, vv = _exact(cells, kappa, part, P, c, W, height)
         else:
-            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(
-                cells, kappa, part, P, c, W, height, flux.beyond
-            )
+            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(cells, kappa, part, flux, v, w)
             around += near
             beside += far
             sums.far += float(np.sum(far))
@@ -77,6 +75,12 @@ def integrate(
             osc = square / pick(kappa.low, part)
             share += osc
             sums.load += float(np.sum(osc))
+            if v.thirds is not None:
+                third = local_thirds(cells, v.thirds, part)
+                rise = 12.0 / 180.0 * np.stack([hats[j] - hats[k] for j, k in cells.others])
+                fv += dot_rows(third, rise)
+                off = volume * np.sqrt(left[part] / 840.0) * sum_rows(np.abs(third))
+                sums.energy_slack += float(np.sum(off))
             if flux.beyond is not None:
                 far, near = _swollen(beside, osc), _swollen(around, osc)
                 sums.far += float(np.sum(far))
@@ -250,14 +254,7 @@ def _exact(
 
 
 def _by_quadrature(
-    cells: Cells,
-    kappa: Coefficient,
-    part: slice,
-    P: FloatArray,
-    c: FloatArray,
-    W: FloatArray,
-    height: FloatArray | None,
-    beyond: Beyond | None,
+    cells: Cells, kappa: Coefficient, part: slice, flux: Flux, v: Companion, w: FloatArray
 ) -> tuple[FloatArray, ...]:
     """The same for any κ and any y, and how far it may be from the truth.
 
@@ -265,26 +262,24 @@ def _by_quadrature(
         ∫_T of |p|², |b|², p·b and κ|∇v|²; and bounds of what quadrature may miss of ∫_T |p − b|²,
         ∫_T |p + b|² and ½∫_T κ|∇v|².
     """
-    values, cut = kappa.values, kappa.cut
-    rule, mean = kappa.rule, kappa.mean
+    values, cut, mean = kappa.values, kappa.cut, kappa.mean
     if values is None or cut is None:
         exact = ((pick(mean, part), weight, hat) for hat, weight in zip(*quadrature(), strict=True))
-        rows = _at_points(cells, mean, part, P, c, W, height, beyond, exact)
-        return *rows[:4], *np.zeros((3, len(P[0])))
+        rows = _at_points(cells, mean, part, flux, v, w, exact)
+        return *rows[:4], *np.zeros((3, part.stop - part.start))
+    rule = kappa.rule
     points = zip(values[:, part], rule.weights, rule.hats.T, strict=True)
-    rows = _at_points(cells, mean, part, P, c, W, height, beyond, points)
-    largest = (3 if beyond is None else 6) ** 2 if cells.tdim == 2 else (cells.tdim + 1) ** 2
+    rows = _at_points(cells, mean, part, flux, v, w, points)
+    largest = (3 if flux.beyond is None else 6) ** 2 if cells.tdim == 2 else (cells.tdim + 1) ** 2
     rows = _with_slack(rows, cut.errors[:, part], cells.tdim, largest)
     first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
     if first < last:
         pieces, within = cut.pieces[np.arange(first, last)], cut.errors_inside[:, first:last]
-        at = pieces.parent - part.start
         hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
         points = zip(kappa.inside[:, first:last], rule.weights, hats, strict=True)
-        of_cell = P[:, at], c[:, at], W[:, at], None if height is None else height[:, at]
-        there = _at_points(cells, mean, pieces.parent, *of_cell, beyond, points)
+        there = _at_points(cells, mean, pieces.parent, flux, v, w, points)
         there = _with_slack(there, within, cells.tdim, largest) * pieces.part
-        which, place = np.unique(at, return_inverse=True)
+        which, place = np.unique(pieces.parent - part.start, return_inverse=True)
         rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
     return tuple(rows)
 
@@ -313,11 +308,9 @@ def _at_points(
     cells: Cells,
     mean: FloatArray,
     where: slice | npt.NDArray[np.intp],
-    P: FloatArray,
-    c: FloatArray,
-    W: FloatArray,
-    height: FloatArray | None,
-    beyond: Beyond | None,
+    flux: Flux,
+    v: Companion,
+    w: FloatArray,
     points: Iterable[tuple[FloatArray, float, FloatArray]],
 ) -> FloatArray:
     """Means over points of |T| times what the gap is made of.
@@ -326,30 +319,29 @@ def _at_points(
 
     At a point with barycentric coordinates λ_k, y − κ_T∇u_h = Σ Q_k X_k / (d |T|) with
     Q_k = λ_k ΣP − P_k plus what y has beyond, and ∇(v − u_h) = Σ γ_k ∇λ_k with
-    γ_k = c_k + 4 Σ_l height_l λ_m, where k, l, m are the three vertices. As Σ Q_k = 0,
-    (Σ Q_k X_k)·∇λ_i = Q_i.
+    γ_k = c_k + 4 Σ_l height_l λ_m, where k, l, m are the three vertices, plus what v has beyond. As
+    Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
 
     Args:
         cells: The mesh.
         mean: κ_T.
         where: Which cells.
-        P: Fluxes of y − κ_T∇u_h out of the cells.
-        c: v − u_h at the vertices.
-        W: u_h at the vertices.
-        height: Heights of v's bumps.
-        beyond: What y has beyond its fluxes.
+        flux: y.
+        v: v.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
         points: κ, a weight, and the point's barycentric coordinates, shape (d + 1,) or (d + 1, n).
     """
     d, mean, volume = cells.tdim, pick(mean, where), cells.volume[where]
+    P, W, slopes = flux.excess[:, where], w[:, where], v.slopes(cells, where)
     s = sum_rows(P)
     gg = dot_rows(W, cells.apply(W, where))
     rows = np.zeros((9, len(volume)))
     for k, weight, hat in points:
         hat = hat.reshape(len(hat), -1)
         Q = hat * s - P
-        if beyond is not None:
-            Q += beyond.through(cells, where, hat)
-        gamma = c if height is None else c + bump_slopes(cells, height, hat)
+        if flux.beyond is not None:
+            Q += flux.beyond.through(cells, where, hat)
+        gamma = slopes(hat)
         qq = np.zeros_like(s)
         for (i, j), length in zip(cells.pairs, cells.lengths[:, where], strict=True):
             qq -= Q[i] * Q[j] * length

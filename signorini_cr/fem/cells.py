@@ -138,6 +138,17 @@ class Cells:
         return np.where(a * d > b * c, 1.0, -1.0)
 
     @cached_property
+    def ways(self) -> FloatArray:
+        """1 where a triangle goes along its facet as its neighbour does, shape (3, cells).
+
+        That is from the end with the lower local number to the other; −1 on one of both sides where
+        they do not agree.
+        """
+        name = self.domain.mesh.topology.index_map(0).local_to_global
+        names = name(self.vertices.ravel().astype(np.int32)).reshape(self.vertices.shape)
+        return np.stack([np.where(names[j] < names[k], 1.0, -1.0) for j, k in self.others])
+
+    @cached_property
     def sides(self) -> dict[int, Side]:
         """Boundary facets of owned cells."""
         mesh, d = self.domain.mesh, self.tdim
