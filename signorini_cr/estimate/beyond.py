@@ -22,13 +22,11 @@ class Beyond:
 
     Attributes:
         heights: Heights of ω's bumps by facet dof.
-        vertices: ω's values at the vertices, which y has in its fluxes.
         rise: ℓ_i, the values at the vertices of the affine part of f − f_T, shape (3, cells);
             None where f is constant on each cell.
     """
 
     heights: FloatArray
-    vertices: FloatArray
     rise: FloatArray | None
 
     def through(
@@ -52,9 +50,8 @@ class Beyond:
         return out
 
     def largest(self, cells: Cells) -> FloatArray:
-        """About the largest |ω| on each cell, shape (cells,)."""
-        of_bumps = np.abs(self.heights[cells.facets]).max(axis=0)
-        return np.asarray(np.abs(self.vertices[cells.vertices]).max(axis=0) + of_bumps)
+        """The largest |height| on each cell, shape (cells,)."""
+        return np.asarray(np.abs(self.heights[cells.facets]).max(axis=0))
 
     def field(self, cells: Cells) -> ufl.core.expr.Expr:
         """The curl of the bumps and τ = ⅓ (Σ ℓ_i λ_i X_i − ℓ x) as an expression; collective."""

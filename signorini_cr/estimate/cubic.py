@@ -20,14 +20,9 @@ from ..mesh.domain import CONTACT, DIRICHLET
 from .companion import Companion
 from .flux import Flux
 from .lifting import Cubic
-from .shapes import local_thirds, quadrature, third_slopes
+from .shapes import best_heights, local_thirds, quadrature, third_slopes
 
 FloatArray = npt.NDArray[np.float64]
-
-STEPS = 200
-"""Of conjugate gradients, at most."""
-SHARE = 1e-12
-"""Square of the part of the way that is left when they stop: the same on any number of ranks."""
 
 
 def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companion:
@@ -48,7 +43,7 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         found = _of_data(trace, values, side)
         thirds[side.dofs] = cells.ways[side.local, side.cells] * found
     cells.share(thirds)
-    _fit(cells, kappa, replace(v, thirds=thirds), np.where(cells.exterior, 0.0, 1.0))
+    thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
     contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)
     words = [word for rank in cells.comm.allgather(reasons) for word in rank if word]
     reason = v.reason or (words[0] if words else None)
@@ -90,38 +85,18 @@ def _of_data(
     return np.asarray((trace.weights * cubic) @ rest / size)
 
 
-def _fit(cells: Cells, kappa: FloatArray, v: Companion, free: FloatArray) -> None:
-    """Conjugate gradients for ‖κ^{1/2}(∇v − ∇u_h)‖² in the free heights; collective."""
-    assert v.thirds is not None
+def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> FloatArray:
+    """What brings ∇v nearest to ∇u_h, to be added to the heights of inner facets; collective."""
     hats, weights = quadrature()
     matrix, pull = np.zeros((3, 3, cells.number)), np.zeros((3, cells.number))
     for part in blocks(cells.number):
         slopes, signs = v.slopes(cells, part), cells.ways[:, part]
-        ones = np.ones_like(signs)
         for hat, weight in zip(hats[:, :, None], weights, strict=True):
-            scale, off = weight * pick(kappa, part), slopes(hat)
-            each = [
-                third_slopes(cells, np.where(np.arange(3)[:, None] == i, ones, 0.0), hat)
-                for i in range(3)
-            ]
+            off = slopes(hat)
+            each = [third_slopes(cells, signs * row[:, None], hat) for row in np.eye(3)]
             for i, own in enumerate(each):
-                flow = scale * signs[i] * cells.apply(own, part)
+                flow = weight * pick(kappa, part) * cells.apply(own, part)
                 pull[i, part] -= dot_rows(flow, off)
                 for j, other in enumerate(each):
-                    matrix[i, j, part] += signs[j] * dot_rows(flow, other)
-    down = cells.over_facets(pull) * free
-    weight = cells.over_facets(np.stack([matrix[i, i] for i in range(3)]))
-    weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
-    owned = slice(cells.owned_facets())
-    way = down / weight
-    first = square = cells.total(down[owned] @ way[owned])[0]
-    for _ in range(STEPS):
-        if not square > SHARE * first:
-            break
-        image = cells.over_facets(np.einsum("ijn,jn->in", matrix, way[cells.facets])) * free
-        length = square / cells.total(way[owned] @ image[owned])[0]
-        v.thirds[:] += length * way
-        down -= length * image
-        straight = down / weight
-        before, square = square, cells.total(down[owned] @ straight[owned])[0]
-        way = straight + square / before * way
+                    matrix[i, j, part] += dot_rows(flow, other)
+    return best_heights(cells, matrix, pull, ~cells.exterior)

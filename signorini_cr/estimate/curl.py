@@ -1,10 +1,10 @@
 """What y gains on thin cells, where fluxes that are constant on facets cannot follow κ∇u.
 
-y gets the curl of a continuous function ω of degree 2, which changes no divergence, and on each
-cell a field τ without normal components that carries the affine part of f − f_T. ω is what brings
-y + τ + curl ω nearest to κ∇v, by algebraic multigrid; it is 0 on Γ1 and Γg, so that y·n stays what
-it is there. ω's values at the vertices change the fluxes through facets; what its bumps and τ
-add to y is in `Beyond`. `docs/certificate.md` has the mathematics.
+y gets the curl of a continuous function ω, which changes no divergence, and on each cell a field τ
+without normal components that carries the affine part of f − f_T. ω is made of the bumps of facets;
+their heights are those that bring y + τ + curl ω nearest to κ∇(u_h + v)/2, the middle of what the
+bound is made of. On Γ1 and Γg they are 0, so that y·n stays what it is there. `docs/certificate.md`
+has the mathematics.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ..data.loads import Load
 from ..fem.cells import Cells, blocks, pick
 from ..mesh.domain import CONTACT, NEUMANN
-from .beyond import Beyond, turn
+from .beyond import Beyond
 from .companion import Companion
 from .flux import Flux, field_squares
 from .nearest import Slopes, nearest
@@ -61,55 +61,40 @@ def improve(cells: Cells, kappa: FloatArray, load: Load, flux: Flux, v: Companio
         v: v; its cusps do not count.
     """
     rise = None if load.hats is None else 12.0 * load.hats
-    nothing = np.zeros(len(cells.exterior))
-    flux.beyond = Beyond(nothing, nothing, rise)
-    loose, free = _loosened(cells, len(v.vertices))
-    slopes = _slopes(cells, kappa, flux, flux.beyond, v)
-    vertices, heights = nearest(cells, np.asarray(1.0 / kappa), slopes, loose, free)
-    vertices[~loose] = 0.0
-    heights[~free] = 0.0
-    flux.excess -= cells.turns * turn(vertices[cells.vertices])
-    flux.beyond = Beyond(heights, vertices, rise)
-
-
-def _loosened(cells: Cells, vertices: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Which of ω's values at vertices, and which heights, need not be 0; collective."""
-    at_vertices, at_facets = np.zeros(vertices), np.zeros(len(cells.exterior))
+    flux.beyond = Beyond(np.zeros(len(cells.exterior)), rise)
+    held = np.zeros(len(cells.exterior))
     for part in (CONTACT, NEUMANN):
-        at_vertices[cells.sides[part].ends] = 1.0
-        at_facets[cells.sides[part].dofs] = 1.0
-    if not cells.total(np.sum(at_facets))[0] and cells.comm.rank == 0:
-        at_vertices[:1] = 1.0  # ω counts up to a constant
-    return cells.share(at_vertices, 0) == 0.0, cells.share(at_facets) == 0.0
+        held[cells.sides[part].dofs] = 1.0
+    free = cells.share(held) == 0.0
+    slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa, flux, v), np.zeros(0))
+    none = np.zeros(len(v.vertices), dtype=bool)
+    _, heights = nearest(cells, np.asarray(1.0 / kappa), slopes, none, free)
+    flux.beyond = Beyond(np.where(free, heights, 0.0), rise)
 
 
-def _slopes(cells: Cells, kappa: FloatArray, flux: Flux, beyond: Beyond, v: Companion) -> Slopes:
-    """−½ of how ‖κ^{-1/2}(y + τ + curl ω − κ∇v)‖² changes with ω.
+def _pull(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> FloatArray:
+    """−∫ κ⁻¹ (y − κ∇(u_h + v)/2)·curl b_i on each cell, shape (3, cells).
 
-    With V = Σ Q_i X_i/(2|T|), Σ Q_i = 0, and k, a, b the vertices in their order,
-    V·curl λ_k = ((Q_a − Q_b) |X_a − X_b|² + Q_k (|X_b − X_k|² − |X_a − X_k|²)) / (8|T|²) with the
-    order's sign.
+    With V = Σ Q_i X_i/(2|T|), Σ Q_i = 0, and a, b the vertices before and after k,
+    V·curl λ_k = ((Q_a − Q_b) |X_a − X_b|² + Q_k (|X_b − X_k|² − |X_a − X_k|²)) / (8|T|²) if the
+    vertices turn left, else the negative of that.
     """
     hats, weights = quadrature()
-    vertices, facets = np.zeros((2, 3, cells.number))
+    pull = np.zeros((3, cells.number))
     for part in blocks(cells.number):
         k, P, volume = pick(kappa, part), flux.excess[:, part], cells.volume[part]
         slopes = v.slopes(cells, part)
         opposite = dict(zip(cells.pairs, cells.lengths[:, part], strict=True))
-        l0, l1, l2 = opposite[1, 2], opposite[0, 2], opposite[0, 1]
+        lengths = [opposite[1, 2], opposite[0, 2], opposite[0, 1]]
         for hat, weight in zip(hats[:, :, None], weights, strict=True):
-            Q = hat * P.sum(axis=0) - P + beyond.through(cells, part, hat)
-            Q -= 2.0 * k * cells.apply(slopes(hat), part)
-            pull = np.stack(
-                [
-                    (Q[2] - Q[1]) * l0 + Q[0] * (l2 - l1),
-                    (Q[0] - Q[2]) * l1 + Q[1] * (l0 - l2),
-                    (Q[1] - Q[0]) * l2 + Q[2] * (l1 - l0),
-                ]
-            )
-            pull *= -weight * cells.turns[part] / (8.0 * k * volume)
-            vertices[:, part] += pull
-            facets[0, part] += 4.0 * (hat[1] * pull[2] + hat[2] * pull[1])
-            facets[1, part] += 4.0 * (hat[0] * pull[2] + hat[2] * pull[0])
-            facets[2, part] += 4.0 * (hat[0] * pull[1] + hat[1] * pull[0])
-    return Slopes(vertices, facets, np.zeros(cells.number))
+            Q = hat * P.sum(axis=0) - P - k * cells.apply(slopes(hat), part)
+            if flux.beyond is not None:
+                Q += flux.beyond.through(cells, part, hat)
+            along = [
+                (Q[a] - Q[b]) * lengths[m] + Q[m] * (lengths[a] - lengths[b])
+                for m, a, b in ((0, 2, 1), (1, 0, 2), (2, 1, 0))
+            ]
+            scale = -0.5 * weight * cells.turns[part] / (k * volume)
+            for i, (a, b) in enumerate(cells.others):
+                pull[i, part] += scale * (hat[a] * along[b] + hat[b] * along[a])
+    return pull

@@ -11,6 +11,11 @@ from ..fem.cells import Cells
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
+STEPS = 200
+"""Of conjugate gradients, at most."""
+SHARE = 1e-20
+"""Square of the part of the way that is left when they stop: the same on any number of ranks."""
+
 
 def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
     """Numbers γ_k with ∇ Σ height_i b_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
@@ -40,3 +45,33 @@ def quadrature() -> tuple[FloatArray, FloatArray]:
     """Points and weights of a rule that is exact for |y|², shapes (q, 3) and (q,)."""
     points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
     return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
+
+
+def best_heights(
+    cells: Cells, matrix: FloatArray, pull: FloatArray, free: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """Heights that minimise a quadratic functional, by conjugate gradients; collective.
+
+    Args:
+        cells: The mesh.
+        matrix: The cells' shares of the matrix, shape (3, 3, cells).
+        pull: Those of the right side, shape (3, cells).
+        free: Which heights need not be 0, by facet dof.
+    """
+    down = cells.over_facets(pull) * free
+    weight = cells.over_facets(np.stack([matrix[i, i] for i in range(3)]))
+    weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
+    owned, heights = slice(cells.owned_facets()), np.zeros_like(down)
+    way = down / weight
+    first = square = cells.total(down[owned] @ way[owned])[0]
+    for _ in range(STEPS):
+        if not square > SHARE * first:
+            break
+        image = cells.over_facets(np.einsum("ijn,jn->in", matrix, way[cells.facets])) * free
+        length = square / cells.total(way[owned] @ image[owned])[0]
+        heights += length * way
+        down -= length * image
+        straight = down / weight
+        before, square = square, cells.total(down[owned] @ straight[owned])[0]
+        way = straight + square / before * way
+    return heights
