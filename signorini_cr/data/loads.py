@@ -314,10 +314,26 @@ class Segments:
         )
         return at, sizes.astype(np.float64)
 
-    def oscillation(self) -> tuple[IntArray, FloatArray]:
-        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each."""
-        squares = self.measure * (self.weights @ self.rest**2)
-        return self._by_cell(np.sqrt(np.bincount(self.place, squares, minlength=len(self.through))))
+    @cached_property
+    def slope(self) -> FloatArray:
+        """The a with a (λ_j − λ_k) nearest to q − g_F, j < k the ends, d = 2, shape (facets,)."""
+        moments = self.measure * (self.weights @ (self.rest * (self.hats[:, 0] - self.hats[:, 1])))
+        return np.asarray(3.0 * self._over_facets(moments) / self._over_facets(self.measure))
+
+    def _over_facets(self, amounts: FloatArray) -> FloatArray:
+        found = np.bincount(self.place, amounts, minlength=len(self.through))
+        return found.astype(np.float64)
+
+    def oscillation(self, carried: bool) -> tuple[IntArray, FloatArray]:
+        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each.
+
+        Args:
+            carried: Whether y carries q's affine part, and what is left of q − g_F is meant.
+        """
+        squares = self._over_facets(self.measure * (self.weights @ self.rest**2))
+        if carried:
+            squares = squares - self._over_facets(self.measure) * self.slope**2 / 3.0
+        return self._by_cell(np.sqrt(np.maximum(squares, 0.0)))
 
     def beyond(self) -> tuple[IntArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""

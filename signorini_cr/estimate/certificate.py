@@ -222,7 +222,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     if promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
             v = cubed(cells, kappa.mean, flux, v)
-        improve(cells, kappa.mean, load, flux, v)
+        improve(cells, kappa.mean, load, segments, flux, v)
         sums = integrate(cells, kappa, w, load, flux, v)
     cusps, known = v.cusps, (v.excess, v.bumps)
     unsure = 0.0 if cusps is None else cusps.add(cells, w, load, kappa.low, flux, known, sums)

@@ -3,7 +3,8 @@
 y gets the curl of a continuous function ω, which changes no divergence, and on each cell a field τ
 without normal components that carries the affine part of f − f_T. ω is made of the bumps of facets;
 their heights are those that bring y + τ + curl ω nearest to κ∇(u_h + v)/2, the middle of what the
-bound is made of. On Γ1 and Γg they are 0, so that y·n stays what it is there. `docs/certificate.md`
+bound is made of. On Γ1 they are 0, so that y·n stays what it is there; on Γg they are such that y·n
+is the affine function nearest to g. `docs/certificate.md`
 has the mathematics.
 """
 
@@ -12,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..data.loads import Load
-from ..fem.cells import Cells, blocks, pick
+from ..data.loads import Load, Segments
+from ..fem.cells import Cells, blocks, measures, pick
 from ..mesh.domain import CONTACT, NEUMANN
 from .beyond import Beyond
 from .companion import Companion
@@ -50,26 +51,34 @@ def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
     return bool(there > HELD * whole)
 
 
-def improve(cells: Cells, kappa: FloatArray, load: Load, flux: Flux, v: Companion) -> None:
+def improve(
+    cells: Cells, kappa: FloatArray, load: Load, edge: Segments, flux: Flux, v: Companion
+) -> None:
     """Give y the curl and τ; collective.
 
     Args:
         cells: The mesh, d = 2.
         kappa: Mean of κ, shape (cells,) or ().
         load: Moments of f.
+        edge: Values of g.
         flux: y, changed in place.
         v: v; its cusps do not count.
     """
     rise = None if load.hats is None else 12.0 * load.hats
-    flux.beyond = Beyond(np.zeros(len(cells.exterior)), rise)
-    held = np.zeros(len(cells.exterior))
+    given, held = np.zeros((2, len(cells.exterior)))
+    # ω = 4 height λ_j λ_k has the slope 4 height (λ_j − λ_k)/|F|; to the left of the facet's normal
+    # it goes from j to k, but for the facet 1 of cells whose vertices turn left
+    side = cells.sides[NEUMANN]
+    left = np.where(side.local == 1, -1.0, 1.0) * cells.turns[side.cells]
+    given[side.dofs] = left * edge.slope * measures(cells, side) / 4.0
     for part in (CONTACT, NEUMANN):
         held[cells.sides[part].dofs] = 1.0
-    free = cells.share(held) == 0.0
+    given, free = cells.share(given), cells.share(held) == 0.0
+    flux.beyond = Beyond(given, rise)
     slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa, flux, v), np.zeros(0))
     none = np.zeros(len(v.vertices), dtype=bool)
     _, heights = nearest(cells, np.asarray(1.0 / kappa), slopes, none, free)
-    flux.beyond = Beyond(np.where(free, heights, 0.0), rise)
+    flux.beyond = Beyond(np.where(free, heights, given), rise)
 
 
 def _pull(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> FloatArray:

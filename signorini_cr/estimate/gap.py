@@ -140,7 +140,7 @@ def integrate_edge(
         This rank's share of the square of what goes into ω.
     """
     side, d = edge.side, cells.tdim
-    at, sizes = edge.oscillation()
+    at, sizes = edge.oscillation(flux.beyond is not None)
     low = pick(kappa.low, at)
     assert sums.indicators is not None
     assert sums.middle is not None and sums.across is not None
