@@ -21,6 +21,7 @@ from .. import compat
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient, Sampled
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
+from ..jit import compiled
 from ..mesh.domain import CONTACT
 from .beyond import Beyond
 from .companion import Companion, companion, on_facet
@@ -98,7 +99,7 @@ class Certificate:
         y = fem.Function(fem.functionspace(mesh, ("RT", 1 if beyond is None else 2)))
         points = y.function_space.element.interpolation_points
         points = points() if callable(points) else points
-        y.interpolate(fem.Expression(field, points))
+        y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 
     @cached_property

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..fem.cells import dot_rows, sum_rows
 from ..fem.space import ghosted_vector, shared_sum
+from ..jit import compiled
 from ..mesh.domain import CONTACT, DIRICHLET
 from ..options import AMG
 from ..vi.solved import Solved
@@ -110,7 +111,7 @@ def _weight(solution: Certified) -> fem.Function:
     marks.x.array[:] = 0.0
     marks.x.array[parts[CONTACT]] = 1.0
     bc = fem.dirichletbc(marks, fixed)
-    form = fem.form(ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    form = compiled(mesh.comm, fem.form, ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])
