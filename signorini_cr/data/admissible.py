@@ -92,10 +92,10 @@ def differs(cells: Cells, side: Side, gap: FloatArray, scale: float, *data: Trac
     Returns:
         Whether they do on this rank.
     """
-    precision = Precision.of(cells.domain.mesh).vertices
     vertex, facet = np.nonzero(gap > TOLERANCE * scale)
-    if not len(facet):
+    if not cells.comm.allreduce(len(facet)):
         return False
+    precision = Precision.of(cells.domain.mesh).vertices
     x = corner_points(cells, side)[1][vertex, facet]
     points = np.zeros((len(x), 3))
     points[:, : x.shape[1]] = x

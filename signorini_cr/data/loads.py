@@ -12,7 +12,7 @@ from mpi4py import MPI
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare
 from ..fem.space import facet_quadrature
 from ..mesh.domain import NEUMANN
-from .jets import Boxes, Unknown
+from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, Trace, Volume
 from .ranges import Cut, Pieces, cut, errors_on, refine
 
@@ -145,7 +145,7 @@ class Certain:
         deviation, points = f.deviation, np.hstack([fine.rule.hats, fine.plain.hats])
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-            quadratic, cubic = deviation(boxes, half, hats=points)
+            quadratic, cubic = deviation(Enclosure(boxes), half, hats=points)
             return np.stack([cubic, quadratic**2])
 
         reach = 4.0 * poincare(cells.tdim) ** 2 * cells.diameter2 * cells.volume / low
@@ -251,7 +251,7 @@ class Segments:
         if not known:
 
             def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-                quadratic, cubic = g.deviation(boxes, half, hats=hats.T)
+                quadratic, cubic = g.deviation(Enclosure(boxes), half, hats=hats.T)
                 return np.stack([cubic, quadratic**2])
 
             here, goal = pick(low, facets.cells), SHARE * size

@@ -6,7 +6,6 @@ where they are numbers exactly.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from math import factorial
@@ -24,7 +23,7 @@ from .. import compat
 from ..fem.cells import Cells
 from ..fem.problem import Forms, number
 from ..fem.space import facet_quadrature
-from .jets import Boxes, Enclosure, strips_of
+from .jets import Boxes, Enclosure, values
 from .ranges import Cut, Deviation, Range, cut, range_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -169,16 +168,17 @@ class Coefficient:
         """
         if self.values is None:
             return
-        strips = strips_of(self.deviation.expression)
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-            (r, w), (s, x) = (self.deviation(boxes, half, inverse) for inverse in (False, True))
+            at = Enclosure(boxes)
+            (r, w), (s, x) = (self.deviation(at, half, inverse) for inverse in (False, True))
             low, high = np.zeros((2, len(r)))
-            if strips and boxes.corners is not None:
-                jet = Enclosure(replace(boxes, corners=None), order=0)(self.deviation.expression)
-                part = strips * boxes.strip_part
-                low, high = part / np.maximum(jet.low, 1e-300), part * jet.high
-            return np.stack([r, self._ratio(boxes, r, s), w, x, low, high, r**2])
+            if at.strips.any():
+                which = np.flatnonzero(at.strips)
+                jet = Enclosure(boxes.whole(which), order=0)(self.deviation.expression)
+                part = (at.strips * boxes.strip_part)[which]
+                low[which], high[which] = part / np.maximum(jet.low, 1e-300), part * jet.high
+            return np.stack([r, self._ratio(at, r, s), w, x, low, high, r**2])
 
         # of the bound's square: (e + 2 R a)² for e², a norm κ^{-1/2} weighs
         weights = self.rule.weights
@@ -202,26 +202,23 @@ class Coefficient:
         )
         self.inside = self.deviation.values(self.cut.pieces, cells, self.rule.hats)
 
-    def _ratio(self, boxes: Boxes, r: FloatArray, s: FloatArray) -> FloatArray:
+    def _ratio(self, at: Enclosure, r: FloatArray, s: FloatArray) -> FloatArray:
         """T on boxes, with R for κ and for 1/κ given, shape (n,).
 
         Let q be the quadratic through κ⁻¹ at the rule's points. 1 − κq is within R|q| of a
         polynomial of degree 4, which is known at the points up to R|q|. Without points R for κ⁻¹
         has to do.
         """
-        jet = Enclosure(boxes, order=0)(self.deviation.expression)
+        boxes = at.boxes
         with np.errstate(all="ignore"):
-            excess = 2.0 * jet.high * s
+            excess = 2.0 * at(self.deviation.expression).high * s
             if boxes.corners is None:
                 return np.where(np.isnan(excess), np.inf, excess)
             hats = self.rule.hats
-            at = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
+            x = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
             cells = None if boxes.cells is None else np.tile(boxes.cells, hats.shape[1])
-            there = Enclosure(Boxes(at, at, cells=cells, mesh=boxes.mesh), order=0)
-            jet = there(self.deviation.expression)
-            values = np.broadcast_to(0.5 * (jet.low + jet.high), at.shape[1])
-            values = values.reshape(hats.shape[1], len(r))
-            excess = np.fmin(excess, self._by_points(values, r))
+            there = values(self.deviation.expression, Boxes(x, x, cells=cells, mesh=boxes.mesh))
+            excess = np.fmin(excess, self._by_points(there.reshape(hats.shape[1], len(r)), r))
             return np.where(np.isnan(excess), np.inf, excess)
 
     def _by_points(self, values: FloatArray, r: FloatArray) -> FloatArray:

@@ -132,7 +132,7 @@ def unbalanced(
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if level.domain is not cells.domain:
-        cells = Cells(level.domain, level.V)
+        cells = level.cells  # kept: all finer meshes of a sequence ask for the same walk
     return float(bound + _carried(cells, left, kappa_min, signed))
 
 
