@@ -656,12 +656,21 @@ def _split(
         both = probes[0] + probes[1] + probes[2] + finer
         everywhere = errors(both)
         inside, probed = everywhere[:, 3 * len(new) :], everywhere[:, : 3 * len(new)]
+    # what is bounded by a singular point in its corner is not so in slabs
+    lost = np.bincount(origin[~np.isfinite(inside).all(axis=0)], minlength=len(known)) > 0
+    lost &= np.isfinite(share[known])
+    kept = np.flatnonzero(~lost[origin])
+    back = known[lost]
+    finer, origin, made, inside = finer[kept], origin[kept], made[kept], inside[:, kept]
     before, n = np.clip(share[known], 0, 1e300), len(known)
     amounts = finer.part * _shares(weights[:, finer.parent], inside)
     sums = np.clip(np.bincount(origin, amounts, minlength=n), 0, 1e300)
     # what did little may be followed by another way
     idle = sums > before / np.maximum(np.bincount(origin, minlength=n), 1) ** IDLE
     made = np.where(idle[origin], UNKNOWN, made)
+    if len(back):
+        finer, inside = finer + pieces[back], np.hstack([inside, errors_of[:, back]])
+        made = np.concatenate([made, np.full(len(back), QUARTERS)])
     if probed is None:
         return finer, inside, made
     of_probes = np.tile(some.parent, 3)

@@ -133,7 +133,7 @@ def unbalanced(
 
 
 def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
-    """Add to y what the cells lack, carried to Γ0 from cell to cell, where that is worth it; collective.
+    """Add to y what the cells lack, carried to Γ0 cell by cell, where that is worth it; collective.
 
     Args:
         cells: The mesh.
@@ -236,8 +236,8 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
 
     load = np.tile(left / (d + 1), (d + 1, 1))
     diagonal = cells.over_facets(d**2 * kappa * cells.squares(slice(0, cells.number)))
-    z, r = np.zeros(len(free)), assembled(load)
-    p, before = np.zeros(len(free)), np.inf
+    r, before = assembled(load), np.inf
+    z, p = np.zeros_like(r), np.zeros_like(r)
     for _ in range(STEPS):
         s = r / diagonal
         now = product(r, s)
