@@ -332,6 +332,38 @@ def test_residual_functional_is_bounded():
             assert all(work <= bound * norm for bound in bounds)
 
 
+def test_what_is_carried_away_does_not_depend_on_the_ranks():
+    """On squares most cells have several ways to Γ0, and none of them is the first."""
+    bounds = []
+    for comm in (WORLD, MPI.COMM_SELF):
+        domain = exact.S1_NEUMANN.structured(6, comm)
+        level = solve(exact.S1_NEUMANN.problem, domain).level
+        cells, mesh = Cells(level.domain, level.V), domain.mesh
+        x = mesh.geometry.x[cell_nodes(mesh)[: cells.number]].mean(axis=1)
+        left = cells.volume * np.exp(-3 * x[:, 0])
+        bounds.append([unbalanced(level, cells, left, np.array(1.0), s) for s in (0.0, np.inf)])
+    assert np.allclose(*bounds, rtol=1e-10, atol=0)
+    # the second is that of the walk alone
+    assert bounds[0][0] < 0.8 * bounds[0][1]
+
+
+def test_load_with_infinitely_many_kinks():
+    """The figure of docs/certificate.md; the same on any ranks, as far as the solver gets."""
+    options = PETSc.Options("signorini_")
+    options["snes_atol"], options["ksp_rtol"] = 1e-14, 1e-12
+    try:
+        solution = solve(exact.I.problem, exact.I.structured(8))
+        certificate = solution.certificate
+        assert certificate.bound_h1 / solution.errors[0] == pytest.approx(1.156, abs=0.01)
+        if WORLD.size > 1:
+            alone = solve(exact.I.problem, exact.I.structured(8, MPI.COMM_SELF)).certificate
+            assert certificate.bound_h1 == pytest.approx(alone.bound_h1, rel=1e-10)
+            assert certificate.energy == pytest.approx(alone.energy, rel=1e-10)
+    finally:
+        for name in ("snes_atol", "ksp_rtol"):
+            options.delValue(name)
+
+
 # ---- P1
 
 

@@ -359,3 +359,38 @@ def test_same_figures_on_any_number_of_ranks():
     )
     assert np.isclose(here.bound_h1, alone.bound_h1, rtol=1e-5)
     assert np.allclose(here.energy, alone.energy, rtol=1e-5)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_an_angle_that_jumps_along_the_boundary(side):
+    """r^{3/2} cos(3θ/2) on a turned square, with the cut of atan2 along its contact side."""
+    c, s = np.cos(0.7), np.sin(0.7)
+    corners = np.array([(-1, 0), (1, 0), (1, 1), (-1, 1)]) @ np.array([[c, s], [-s, c]])
+    polygon = Polygon(corners, ["contact", "dirichlet", "dirichlet", "dirichlet"])
+
+    def u(x):
+        a, b = c * x[0] + s * x[1], c * x[1] - s * x[0]
+        return (a**2 + b**2) ** 0.75 * ufl.cos(1.5 * ufl.atan2(side * b, a))
+
+    solution = solve(Problem(f=0.0, exact=u), polygon.mesh(0.25))
+    assert 1.0 <= solution.certificate.bound_h1 / solution.errors[0] <= 1.02
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_angles_hold_on_triangles_beside_their_cut(side):
+    x = ufl.SpatialCoordinate(exact.S1.structured(1, MPI.COMM_SELF).mesh)
+    rng = np.random.default_rng(5)
+    turn = rng.uniform(-np.pi, np.pi, 30)
+    c, s = np.cos(turn), np.sin(turn)
+    for k in range(30):
+        a, b = c[k] * x[0] + s[k] * x[1], c[k] * x[1] - s[k] * x[0]
+        flat = np.array([rng.uniform(-2, 0.3, 3), [0.0, 0.0, side * rng.uniform(0.1, 1)]])
+        triangle = np.array([[c[k], -s[k]], [s[k], c[k]]]) @ flat
+        low, high = triangle.min(axis=1)[:, None], triangle.max(axis=1)[:, None]
+        jet = Enclosure(Boxes(low, high, corners=triangle.T[:, :, None]))(ufl.atan2(b, a))
+        hats = rng.dirichlet(np.ones(3), 50).T
+        at = flat @ hats
+        angle = np.arctan2(at[1], at[0])
+        assert np.all((jet.low <= angle) & (angle <= jet.high))
+        if flat[0].max() < -0.1:  # one-sided
+            assert jet.high - jet.low < np.pi

@@ -160,9 +160,9 @@ def is_local(expression: Any) -> bool:
 
 
 def has_conditions(expression: Any) -> bool:
-    """Whether the expression may jump by a choice between two others."""
+    """Whether the expression may jump: by a choice between two others, or as an angle."""
     return any(
-        isinstance(e, classes.Conditional)
+        isinstance(e, classes.Conditional | classes.Atan2)
         for e in ufl.corealg.traversal.unique_pre_traversal(expression)
     )
 
@@ -392,6 +392,8 @@ class Enclosure:
                 low, high = np.fmin(low, angle), np.fmax(high, angle)
         low, high = out((low, high), LOOSE)
         full = ((a.low < 0) & (a.high >= 0) & (b.low < 0)) | ~np.isfinite(low + high)
+        if self.boxes.corners is not None and full.any():
+            low, high, full = self._beside_cut(a, b, (low, high), full)
         rest = self._of_logarithm(a, b, (low, high))
         rows = self._every if full.any() else rest.rows
         mid, rad = rest.on(rows)
@@ -418,6 +420,27 @@ class Enclosure:
             )
             real, imaginary = xu + -yv, xv + yu
         return imaginary
+
+    def _beside_cut(
+        self, a: Jet, b: Jet, found: Range, full: BoolArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Go on with the angle across its jump where that does not enter the simplex.
+
+        Where a ≥ 0 the angle is π/2 − atan2(b, a), and where a ≤ 0 it is atan2(b, −a) − π/2. They
+        jump where a has the other sign and b is 0, and nowhere else.
+        """
+        low, high = found
+        bottom, top, _ = self._difference(a, self._constant(0.0))
+        for sign, beside in ((1.0, bottom >= 0), (-1.0, top <= 0)):
+            ends = (a.low, a.high) if sign > 0 else (-a.high, -a.low)
+            here = full & beside & ~((ends[0] <= 0) & (b.low <= 0) & (b.high >= 0))
+            angles = [np.arctan2(x, y) for x in (b.low, b.high) for y in ends]
+            turned = out((np.minimum.reduce(angles), np.maximum.reduce(angles)), LOOSE)
+            first, last = (sign * (0.5 * np.pi - angle) for angle in turned)
+            rows = out((np.minimum(first, last), np.maximum(first, last)), LOOSE)
+            low, high = np.where(here, rows[0], low), np.where(here, rows[1], high)
+            full = full & ~here
+        return low, high, full
 
     # ---- choices
 

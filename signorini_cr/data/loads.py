@@ -162,7 +162,7 @@ class Certain:
         return cls(load.refined(fine, cells, found), missed, rough, reason)
 
 
-SHARE = 2e-3
+SHARE = 4e-3
 """What may be missed of f, in parts of the bound, or thereabouts."""
 UNBOUNDED = "f is not bounded on the mesh, or not known to be"
 

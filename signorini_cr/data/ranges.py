@@ -50,7 +50,7 @@ ROUNDS = 20
 """How often pieces are cut at most."""
 BISECTIONS = 6
 """Steps towards the smallest size that there is room for."""
-CELLS = 20_000
+CELLS = 60_000
 """Cells that may have boxes of their own, if that is more than twice the pieces."""
 LEAST = 1e-11
 """Part of a cell, or of a facet, that is not cut any more: coordinates have so many digits."""

@@ -202,10 +202,10 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
     flux.excess[there] += change
     np.add.at(flux.left, edge.side.cells, change)
-    left = unbalanced(level, cells, flux.left, kappa.low)
+    left = unbalanced(level, cells, flux.left, kappa.low, size)
     carried = balance(cells, flux, kappa.low, size, left)
     if carried:
-        left = unbalanced(level, cells, flux.left, kappa.low)
+        left = unbalanced(level, cells, flux.left, kappa.low, size)
     excess = field_squares(cells, flux.excess, slice(0, cells.number))
     kappa.enclose(cells, slopes, excess, size)
     if solution.element != "CR":
@@ -239,7 +239,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, *with_lift
     )
     lift = np.sqrt(lift)
-    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums)
+    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums, size)
     rounding = _rounding(cells, kappa, w, load, flux)
     loose = np.sqrt(edge_square) + left + hidden + rounding
     same = total["flux"] + total["companion"] + total["load"]
@@ -367,11 +367,13 @@ def _hidden(
     segments: Segments,
     v: Companion,
     sums: Sums,
+    size: float,
 ) -> tuple[float, float]:
     """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
 
     On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
-    on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise.
+    on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise. Whatever the signs of the first
+    terms, they are bounded as if all were the same: by what they are for |e|, which has ∇e's norm.
     """
     counts = certain.missed is not None, bool(segments.missed.any())
     if not any(cells.total(*counts)):
@@ -394,7 +396,7 @@ def _hidden(
     change += segments.change(v.vertices, v.bumps)
     square, on_edge, change = cells.total(square, on_edge**2, change)
     loose = np.sqrt(square) + np.sqrt(on_edge)
-    return loose + unbalanced(level, cells, missed, kappa.low, False), float(change)
+    return loose + unbalanced(level, cells, missed, kappa.low, size), float(change)
 
 
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:

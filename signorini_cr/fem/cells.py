@@ -181,10 +181,11 @@ class Cells:
         return mark.array > 0
 
     @cached_property
-    def layers(self) -> list[tuple[IntArray, IntArray]]:
+    def layers(self) -> list[tuple[IntArray, npt.NDArray[np.bool_]]]:
         """Cells by the number of facets between them and Γ0, nearest first.
 
-        Each layer has its cells and, for each, the local facet that leads back towards Γ0.
+        Each layer has its cells, shape (n,), and which of their local facets lead back towards Γ0,
+        shape (d + 1, n): one or more.
         """
         d = self.tdim
         owners = np.full((2, len(self.exterior)), -1)
@@ -192,7 +193,7 @@ class Cells:
         owners[0, flat] = cell
         other = owners[0, flat] != cell
         owners[1, flat[other]] = cell[other]
-        way_out = np.full(self.number, -1, dtype=np.intp)
+        reached = np.zeros(self.number, dtype=bool)
         front = np.zeros(len(self.exterior))
         front[self.sides[DIRICHLET].dofs] = 1.0
         seen = self.share(front) > 0
@@ -200,10 +201,10 @@ class Cells:
         while self.comm.allreduce(len(found)) > 0:
             near = owners[:, found].ravel()
             layer = np.unique(near[near >= 0])
-            layer = layer[way_out[layer] < 0]
+            layer = layer[~reached[layer]]
             facets = self.facets[:, layer]
-            way_out[layer] = np.argmax(seen[facets], axis=0)
-            layers.append((layer, way_out[layer]))
+            reached[layer] = True
+            layers.append((layer, seen[facets]))
             new = np.unique(facets[~seen[facets]])
             if self.comm.size > 1:
                 theirs = self.from_others(new, np.ones(len(new))) > 0

@@ -25,6 +25,7 @@ from ufl.core.expr import Expr
 from ..errors import InputError
 from ..jit import compiled
 from ..mesh.domain import NEUMANN, Domain
+from .simplified import simplified
 from .space import facet_entities, ufl_element
 
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
@@ -152,7 +153,7 @@ class Forms:
                 return as_expression(data, self.x)
             return ufl.as_ufl(0.0) if flux is None else derived()
 
-        self.f = given(problem.f, lambda: -ufl.div(flux))
+        self.f = given(problem.f, lambda: simplified(-ufl.div(flux)))
         self.g = given(problem.g, lambda: ufl.dot(flux, n))
         boundary = self.exact if problem.dirichlet is None else problem.dirichlet
         self.dirichlet = as_expression(0.0 if boundary is None else boundary, self.x)
