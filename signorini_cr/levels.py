@@ -173,6 +173,7 @@ def _solve(
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
     contact = contact_facts(
         level.domain,
+        system.bounded_facets,
         u,
         residual,
         diagonal=diagonal,

@@ -11,7 +11,6 @@ from mpi4py import MPI
 
 from ..fem.cells import Cells, Side, blocks, measures, pick, poincare
 from ..fem.space import facet_quadrature
-from ..mesh.domain import NEUMANN
 from .jets import Boxes, Unknown
 from .moments import LOAD_DEGREE, Trace, Volume
 from .ranges import Cut, Pieces, cut, errors_on, refine
@@ -168,10 +167,9 @@ class Edge:
         shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
     """
 
-    def __init__(self, g: Trace, cells: Cells):
+    def __init__(self, g: Trace, side: Side, cells: Cells):
         """Evaluate g."""
-        self.g, self._cells = g, cells
-        self.side = cells.sides[NEUMANN]
+        self.g, self.side, self._cells = g, side, cells
         _, _, self.values = g.at(cells.domain.mesh, self.side.entities)
         self.measure = measures(cells, self.side)
         self.shares = self.measure * (g.hats.T * g.weights @ self.values)

@@ -342,17 +342,20 @@ class Sampled:
     @cached_property
     def u_D(self) -> Trace:
         """Values on Γ0."""
-        return Trace(self._forms.dirichlet, self._forms)
+        (dirichlet,) = self._forms.fixed
+        return Trace(dirichlet.fixed, self._forms)
 
     @cached_property
     def alpha(self) -> Trace:
         """Obstacle."""
-        return Trace(self._forms.obstacle, self._forms)
+        (contact,) = self._forms.bounded
+        return Trace(contact.lower, self._forms)
 
     @cached_property
     def g(self) -> Trace:
         """Flux on Γg."""
-        return Trace(self._forms.g, self._forms)
+        (neumann,) = self._forms.natural
+        return Trace(neumann.flux, self._forms)
 
     @classmethod
     def of(cls, forms: Forms) -> Sampled:

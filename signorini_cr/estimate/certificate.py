@@ -21,7 +21,6 @@ from .. import compat
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient, Sampled
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
-from ..mesh.domain import CONTACT
 from .companion import Companion, companion, on_facet
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, unbalanced
@@ -161,6 +160,8 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     level, u = base.level, base.u
     if base.element != "CR" or base.domain is not solution.domain:
         return Certificate(reason=NO_FLUX)
+    if level.forms.uncertified is not None:
+        return Certificate(reason=level.forms.uncertified)
     data = Sampled.of(level.forms)
     if data.kappa is None:
         return Certificate(reason=TENSOR)
@@ -170,10 +171,13 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
     slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
-    contact_side = cells.sides[CONTACT]
+    (on_fixed,), (contact_side,) = (
+        [cells.sides[condition.number] for condition in which]
+        for which in (level.forms.fixed, level.forms.bounded)
+    )
     obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
     gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
-    flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
+    flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
     size = _size(cells, kappa, w, flux, slopes)
     certain = Certain.of(data.f, load, cells, kappa.low, size)
     if certain.reason is not None:
@@ -204,7 +208,19 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     steady = kappa.high - kappa.low <= STEADY * kappa.mean
     goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
     v = companion(
-        cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps, steady, goal
+        cells,
+        kappa.mean,
+        w,
+        u.x.array,
+        flux,
+        on_fixed,
+        data.u_D,
+        contact_side,
+        data.alpha,
+        obstacle,
+        sweeps,
+        steady,
+        goal,
     )
     sums = integrate(cells, kappa, w, load, flux, v)
     cusps, known = v.cusps, (v.excess, v.bumps)

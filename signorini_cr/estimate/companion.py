@@ -19,7 +19,6 @@ import numpy.typing as npt
 from ..data.admissible import differs
 from ..data.moments import Trace
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
-from ..mesh.domain import CONTACT, DIRICHLET
 from .cusps import Cusps
 from .flux import Flux
 from .lifting import Lift, Quadratic, affine, lift
@@ -71,7 +70,9 @@ def companion(
     w: FloatArray,
     u: FloatArray,
     flux: Flux,
+    fixed: Side,
     u_D: Trace,
+    contact: Side,
     alpha: Trace,
     on_contact: tuple[FloatArray, FloatArray, FloatArray],
     sweeps: int,
@@ -86,14 +87,15 @@ def companion(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         u: u_h by facet dof.
         flux: y.
-        u_D: Values on Γ0.
-        alpha: Obstacle on Γ1.
+        fixed: The facets of Γ0.
+        u_D: Values there.
+        contact: The facets of Γ1.
+        alpha: Obstacle there.
         on_contact: Its values.
         sweeps: How often the bumps are improved.
         steady: Where κ is constant on the cell, shape (cells,) or ().
         goal: What ‖∇ℓ‖ need not be known better than.
     """
-    fixed, contact = cells.sides[DIRICHLET], cells.sides[CONTACT]
     on_fixed = u_D.at(cells.domain.mesh, fixed.entities)
     obstacle, middle, _ = on_contact
     touching = flux.touching
@@ -135,9 +137,9 @@ def companion(
                 cells, kappa, steady, w, (v, bumps), (loose, free), contact, on_contact[:2]
             )
             excess = v[cells.vertices] - w
-    sides = ((fixed, u_D, on_fixed), (contact, alpha, on_contact))
     lifts = [
-        _lift(cells, side, trace, values, v, bumps, scale, goal) for side, trace, values in sides
+        _lift(cells, fixed, u_D, on_fixed, v, bumps, scale, goal, obstacle=False),
+        _lift(cells, contact, alpha, on_contact, v, bumps, scale, goal, obstacle=True),
     ]
     wrong += [lift.reason for lift in lifts]
     # y·n is constant on a facet: the mean of v + ℓ − α
@@ -398,12 +400,12 @@ def _lift(
     bumps: FloatArray,
     scale: float,
     goal: float,
+    obstacle: bool,
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
     if cells.tdim != 2:
         return affine(cells, side, trace, v[side.ends], values[0], scale)
     ends, middle, _ = values
     companion = Quadratic(v[side.ends], bumps[side.dofs])
-    obstacle = side is cells.sides[CONTACT]
     base = Quadratic(ends, middle - ends.mean(axis=0)) if obstacle else companion
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data.loads import Edge, Load
-from ..fem.cells import Cells, blocks, pick, poincare, sum_rows
-from ..mesh.domain import CONTACT, NEUMANN
+from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
 
 if TYPE_CHECKING:
     from ..vi.assembly import Level
@@ -43,7 +42,13 @@ class Flux:
 
 
 def equilibrate(
-    cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge: Edge, gap: FloatArray
+    cells: Cells,
+    kappa: FloatArray,
+    w: FloatArray,
+    load: Load,
+    edge: Edge,
+    on_contact: Side,
+    gap: FloatArray,
 ) -> Flux:
     """Find the facet fluxes of y from the local residuals of u_h.
 
@@ -58,7 +63,8 @@ def equilibrate(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f.
         edge: Integrals of g.
-        gap: u_h − α on the facets of Γ1, by means, shape (n,).
+        on_contact: The facets of Γ1.
+        gap: u_h − α on them, by means, shape (n,).
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
@@ -67,8 +73,7 @@ def equilibrate(
         shares = load.shares(cells, part)
         np.negative(shares, out=excess[:, part])
         fluxes[:, part] = -d * pick(kappa, part) * cells.apply(w[:, part], part) - shares
-    on_contact, on_neumann = cells.sides[CONTACT], cells.sides[NEUMANN]
-    through = edge.shares.sum(axis=0)
+    on_neumann, through = edge.side, edge.shares.sum(axis=0)
     for i, share in enumerate(edge.to_cells()):
         # the facet itself gets all of it further down
         share = np.where(on_neumann.local == i, 0.0, share)
@@ -129,7 +134,7 @@ def unbalanced(
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if level.domain is not cells.domain:
-        cells = Cells(level.domain, level.V)
+        cells = level.cells
     return float(bound + _carried(cells, left, kappa_min, signed))
 
 

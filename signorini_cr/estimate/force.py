@@ -14,8 +14,8 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 from ..fem.cells import dot_rows, sum_rows
+from ..fem.conditions import facets_of
 from ..fem.space import ghosted_vector, shared_sum
-from ..mesh.domain import CONTACT, DIRICHLET
 from ..options import AMG
 from ..vi.solved import Solved
 from .certificate import Certificate
@@ -96,26 +96,27 @@ def _weight(solution: Certified) -> fem.Function:
     mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
     V = fem.functionspace(mesh, ("Lagrange", 1))
     phi, marks = fem.Function(V), fem.Function(V)
-    parts = {}
-    for part in (CONTACT, DIRICHLET):
+    forms, parts = solution.level.forms, []
+    for conditions in (forms.bounded, forms.fixed):
         marks.x.array[:] = 0.0
-        marks.x.array[fem.locate_dofs_topological(V, fdim, domain.facets(part))] = 1.0
+        marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, conditions))] = 1.0
         seen = shared_sum(mesh.comm, V.dofmap.index_map, marks.x.array)
-        parts[part] = np.flatnonzero(seen > 0).astype(np.int32)
-    both = len(np.intersect1d(parts[CONTACT], parts[DIRICHLET]))
+        parts.append(np.flatnonzero(seen > 0).astype(np.int32))
+    bounded, fixed = parts
+    both = len(np.intersect1d(bounded, fixed))
     if mesh.comm.allreduce(both) > 0:
         raise InputError(f"the contact force has no bounds: {TOUCHES}")
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    fixed = np.concatenate(list(parts.values()))
+    known = np.concatenate(parts)
     marks.x.array[:] = 0.0
-    marks.x.array[parts[CONTACT]] = 1.0
-    bc = fem.dirichletbc(marks, fixed)
+    marks.x.array[bounded] = 1.0
+    bc = fem.dirichletbc(marks, known)
     form = fem.form(ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])
     b.x.scatter_reverse(InsertMode.add)
-    b.x.array[fixed] = marks.x.array[fixed]
+    b.x.array[known] = marks.x.array[known]
     ksp = PETSc.KSP().create(mesh.comm)
     ksp.setOperators(A)
     ksp.setType(PETSc.KSP.Type.CG)
@@ -126,7 +127,7 @@ def _weight(solution: Certified) -> fem.Function:
     for thing in (ksp, A, *vectors):
         thing.destroy()
     # Exactly so, whatever the solver did
-    phi.x.array[parts[CONTACT]] = 1.0
-    phi.x.array[parts[DIRICHLET]] = 0.0
+    phi.x.array[bounded] = 1.0
+    phi.x.array[fixed] = 0.0
     phi.x.scatter_forward()
     return phi

@@ -16,10 +16,11 @@ from ..data.loads import Edge, Load, chi
 from ..data.moments import Sampled
 from ..errors import InputError
 from ..fem.cells import Cells
+from ..fem.conditions import facets_of
 from ..fem.problem import Forms
 from ..fem.space import function_space
 from ..garbage import hold, sweep
-from ..mesh.domain import CONTACT, DIRICHLET, Domain
+from ..mesh.domain import Domain
 from ..multigrid.cycle import LONG_SWEEPS, SWEEPS, Grid, Patience
 from ..multigrid.masking import numbers_of
 from ..multigrid.parents import Layout, Parents
@@ -72,7 +73,7 @@ class Level:
     @cached_property
     def cells(self) -> Cells:
         """The mesh as arrays, for the Crouzeix-Raviart element."""
-        return Cells(self.domain, self.V)
+        return Cells(self.domain, self.V, [condition.number for condition in self.forms.fixed])
 
     @cached_property
     def load(self) -> Load:
@@ -82,7 +83,8 @@ class Level:
     @cached_property
     def edge(self) -> Edge:
         """Moments of g."""
-        return Edge(Sampled.of(self.forms).g, self.cells)
+        (neumann,) = self.forms.natural
+        return Edge(Sampled.of(self.forms).g, self.cells.sides[neumann.number], self.cells)
 
     def tidy(self) -> None:
         """Drop what only solution and certificate needed; it is made again if asked for."""
@@ -150,7 +152,10 @@ class Level:
         matrix = assemble_matrix(empty_matrix(p1), self.forms.a.on(domain, [W, W]))
         matrix.assemble()
         matrix.scale(1.0 / d**2)
-        dirichlet, bounded = (p1.owned_ends(domain.facets(part)) for part in (DIRICHLET, CONTACT))
+        dirichlet, bounded = (
+            p1.owned_ends(facets_of(domain, which))
+            for which in (self.forms.fixed, self.forms.bounded)
+        )
         matrix.zeroRowsColumns(numbers_of(matrix, dirichlet), 1.0)
         matrix.setOption(PETSc.Mat.Option.SPD, True)
         space = matrix, p1, dirichlet, bounded

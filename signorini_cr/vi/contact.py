@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from ..fem.space import closure_dofs, facet_corners, facet_entities, facet_measures, vertex_values
 from ..fem.walk import along_boundary
-from ..mesh.domain import CONTACT, Domain
+from ..mesh.domain import Domain
 from .solver import Iterations
 from .stopping import NOISE
 
@@ -103,6 +103,7 @@ class Contact:
 
 def contact_facts(
     domain: Domain,
+    facets: npt.NDArray[np.int32],
     u: fem.Function,
     residual: fem.Function,
     diagonal: FloatArray,
@@ -116,6 +117,7 @@ def contact_facts(
 
     Args:
         domain: Mesh and boundary parts.
+        facets: The contact facets this rank owns, ascending, shape (n,).
         u: u_h, ghosts up to date.
         residual: r = A u_h − b, ghosts up to date.
         diagonal: Diagonal of A, owned dofs.
@@ -126,7 +128,7 @@ def contact_facts(
         iterations: What the solver says about its errors.
     """
     V = u.function_space
-    mesh, facets = domain.mesh, domain.facets(CONTACT)
+    mesh = domain.mesh
     comm, owned = mesh.comm, V.dofmap.index_map.size_local
     vertices, measure = facet_measures(mesh, facets)
     dofs = closure_dofs(V, facets)

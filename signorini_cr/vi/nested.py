@@ -27,7 +27,6 @@ from ..fem.space import (
     facet_measures,
     ghosted_vector,
 )
-from ..mesh.domain import CONTACT
 from ..multigrid.parents import Layout, barycentric_coordinates
 from ..multigrid.transfer import prolongate
 from .assembly import Level
@@ -58,7 +57,7 @@ def nested_start(coarse: Solved, level: Level, start: fem.Function) -> None:
     values = x[system.dirichlet].copy()
     x[:] = prolongate(coarse.u, V, parents, before)
     x[system.dirichlet] = values
-    facets = level.domain.facets(CONTACT)
+    facets = system.bounded_facets
     dofs = closure_dofs(V, facets)
     if dofs.shape[1] > 1:  # a P1 dof has many cells, and no one to change its residual through
         return

@@ -12,12 +12,13 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..data.moments import Sampled
+from ..data.moments import Sampled, Trace
 from ..errors import InputError, raise_together
+from ..fem.conditions import facets_of
 from ..fem.problem import Forms
 from ..fem.space import closure_dofs, facet_entities, ghosted_vector, shared_maximum
 from ..garbage import release
-from ..mesh.domain import CONTACT, DIRICHLET, Domain
+from ..mesh.domain import Domain
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import NO_INODES, defaults
@@ -39,6 +40,7 @@ class System:
         dirichlet: Local dofs on Γ0, ghosts included.
         bounded: Owned local dofs with a bound, ascending.
         u_D: Function with the Dirichlet values, 0 elsewhere.
+        bounded_facets: Owned facets of Γ1, ascending, shape (n,).
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: Norm of the residual at the most trivial start, which all residuals are measured
             against: the number in the middle of the values u_D takes, raised to α on Γ1 where that
@@ -62,8 +64,15 @@ class System:
         """
         comm = domain.mesh.comm
         forms.insist_on_mesh(domain.mesh)
-        on_dirichlet, self.u_D, _ = _boundary_values(forms, domain, V, DIRICHLET)
-        on_contact, lower, self.obstacle_at_vertices = _boundary_values(forms, domain, V, CONTACT)
+        sampled = Sampled.of(forms)
+        self.bounded_facets = facets_of(domain, forms.bounded)
+        (fixed,), (contact,) = forms.fixed, forms.bounded
+        on_dirichlet, self.u_D, _ = _boundary_values(
+            sampled.u_D, fixed.key, facets_of(domain, forms.fixed), V
+        )
+        on_contact, lower, self.obstacle_at_vertices = _boundary_values(
+            sampled.alpha, contact.key, self.bounded_facets, V
+        )
         # Where the two parts meet in a P1 vertex the Dirichlet value holds
         bounded = on_contact & ~on_dirichlet
         self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
@@ -147,7 +156,7 @@ class System:
 
 
 def _boundary_values(
-    forms: Forms, domain: Domain, V: fem.FunctionSpace, part: int
+    trace: Trace, key: str, facets: npt.NDArray[np.int32], V: fem.FunctionSpace
 ) -> tuple[npt.NDArray[np.bool_], fem.Function, FloatArray]:
     """Data on one boundary part as the element takes them: CR facet means, P1 values at vertices.
 
@@ -155,13 +164,7 @@ def _boundary_values(
         Which dofs lie on the part, a Function with the values there, and the values at the
         facets' vertices, shape (n, d).
     """
-    facets = domain.facets(part)
-    sampled = Sampled.of(forms)
-    if part == DIRICHLET:
-        key, trace = "dirichlet", sampled.u_D
-    else:
-        key, trace = "obstacle", sampled.alpha
-    at_vertices, _, inside = trace.at(domain.mesh, facet_entities(domain.mesh, facets))
+    at_vertices, _, inside = trace.at(V.mesh, facet_entities(V.mesh, facets))
     at_vertices, means = at_vertices.T, trace.weights @ inside
     dofs = closure_dofs(V, facets)
     # Π_h K ⊂ K_h holds with facet means for any α and u_D
