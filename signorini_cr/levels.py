@@ -124,7 +124,7 @@ def solve_sequence(
         refined = step(solution)
         if refined is None:
             return
-        level.tidy()
+        level.data.tidy()
         level = Level(level.forms, refined[0], level.number + 1, level, refined[1])
         seconds = {"mesh": time.perf_counter() - began}
         solution = _solve(level, solution if nested else None, monitor, seconds)

@@ -6,11 +6,10 @@ where they are numbers exactly.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import factorial
-from weakref import WeakKeyDictionary, proxy
 
 import basix
 import numpy as np
@@ -21,9 +20,11 @@ from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from .. import compat
-from ..fem.cells import Cells
+from ..fem.cells import Cells, Side
+from ..fem.conditions import Condition
 from ..fem.problem import Forms, number
-from ..fem.space import facet_quadrature
+from ..fem.space import facet_entities, facet_quadrature
+from ..mesh.domain import Domain
 from .jets import Boxes, Enclosure, strips_of
 from .ranges import Cut, Deviation, Range, cut, range_of
 
@@ -320,49 +321,87 @@ class Trace:
         return values[:k], values[k], values[k + 1 :]
 
 
-class Sampled:
-    """The data of a problem for evaluation, each compiled when first asked for; collective."""
+@dataclass(frozen=True, eq=False)
+class OnFacets:
+    """A condition's datum on all facets of its part that a rank sees, evaluated once.
+
+    Attributes:
+        condition: The condition.
+        trace: The datum.
+        facets: Local indices, ghosts included, ascending, shape (n,).
+        entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+        ends: Values at the vertices, in the order of the cell's closure, shape (d, n).
+        middle: At the midpoints, shape (n,).
+        inside: At the trace's quadrature points, shape (q, n).
+    """
+
+    condition: Condition
+    trace: Trace
+    facets: IntArray
+    entities: IntArray
+    ends: FloatArray
+    middle: FloatArray
+    inside: FloatArray
+
+    @classmethod
+    def of(cls, condition: Condition, trace: Trace, domain: Domain) -> OnFacets:
+        """Evaluate a datum on a mesh; collective."""
+        facets = domain.all_facets[condition.number]
+        entities = facet_entities(domain.mesh, facets)
+        return cls(condition, trace, facets, entities, *trace.at(domain.mesh, entities))
+
+    @property
+    def means(self) -> FloatArray:
+        """Means over the facets, shape (n,)."""
+        return self.trace.weights @ self.inside
+
+    def among(self, which: npt.NDArray[np.bool_]) -> OnFacets:
+        """Leave facets out."""
+        values = self.ends[:, which], self.middle[which], self.inside[:, which]
+        return replace(
+            self,
+            facets=self.facets[which],
+            entities=self.entities[which],
+            ends=values[0],
+            middle=values[1],
+            inside=values[2],
+        )
+
+    def seen_from(self, cells: Cells) -> OnFacets:
+        """Keep the facets of owned cells, those of the part's `Side`."""
+        return self.among(self.entities[:, 0] < cells.number)
+
+    def side(self, cells: Cells) -> Side:
+        """The facets of owned cells, seen from these."""
+        return cells.sides[self.condition.number]
+
+
+class Compiled:
+    """The data of a problem ready for evaluation on any mesh, each compiled when first asked for.
+
+    Args:
+        forms: The problem's.
+    """
 
     def __init__(self, forms: Forms):
-        """Note whose data, weakly: `of` keeps this as long as the forms are there."""
-        self._forms: Forms = proxy(forms)
+        """Note whose data."""
+        self.forms = forms
         self._rule = Rule(forms, forms.problem.quadrature_degree)
+        self._traces: dict[Expr, Trace] = {}
 
     @cached_property
     def f(self) -> Volume:
-        """Volume load."""
-        return Volume(self._forms.f, self._forms, self._rule)
+        """Volume load; collective."""
+        return Volume(self.forms.f, self.forms, self._rule)
 
     @cached_property
     def kappa(self) -> Volume | None:
-        """Coefficient; None if it isn't a scalar."""
-        kappa = self._forms.kappa
-        return None if ufl.shape(kappa) else Volume(kappa, self._forms, self._rule)
+        """Coefficient; None if it isn't a scalar; collective."""
+        kappa = self.forms.kappa
+        return None if ufl.shape(kappa) else Volume(kappa, self.forms, self._rule)
 
-    @cached_property
-    def u_D(self) -> Trace:
-        """Values on Γ0."""
-        (dirichlet,) = self._forms.fixed
-        return Trace(dirichlet.fixed, self._forms)
-
-    @cached_property
-    def alpha(self) -> Trace:
-        """Obstacle."""
-        (contact,) = self._forms.bounded
-        return Trace(contact.lower, self._forms)
-
-    @cached_property
-    def g(self) -> Trace:
-        """Flux on Γg."""
-        (neumann,) = self._forms.natural
-        return Trace(neumann.flux, self._forms)
-
-    @classmethod
-    def of(cls, forms: Forms) -> Sampled:
-        """The data of these forms, one object for all who ask."""
-        if forms not in _SAMPLED:
-            _SAMPLED[forms] = cls(forms)
-        return _SAMPLED[forms]
-
-
-_SAMPLED: WeakKeyDictionary[Forms, Sampled] = WeakKeyDictionary()
+    def trace(self, expression: Expr) -> Trace:
+        """Values of a condition's datum on facets; collective."""
+        if expression not in self._traces:
+            self._traces[expression] = Trace(expression, self.forms)
+        return self._traces[expression]

@@ -19,7 +19,7 @@ from dolfinx import fem
 
 from .. import compat
 from ..data.loads import Certain, Load, Segments
-from ..data.moments import Coefficient, Sampled
+from ..data.moments import Coefficient
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, companion, on_facet
 from .cusps import Cusps
@@ -162,32 +162,29 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         return Certificate(reason=NO_FLUX)
     if level.forms.uncertified is not None:
         return Certificate(reason=level.forms.uncertified)
-    data = Sampled.of(level.forms)
-    if data.kappa is None:
+    data = level.data
+    if data.compiled.kappa is None:
         return Certificate(reason=TENSOR)
-    cells, load, edge = level.cells, level.load, level.edge
-    kappa = Coefficient(data.kappa, cells)
+    cells, load, (edge,) = data.cells, data.load, data.edges
+    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.fixed, data.bounded))
+    kappa = Coefficient(data.compiled.kappa, cells)
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
     slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
-    (on_fixed,), (contact_side,) = (
-        [cells.sides[condition.number] for condition in which]
-        for which in (level.forms.fixed, level.forms.bounded)
-    )
-    obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
-    gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
+    contact_side = alpha.side(cells)
+    gap = u.x.array[contact_side.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
     size = _size(cells, kappa, w, flux, slopes)
-    certain = Certain.of(data.f, load, cells, kappa.low, size)
+    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
     if certain.reason is not None:
-        level.tidy()
+        data.tidy()
         return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
     flux.left += cells.volume * (certain.load.mean - load.mean)
     load = certain.load
     segments = Segments.of(edge, cells, kappa.low, size)
     if segments.reason is not None:
-        level.tidy()
+        data.tidy()
         return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
     there = edge.side.local, edge.side.cells
     change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
@@ -207,21 +204,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         w = own
     steady = kappa.high - kappa.low <= STEADY * kappa.mean
     goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
-    v = companion(
-        cells,
-        kappa.mean,
-        w,
-        u.x.array,
-        flux,
-        on_fixed,
-        data.u_D,
-        contact_side,
-        data.alpha,
-        obstacle,
-        sweeps,
-        steady,
-        goal,
-    )
+    v = companion(cells, kappa.mean, w, u.x.array, flux, u_D, alpha, sweeps, steady, goal)
     sums = integrate(cells, kappa, w, load, flux, v)
     cusps, known = v.cusps, (v.excess, v.bumps)
     unsure = 0.0 if cusps is None else cusps.add(cells, w, load, kappa.low, flux, known, sums)
@@ -256,7 +239,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
     lift_energy += hidden_energy + total["energy_slack"]
     lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    level.tidy()
+    data.tidy()
     reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
     if reason is not None:
         return Certificate(reason=reason, seconds=time.perf_counter() - began)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data.admissible import differs
-from ..data.moments import Trace
+from ..data.moments import OnFacets
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
 from .cusps import Cusps
 from .flux import Flux
@@ -70,11 +70,8 @@ def companion(
     w: FloatArray,
     u: FloatArray,
     flux: Flux,
-    fixed: Side,
-    u_D: Trace,
-    contact: Side,
-    alpha: Trace,
-    on_contact: tuple[FloatArray, FloatArray, FloatArray],
+    u_D: OnFacets,
+    alpha: OnFacets,
     sweeps: int,
     steady: BoolArray,
     goal: float,
@@ -87,30 +84,29 @@ def companion(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         u: u_h by facet dof.
         flux: y.
-        fixed: The facets of Γ0.
-        u_D: Values there.
-        contact: The facets of Γ1.
-        alpha: Obstacle there.
-        on_contact: Its values.
+        u_D: Values on Γ0, seen from the cells.
+        alpha: Obstacle on Γ1, seen from the cells.
         sweeps: How often the bumps are improved.
         steady: Where κ is constant on the cell, shape (cells,) or ().
         goal: What ‖∇ℓ‖ need not be known better than.
     """
-    on_fixed = u_D.at(cells.domain.mesh, fixed.entities)
-    obstacle, middle, _ = on_contact
+    fixed, contact = u_D.side(cells), alpha.side(cells)
+    obstacle, middle = alpha.ends, alpha.middle
     touching = flux.touching
-    v = _at_vertices(cells, kappa, w, fixed, on_fixed[0], contact, obstacle, touching)
+    v = _at_vertices(cells, kappa, w, fixed, u_D.ends, contact, obstacle, touching)
     scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
     scale = max(cells.comm.allgather(scale))
     wrong = [
-        JUMP if differs(cells, fixed, np.abs(v[fixed.ends] - on_fixed[0]), scale, u_D) else None,
-        BELOW if differs(cells, contact, obstacle - v[contact.ends], scale, u_D, alpha) else None,
+        JUMP if differs(cells, fixed, np.abs(v[fixed.ends] - u_D.ends), scale, u_D.trace) else None,
+        BELOW
+        if differs(cells, contact, obstacle - v[contact.ends], scale, u_D.trace, alpha.trace)
+        else None,
     ]
     bumps = np.zeros(len(u))
     lowest = np.full(len(u), -np.inf)
     free = np.ones(len(u), dtype=bool)
     if cells.tdim == 2:
-        bumps[fixed.dofs] = on_fixed[1] - v[fixed.ends].mean(axis=0)
+        bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
         free[fixed.dofs] = False
         lowest[contact.dofs] = _lowest(v[contact.ends], obstacle, middle)
         free[contact.dofs[touching]] = False
@@ -134,12 +130,12 @@ def companion(
         promise += _promise(cells, kappa, excess, bumps, loose)
         if promise > PROMISE * energy:
             v[:], bumps[:], cusps = _solved(
-                cells, kappa, steady, w, (v, bumps), (loose, free), contact, on_contact[:2]
+                cells, kappa, steady, w, (v, bumps), (loose, free), contact, (obstacle, middle)
             )
             excess = v[cells.vertices] - w
     lifts = [
-        _lift(cells, fixed, u_D, on_fixed, v, bumps, scale, goal, obstacle=False),
-        _lift(cells, contact, alpha, on_contact, v, bumps, scale, goal, obstacle=True),
+        _lift(cells, data, v, bumps, scale, goal, obstacle)
+        for data, obstacle in ((u_D, False), (alpha, True))
     ]
     wrong += [lift.reason for lift in lifts]
     # y·n is constant on a facet: the mean of v + ℓ − α
@@ -393,9 +389,7 @@ def on_facet(
 
 def _lift(
     cells: Cells,
-    side: Side,
-    trace: Trace,
-    values: tuple[FloatArray, FloatArray, FloatArray],
+    data: OnFacets,
     v: FloatArray,
     bumps: FloatArray,
     scale: float,
@@ -403,9 +397,9 @@ def _lift(
     obstacle: bool,
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
+    side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
     if cells.tdim != 2:
-        return affine(cells, side, trace, v[side.ends], values[0], scale)
-    ends, middle, _ = values
+        return affine(cells, side, trace, v[side.ends], ends, scale)
     companion = Quadratic(v[side.ends], bumps[side.dofs])
     base = Quadratic(ends, middle - ends.mean(axis=0)) if obstacle else companion
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

@@ -134,7 +134,7 @@ def unbalanced(
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if level.domain is not cells.domain:
-        cells = level.cells
+        cells = level.data.cells
     return float(bound + _carried(cells, left, kappa_min, signed))
 
 

@@ -53,7 +53,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     if made is None or certificate.bound_h1 is None:
         raise InputError(f"the contact force has no bounds: {certificate.reason}")
     level = made.level
-    cells = level.cells
+    cells = level.data.cells
     if made.varies or cells.tdim != 2:
         why = VARIES if made.varies else SPATIAL
         raise InputError(f"the contact force has no bounds: {why}")
@@ -85,7 +85,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     middle, energy = cells.total(
         made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)
     )
-    level.tidy()
+    level.data.tidy()
     reach = made.reach * np.sqrt(energy)
     return max(float(middle - reach), 0.0), float(middle + reach)
 

@@ -12,13 +12,11 @@ from dolfinx.fem.petsc import assemble_matrix
 from petsc4py import PETSc
 
 from .. import compat
-from ..data.loads import Edge, Load, chi
-from ..data.moments import Sampled
+from ..data.moments import Compiled
+from ..data.onmesh import OnMesh
 from ..errors import InputError
-from ..fem.cells import Cells
 from ..fem.conditions import facets_of
 from ..fem.problem import Forms
-from ..fem.space import function_space
 from ..garbage import hold, sweep
 from ..mesh.domain import Domain
 from ..multigrid.cycle import LONG_SWEEPS, SWEEPS, Grid, Patience
@@ -66,37 +64,20 @@ class Level:
         return Parents(self.coarser.domain.mesh, self.domain.mesh, self.parent_cell)
 
     @cached_property
+    def data(self) -> OnMesh:
+        """The problem's data on this mesh; what is compiled serves all meshes of a sequence."""
+        compiled = Compiled(self.forms) if self.coarser is None else self.coarser.data.compiled
+        return OnMesh(compiled, self.domain)
+
+    @property
     def V(self) -> fem.FunctionSpace:
         """The discrete space."""
-        return function_space(self.domain.mesh, self.forms.element)
-
-    @cached_property
-    def cells(self) -> Cells:
-        """The mesh as arrays, for the Crouzeix-Raviart element."""
-        return Cells(self.domain, self.V, [condition.number for condition in self.forms.fixed])
-
-    @cached_property
-    def load(self) -> Load:
-        """Moments of f."""
-        return Load.of(Sampled.of(self.forms).f, self.cells)
-
-    @cached_property
-    def edge(self) -> Edge:
-        """Moments of g."""
-        (neumann,) = self.forms.natural
-        return Edge(Sampled.of(self.forms).g, self.cells.sides[neumann.number], self.cells)
-
-    def tidy(self) -> None:
-        """Drop what only solution and certificate needed; it is made again if asked for."""
-        for name in ("cells", "load", "edge"):
-            self.__dict__.pop(name, None)
+        return self.data.V
 
     @cached_property
     def system(self) -> System:
         """The assembled variational inequality."""
-        return System(
-            self.forms, self.domain, self.V, lambda: chi(self.load, self.edge, self.cells)
-        )
+        return System(self.data)
 
     @cached_property
     def loose(self) -> Loose | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -12,13 +12,12 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..data.moments import Sampled, Trace
+from ..data.moments import OnFacets
+from ..data.onmesh import OnMesh
 from ..errors import InputError, raise_together
 from ..fem.conditions import facets_of
-from ..fem.problem import Forms
-from ..fem.space import closure_dofs, facet_entities, ghosted_vector, shared_maximum
+from ..fem.space import closure_dofs, ghosted_vector, shared_maximum
 from ..garbage import release
-from ..mesh.domain import Domain
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import NO_INODES, defaults
@@ -48,31 +47,20 @@ class System:
             so large that differences drown in it.
     """
 
-    def __init__(
-        self, forms: Forms, domain: Domain, V: fem.FunctionSpace, chi: Callable[[], FloatArray]
-    ):
+    def __init__(self, data: OnMesh):
         """Assemble it; collective.
 
         Args:
-            forms: The compiled forms.
-            domain: Mesh and boundary parts.
-            V: The discrete space.
-            chi: Gives χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's share.
+            data: The problem on the mesh.
 
         Raises:
             InputError: Data are not finite, or κ is not above 0.
         """
+        forms, domain, V = data.forms, data.domain, data.V
         comm = domain.mesh.comm
-        forms.insist_on_mesh(domain.mesh)
-        sampled = Sampled.of(forms)
         self.bounded_facets = facets_of(domain, forms.bounded)
-        (fixed,), (contact,) = forms.fixed, forms.bounded
-        on_dirichlet, self.u_D, _ = _boundary_values(
-            sampled.u_D, fixed.key, facets_of(domain, forms.fixed), V
-        )
-        on_contact, lower, self.obstacle_at_vertices = _boundary_values(
-            sampled.alpha, contact.key, self.bounded_facets, V
-        )
+        on_dirichlet, self.u_D, _ = _boundary_values(data.fixed, V)
+        on_contact, lower, self.obstacle_at_vertices = _boundary_values(data.bounded, V)
         # Where the two parts meet in a P1 vertex the Dirichlet value holds
         bounded = on_contact & ~on_dirichlet
         self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
@@ -95,7 +83,7 @@ class System:
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
         if forms.element == "CR" and forms.loaded:
-            self.chi.x.array[:] = chi()
+            self.chi.x.array[:] = data.chi()
         elif forms.chi is not None:
             fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
         self.b = fem.Function(V)
@@ -156,31 +144,34 @@ class System:
 
 
 def _boundary_values(
-    trace: Trace, key: str, facets: npt.NDArray[np.int32], V: fem.FunctionSpace
+    sampled: Sequence[OnFacets], V: fem.FunctionSpace
 ) -> tuple[npt.NDArray[np.bool_], fem.Function, FloatArray]:
-    """Data on one boundary part as the element takes them: CR facet means, P1 values at vertices.
+    """Data on the boundary as the element takes them: CR facet means, P1 values at vertices.
 
     Returns:
-        Which dofs lie on the part, a Function with the values there, and the values at the
-        facets' vertices, shape (n, d).
+        Which dofs have some, a Function with the values there, and the values at the vertices of
+        the owned facets in ascending order, shape (n, d).
     """
-    at_vertices, _, inside = trace.at(V.mesh, facet_entities(V.mesh, facets))
-    at_vertices, means = at_vertices.T, trace.weights @ inside
-    dofs = closure_dofs(V, facets)
-    # Π_h K ⊂ K_h holds with facet means for any α and u_D
-    of_dofs = means[:, None] if dofs.shape[1] == 1 else at_vertices
-    # before the maximum over the ranks, which a NaN may lose
-    _require_finite(V.mesh.comm, key, of_dofs)
+    owned = V.mesh.topology.index_map(V.mesh.topology.dim - 1).size_local
     values = fem.Function(V)
     on_part = np.zeros_like(values.x.array)
     values.x.array[:] = PETSc.NINFINITY
-    values.x.array[dofs] = of_dofs
-    on_part[dofs] = 1.0
+    for data in sampled:
+        dofs = closure_dofs(V, data.facets)
+        # Π_h K ⊂ K_h holds with facet means for any α and u_D
+        of_dofs = data.means[:, None] if dofs.shape[1] == 1 else data.ends.T
+        # before the maximum over the ranks, which a NaN may lose
+        _require_finite(V.mesh.comm, data.condition.key, of_dofs)
+        np.maximum.at(values.x.array, dofs, of_dofs)
+        on_part[dofs] = 1.0
     # A rank may own a dof of the part without owning any of its facets
     for array in (values.x.array, on_part):
         shared_maximum(V, array)
     values.x.array[on_part == 0.0] = 0.0
-    return on_part > 0.0, values, at_vertices
+    facets = np.concatenate([data.facets for data in sampled])
+    at_vertices = np.concatenate([data.ends.T for data in sampled])
+    order = np.argsort(facets)
+    return on_part > 0.0, values, at_vertices[order[facets[order] < owned]]
 
 
 def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
