@@ -23,7 +23,8 @@ from petsc4py import PETSc
 from tables import tabulate
 
 from signorini_cr import exact, solve
-from signorini_cr.fem.problem import Forms, Problem
+from signorini_cr.diffusion import Diffusion
+from signorini_cr.fem.problem import Problem
 from signorini_cr.fem.space import ghosted_vector
 from signorini_cr.mesh.domain import Domain
 from signorini_cr.vi.assembly import Level
@@ -76,7 +77,7 @@ def inequality(problem: Problem, domain: Domain) -> tuple[float, str]:
 
 def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:
     """One line of the table."""
-    level = Level(Forms(problem, domain.mesh, "CR"), domain)
+    level = Level(Diffusion(problem, domain.mesh, "CR"), domain)
     b = ghosted_vector(level.V, level.system.b.x.array)
     ours, theirs = [], []
     for _ in range(repeats):

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from .data.admissible import check_data
+from .diffusion import Diffusion
 from .errors import InputError
-from .fem.problem import Forms, Problem
+from .fem.physics import Physics
+from .fem.problem import Problem
 from .fem.space import ghosted_vector
 from .garbage import release
 from .mesh.domain import Domain
@@ -50,9 +51,9 @@ def solve(
         NotConverged: The solver stopped short, with PETSc's name for the reason; or the contact
             forces, or the equations of a part, are lost in rounding.
     """
-    forms = Forms(problem, domain.mesh, element)
-    check_data(forms, domain)
-    return _solve(Level(forms, domain), None, monitor)
+    physics = Diffusion(problem, domain.mesh, element)
+    physics.check(domain)
+    return _solve(Level(physics, domain), None, monitor)
 
 
 def solve_levels(
@@ -114,9 +115,21 @@ def solve_sequence(
     Yields:
         The solutions, coarsest first.
     """
-    forms = Forms(problem, domain.mesh, element)
-    check_data(forms, domain)
-    level = Level(forms, domain)
+    yield from solve_physics(
+        Diffusion(problem, domain.mesh, element), domain, step, monitor, nested
+    )
+
+
+def solve_physics(
+    physics: Physics,
+    domain: Domain,
+    step: Callable[[Solution], tuple[Domain, npt.NDArray[np.int32]] | None],
+    monitor: LevelMonitor | None = None,
+    nested: bool = True,
+) -> Iterator[Solution]:
+    """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`."""
+    physics.check(domain)
+    level = Level(physics, domain)
     solution = _solve(level, None, monitor)
     while True:
         yield solution
@@ -125,7 +138,7 @@ def solve_sequence(
         if refined is None:
             return
         level.data.tidy()
-        level = Level(level.forms, refined[0], level.number + 1, level, refined[1])
+        level = Level(physics, refined[0], level.number + 1, level, refined[1])
         seconds = {"mesh": time.perf_counter() - began}
         solution = _solve(level, solution if nested else None, monitor, seconds)
 
@@ -164,7 +177,7 @@ def _solve(
         release(entries)
         terms = operator.magnitude(vectors[2]) + np.abs(system.b.x.array[bounded])
     finally:
-        if level.forms.element != "P1":
+        if level.physics.element != "P1":
             level.grid.free()  # the next level needs P1 alone
             del level.grid
         release(*vectors)
@@ -172,22 +185,17 @@ def _solve(
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
     contact = contact_facts(
-        level.domain,
-        system.bounded_facets,
+        level.data,
+        system,
         u,
         residual,
         diagonal=diagonal,
-        lower=system.lower,
-        obstacle_at_vertices=system.obstacle_at_vertices,
-        load=system.load,
         rounding=NOISE * terms,
         iterations=iterations,
     )
-    owned = level.V.dofmap.index_map.size_local
-    comm = level.domain.mesh.comm
-    form = level.forms.a_of_w.on(level.domain, (), [u])
-    energy = comm.allreduce(
-        0.5 * fem.assemble_scalar(form) - system.chi.x.array[:owned] @ u.x.array[:owned]
+    owned = len(diagonal)
+    energy = level.domain.mesh.comm.allreduce(
+        0.5 * level.data.energy(u) - system.chi.x.array[:owned] @ u.x.array[:owned]
     )
     seconds["estimate"] = time.perf_counter() - clock
     before = None if coarser is None else coarser.u

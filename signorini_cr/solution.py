@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from .estimate.certificate import Certificate, certify
+from .estimate.certificate import Certificate
 from .fem.problem import Problem
 from .mesh.domain import Domain
 from .vi.assembly import Level
@@ -49,12 +49,12 @@ class Solution:
     @property
     def problem(self) -> Problem:
         """The data."""
-        return self.level.forms.problem
+        return self.level.physics.problem
 
     @property
     def element(self) -> str:
         """The element's name: "CR" or "P1"."""
-        return self.level.forms.element
+        return self.level.physics.element
 
     @property
     def cells(self) -> int:
@@ -65,7 +65,8 @@ class Solution:
     @property
     def dofs(self) -> int:
         """Number of degrees of freedom, over all ranks."""
-        return self.u.function_space.dofmap.index_map.size_global
+        dofmap = self.u.function_space.dofmap
+        return dofmap.index_map.size_global * dofmap.index_map_bs
 
     @cached_property
     def h(self) -> float:
@@ -81,10 +82,10 @@ class Solution:
 
         Computed when first asked for, collectively.
         """
-        forms = self.level.forms
-        return None if forms.exact is None else forms.errors(self.domain, self.u)
+        physics = self.level.physics
+        return None if physics.exact is None else physics.errors(self.domain, self.u)
 
     @cached_property
     def certificate(self) -> Certificate:
         """What is certain about the error; made when first asked for, collectively."""
-        return certify(self)
+        return self.level.physics.certify(self)

@@ -21,11 +21,11 @@ from petsc4py import PETSc
 from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.ranges import range_of
+from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.estimate.force import force_bounds
 from signorini_cr.fem.cells import Cells
-from signorini_cr.fem.problem import Forms
 from signorini_cr.vi.assembly import Level
 
 WORLD = MPI.COMM_WORLD
@@ -435,7 +435,7 @@ def test_three_dimensions():
     problem = Problem(
         exact=lambda x: (1 - x[0] ** 2) * (1 - x[1] ** 2) * (1 - x[2] ** 2), dirichlet=0.0
     )
-    level = Level(Forms(problem, mesh), domain)
+    level = Level(Diffusion(problem, mesh), domain)
     u = fem.Function(level.V)
     dense = level.system.A[:, :]  # nothing is in contact
     u.x.array[:] = np.linalg.solve(dense, level.system.b.x.array)

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import NotConverged, Polygon, Problem, exact, garbage, solve, solve_levels
-from signorini_cr.fem.problem import Forms
+from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.space import function_space, ghosted_vector
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from signorini_cr.mesh.refinement import refine, refine_marked
@@ -200,7 +200,7 @@ def tensor(x):
 def test_matrix_of_p1_without_a_product(make, coefficient):
     """It is what the product with the inclusion gives, on Γ0 the identity."""
     domain = make()
-    level = Level(Forms(Problem(coefficient=coefficient), domain.mesh), domain)
+    level = Level(Diffusion(Problem(coefficient=coefficient), domain.mesh), domain)
     grid, p1 = level.conforming
     product = level.system.A.ptap(inclusion(p1, Layout.of_space(level.V)).matrix())
     on_dirichlet = vertex_dofs(domain, p1, DIRICHLET)
@@ -301,7 +301,7 @@ def test_the_same_solution_as_a_direct_solver(example, shift, squares, levels, o
 def test_dofs_are_taken_out_of_a_matrix_and_put_back():
     """The identity in their rows and columns, Gauss-Seidel as on a copy, products with A."""
     domain = CROOKED.mesh(0.3)
-    system = Level(Forms(PUSHED, domain.mesh), domain).system
+    system = Level(Diffusion(PUSHED, domain.mesh), domain).system
     A, before = system.A, system.A.copy()
     operator = MaskedMatrix(A, system.bounded)
     x, y, z = (A.createVecRight() for _ in range(3))
@@ -459,7 +459,7 @@ def test_extrapolation_comes_nearer():
     """By an order of magnitude where the solution is smooth."""
     *_, middle, coarse = solve_levels(exact.A.problem, exact.A.mesh(0.2), 4)
     fine, parent_cell = refine(coarse.domain)
-    level = Level(Forms(exact.A.problem, fine.mesh), fine, 4, coarse.level, parent_cell)
+    level = Level(Diffusion(exact.A.problem, fine.mesh), fine, 4, coarse.level, parent_cell)
     below = middle.u, coarse.level.parents
     norms = []
     for start in (prolongate(coarse.u, level.V, level.parents, b) for b in (None, below)):
@@ -531,7 +531,7 @@ def test_the_cycle_is_symmetric_and_keeps_fixed_dofs_out(away):
     domain = CROOKED.mesh(0.25)
     domain.mesh.geometry.x[:, :2] += away
     solution = last(Problem(f=-1.0), domain, 3)
-    level = Level(solution.level.forms, solution.domain, 2, solution.level.coarser)
+    level = Level(solution.level.physics, solution.domain, 2, solution.level.coarser)
     level.parent_cell = solution.level.parent_cell
     grid = level.grid
     bounded = level.system.bounded

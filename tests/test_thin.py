@@ -193,7 +193,7 @@ def test_boomeramg_where_cells_are_aligned(element):
     for solution in solve_levels(problem, domain, 5, element):
         steps.append(solution.iterations.linear)
         whole = solution.level.system.A.copy()
-        whole.axpy(-1.0, Level(solution.level.forms, solution.domain).system.A)
+        whole.axpy(-1.0, Level(solution.level.physics, solution.domain).system.A)
         assert whole.norm() == 0.0
     assert max(steps) <= 60 and steps[-1] <= 15
     words = "BoomerAMG, as multigrid took 40 CG steps on a coarser mesh"

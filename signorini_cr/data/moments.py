@@ -22,6 +22,7 @@ from ufl.core.expr import Expr
 from .. import compat
 from ..fem.cells import Cells, Side
 from ..fem.conditions import Condition
+from ..fem.physics import Imposed
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
@@ -354,6 +355,13 @@ class OnFacets:
     def means(self) -> FloatArray:
         """Means over the facets, shape (n,)."""
         return self.trace.weights @ self.inside
+
+    @property
+    def imposed(self) -> Imposed:
+        """The same for the one unknown of each facet."""
+        only = np.zeros(1, dtype=np.int32)
+        means, ends = self.means[:, None], self.ends.T[:, :, None]
+        return Imposed(self.condition.key, self.facets, only, means, ends)
 
     def among(self, which: npt.NDArray[np.bool_]) -> OnFacets:
         """Leave facets out."""

@@ -18,6 +18,7 @@ import ufl
 from dolfinx import fem
 
 from .. import compat
+from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
@@ -160,13 +161,13 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     level, u = base.level, base.u
     if base.element != "CR" or base.domain is not solution.domain:
         return Certificate(reason=NO_FLUX)
-    if level.forms.uncertified is not None:
-        return Certificate(reason=level.forms.uncertified)
-    data = level.data
+    data = diffusion(level.data)
+    if data.forms.uncertified is not None:
+        return Certificate(reason=data.forms.uncertified)
     if data.compiled.kappa is None:
         return Certificate(reason=TENSOR)
     cells, load, (edge,) = data.cells, data.load, data.edges
-    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.fixed, data.bounded))
+    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.u_D, data.alpha))
     kappa = Coefficient(data.compiled.kappa, cells)
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)

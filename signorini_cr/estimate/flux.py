@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from ..data.diffusion import diffusion
 from ..data.loads import Edge, Load
 from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
 
@@ -134,7 +135,7 @@ def unbalanced(
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if level.domain is not cells.domain:
-        cells = level.data.cells
+        cells = diffusion(level.data).cells
     return float(bound + _carried(cells, left, kappa_min, signed))
 
 

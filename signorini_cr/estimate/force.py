@@ -12,6 +12,7 @@ from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
 from petsc4py import PETSc
 
+from ..data.diffusion import diffusion
 from ..errors import InputError
 from ..fem.cells import dot_rows, sum_rows
 from ..fem.conditions import facets_of
@@ -53,7 +54,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     if made is None or certificate.bound_h1 is None:
         raise InputError(f"the contact force has no bounds: {certificate.reason}")
     level = made.level
-    cells = level.data.cells
+    cells = diffusion(level.data).cells
     if made.varies or cells.tdim != 2:
         why = VARIES if made.varies else SPATIAL
         raise InputError(f"the contact force has no bounds: {why}")
@@ -96,7 +97,7 @@ def _weight(solution: Certified) -> fem.Function:
     mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
     V = fem.functionspace(mesh, ("Lagrange", 1))
     phi, marks = fem.Function(V), fem.Function(V)
-    forms, parts = solution.level.forms, []
+    forms, parts = diffusion(solution.level.data).forms, []
     for conditions in (forms.bounded, forms.fixed):
         marks.x.array[:] = 0.0
         marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, conditions))] = 1.0

@@ -240,12 +240,30 @@ class Forms:
         """a_h(w, w)."""
         return Kernel(self._bilinear(self.w, self.w), self.mesh, [self.w])
 
+    @cached_property
+    def a_p1(self) -> Kernel:
+        """a_h in P1, for coarse meshes."""
+        space = ufl.FunctionSpace(self.mesh.ufl_domain(), ufl_element(self.mesh, "P1"))
+        u, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+        return Kernel(self._bilinear(u, v), self.mesh)
+
+    @cached_property
+    def of_one(self) -> Kernel | None:
+        """a_h(1, v), exactly 0 but for the terms without gradients; None if there are none."""
+        terms = self._without_gradients(ufl.as_ufl(1.0), ufl.TestFunction(self.space))
+        return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
+
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
         """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
         rule = {} if self.uniform else {"quadrature_degree": self.problem.quadrature_degree}
         form = ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
-        added = [(c.a(u, v), c.number) for c in self.conditions]
-        return sum((a * self.ds(part) for a, part in added if a is not None), form)
+        return sum(self._without_gradients(u, v), form)
+
+    def _without_gradients(self, u: Expr, v: Expr) -> list[ufl.Form]:
+        """What a_h has beside κ∇u·∇v."""
+        degree = {"quadrature_degree": self.problem.quadrature_degree}
+        added = [(c.a(u, v), self.ds(c.number, metadata=degree)) for c in self.conditions]
+        return [a * measure for a, measure in added if a is not None]
 
     @cached_property
     def _squared_errors(self) -> Kernel:

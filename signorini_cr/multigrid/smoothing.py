@@ -109,10 +109,10 @@ def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, P
     first, end = matrix.getOwnershipRange()
     # An entry stems from a cell. If this rank does not own the cell, its dof is a ghost there and
     # thereby shared; if it does, the other dof is a ghost here, whose row has this one for a column
-    owned, ghosts = dofs.size[0], dofs.index_map.ghosts
-    ghost = np.arange(owned, owned + len(ghosts), dtype=np.int32)
+    ghost = np.arange(dofs.size[0], dofs.local, dtype=np.int32)
     shared = numbers_of(matrix, dofs.owned_among(ghost))
-    _, column, _ = rows_of(matrix, np.sort(ghosts))  # PETSc looks for their owners in order
+    # PETSc looks for their owners in order
+    _, column, _ = rows_of(matrix, np.sort(dofs.numbers(ghost)))
     numbers = np.union1d(shared, column[(column >= first) & (column < end)])
     start, column, value = rows_of(matrix, numbers)
     rows = (numbers - first).astype(np.int32)

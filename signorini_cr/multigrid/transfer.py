@@ -16,7 +16,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..fem.space import ghosted
+from ..fem.space import ghosted, shared_sum
 from ..garbage import release
 from .masking import rows_of
 from .parents import FloatArray, IntArray, Layout, Parents
@@ -42,22 +42,24 @@ class Transfer:
         Args:
             coarse: The coarse dofs.
             fine: The fine dofs.
-            lengths: Number of entries of each owned fine dof's row.
-            dofs: The entries' local coarse dofs, in each row in any order.
-            values: The entries.
+            lengths: Number of entries of each owned fine node's row.
+            dofs: The entries' local coarse nodes, in each row in any order.
+            values: The entries, the same for all unknowns of a node.
         """
         self._coarse, self._fine = coarse, fine
         rows = fine.size[0]
+        if fine.block > 1:
+            lengths, dofs, values = _for_each_unknown(fine, lengths, dofs.ravel(), values)
         if isinstance(lengths, int):
             start = np.arange(0, (rows + 1) * lengths, lengths, dtype=PETSc.IntType)
         else:
             start = np.zeros(rows + 1, dtype=PETSc.IntType)
             np.cumsum(lengths, out=start[1:])
         self._csr = start, dofs.ravel().astype(PETSc.IntType, copy=False), values
-        sizes = rows, coarse.size[0] + coarse.index_map.num_ghosts
+        sizes = rows, coarse.local
         self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
         self._own = self._rows.createVecLeft()
-        self._marks = ghosted(coarse.mesh.comm, coarse.index_map)
+        self._marks = ghosted(coarse.mesh.comm, coarse.index_map, block=coarse.block)
 
     def coarse_vector(self) -> PETSc.Vec:
         """A vector for coarse functions, with room for ghosts."""
@@ -102,10 +104,24 @@ class Transfer:
         release(self._rows, self._own, self._marks)
 
 
+def _for_each_unknown(
+    fine: Layout, lengths: IntArray | int, nodes: IntArray, values: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Repeat the rows of nodes for each of their unknowns, and number columns by unknowns."""
+    block, rows = fine.block, fine.index_map.size_local
+    lengths = np.full(rows, lengths) if isinstance(lengths, int) else lengths
+    start = np.cumsum(lengths) - lengths
+    repeated = np.repeat(lengths, block)
+    row = np.repeat(np.arange(rows * block), repeated)
+    within = np.arange(len(row)) - np.repeat(np.cumsum(repeated) - repeated, repeated)
+    entry = start[row // block] + within
+    return repeated, nodes[entry] * block + row % block, values[entry]
+
+
 def inclusion(p1: Layout, cr: Layout) -> Transfer:
     """P1 in CR on the same mesh: d entries 1/d in each row."""
     d = cr.cells.shape[1] - 1
-    owned = cr.size[0]
+    owned = cr.index_map.size_local
     columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
     for i in range(d + 1):
         others = [j for j in range(d + 1) if j != i]
@@ -126,7 +142,7 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
     corners = fine.cells.shape[1]
     slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
     slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
-    slot = slot[: fine.size[0]]
+    slot = slot[: fine.index_map.size_local]
     if len(weights) < len(parent_cell):  # the same in each parent, whose children are in a row
         parent = slot // (len(weights) * corners)
         slot = slot - parent * (len(weights) * corners)
@@ -190,32 +206,33 @@ def prolongate(
     """
     coarse, fine = Layout.of_space(u.function_space), Layout.of_space(V)
     weights, parent_cell = parents.weights(coarse, fine), parents.cell
-    corners = fine.cells.shape[1]
-    local = u.x.array[coarse.cells]
-    if len(weights) == len(parent_cell):
-        values = np.einsum("cij,cj->ci", weights, local[parent_cell])
-    else:  # the same pattern in each parent
-        values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+    corners, block = fine.cells.shape[1], fine.block
+    gain, repeats = None, False
     if below is not None:
         repeats = len(weights) < len(parent_cell) and below[1].regular
         # A rank without cells has no say, but a part in what follows
         if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
             gain = 0.25 * (u.x.array - prolongate(below[0], u.function_space, below[1]))
-            if repeats:
-                of_families = gain[coarse.cells].reshape(-1, 1, values.shape[1])
-                values.reshape(len(of_families), len(weights), -1)[:] += of_families
-    values = values.ravel()
-    total = _sums(fine, values)
-    values[:] = 1.0
-    return total / _sums(fine, values)
+    result, cells_of_node = np.empty(fine.local), _sums(fine, np.ones(fine.cells.size))
+    for component in range(block):
+        local = u.x.array[component::block][coarse.cells]
+        if len(weights) == len(parent_cell):
+            values = np.einsum("cij,cj->ci", weights, local[parent_cell])
+        else:  # the same pattern in each parent
+            values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+        if gain is not None and repeats:
+            of_families = gain[component::block][coarse.cells].reshape(-1, 1, values.shape[1])
+            values.reshape(len(of_families), len(weights), -1)[:] += of_families
+        result[component::block] = _sums(fine, values.ravel()) / cells_of_node
+    return result
 
 
 def _sums(layout: Layout, values: FloatArray) -> FloatArray:
-    """Sum of what all ranks' cells have for each local dof; PETSc's loop needs no copies."""
+    """Sum of what all ranks' cells have for each local node; PETSc's loop needs no copies."""
     result = np.zeros(layout.index_map.size_local + layout.index_map.num_ghosts)
     vector = PETSc.Vec().createWithArray(result, comm=PETSc.COMM_SELF)
     dofs = layout.cells.ravel().astype(PETSc.IntType, copy=False)
     vector.setValues(dofs, values, PETSc.InsertMode.ADD_VALUES)
     vector.assemble()
     vector.destroy()
-    return layout.shared_sum(result)
+    return shared_sum(layout.mesh.comm, layout.index_map, result)

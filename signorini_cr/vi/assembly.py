@@ -11,12 +11,8 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from petsc4py import PETSc
 
-from .. import compat
-from ..data.moments import Compiled
-from ..data.onmesh import OnMesh
 from ..errors import InputError
-from ..fem.conditions import facets_of
-from ..fem.problem import Forms
+from ..fem.physics import OnMesh, Physics
 from ..garbage import hold, sweep
 from ..mesh.domain import Domain
 from ..multigrid.cycle import LONG_SWEEPS, SWEEPS, Grid, Patience
@@ -36,14 +32,14 @@ class Level:
     """One mesh with everything that is assembled on it.
 
     Attributes:
-        forms: The compiled forms, shared by all levels.
+        physics: What is solved, shared by all levels.
         domain: Mesh and boundary parts.
         number: Position in the sequence, from 0.
         coarser: The level below, if there is one.
         parent_cell: For each local cell the cell of the coarser mesh that holds it.
     """
 
-    forms: Forms
+    physics: Physics
     domain: Domain
     number: int = 0
     coarser: Level | None = None
@@ -65,9 +61,8 @@ class Level:
 
     @cached_property
     def data(self) -> OnMesh:
-        """The problem's data on this mesh; what is compiled serves all meshes of a sequence."""
-        compiled = Compiled(self.forms) if self.coarser is None else self.coarser.data.compiled
-        return OnMesh(compiled, self.domain)
+        """The physics on this mesh."""
+        return self.physics.on(self.domain)
 
     @property
     def V(self) -> fem.FunctionSpace:
@@ -84,7 +79,7 @@ class Level:
         """Pieces without a Dirichlet facet; None if there are none, which refinement keeps."""
         if self.coarser is not None and self.coarser.loose is None:
             return None
-        found = Loose.of(self.V, self.system.dirichlet)
+        found = Loose.of(self.V, self.system.held)
         return found if found.count else None
 
     @cached_property
@@ -104,7 +99,7 @@ class Level:
         if self._below is not None:
             coarse, coarse_dofs, parents = self._below
             transfer = prolongation(coarse_dofs, dofs, parents)
-            if not (self.forms.uniform or coarse.is_product(system.A, transfer)):
+            if not (self.physics.uniform or coarse.is_product(system.A, transfer)):
                 coarse = coarse.projected(system.A, transfer)
                 self._below = coarse, coarse_dofs, parents  # P1 on this mesh shall have them, too
             sweeps = LONG_SWEEPS if dofs.cr else SWEEPS
@@ -119,24 +114,15 @@ class Level:
     @cached_property
     @defaults(NO_INODES, prefix="")
     def conforming(self) -> tuple[Grid, Layout]:
-        """P1 on this mesh and its dofs: for the next mesh, or for CR on this one.
-
-        The function of CR that belongs to the facet opposite vertex i has −d times the gradient of
-        the hat function at i. So the kernel of a_h in CR, at work on the dofs of P1, makes d² times
-        the matrix of P1: no form is compiled, no product computed.
-        """
-        if self.forms.element == "P1":
+        """P1 on this mesh and its dofs: for the next mesh, or for CR on this one."""
+        if self.physics.element == "P1":
             return self.grid, Layout.of_space(self.V)
-        domain = self.domain
-        p1, d = Layout.of_p1(domain.mesh), domain.mesh.topology.dim
-        W = compat.with_dofs(self.V, p1.cells, p1.index_map)
-        matrix = assemble_matrix(empty_matrix(p1), self.forms.a.on(domain, [W, W]))
+        p1 = Layout.of_p1(self.domain.mesh, self.V.dofmap.index_map_bs)
+        form, scale = self.data.conforming(p1.cells, p1.index_map)
+        matrix = assemble_matrix(empty_matrix(p1), form)
         matrix.assemble()
-        matrix.scale(1.0 / d**2)
-        dirichlet, bounded = (
-            p1.owned_ends(facets_of(domain, which))
-            for which in (self.forms.fixed, self.forms.bounded)
-        )
+        matrix.scale(scale)
+        dirichlet, bounded = p1.owned_at(self.data.fixed), p1.owned_at(self.data.lower)
         matrix.zeroRowsColumns(numbers_of(matrix, dirichlet), 1.0)
         matrix.setOption(PETSc.Mat.Option.SPD, True)
         space = matrix, p1, dirichlet, bounded
@@ -155,4 +141,4 @@ class Level:
     @property
     def _owned_dirichlet(self) -> npt.NDArray[np.int32]:
         dofs = self.system.dirichlet
-        return dofs[dofs < self.V.dofmap.index_map.size_local]
+        return dofs[dofs < self.system.A.getLocalSize()[0]]

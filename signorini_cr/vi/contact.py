@@ -13,13 +13,13 @@ import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.la import InsertMode
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from ..fem.space import closure_dofs, facet_corners, facet_entities, facet_measures, vertex_values
+from ..fem.physics import OnMesh
+from ..fem.space import facet_measures
 from ..fem.walk import along_boundary
-from ..mesh.domain import Domain
 from .solver import Iterations
 from .stopping import NOISE
+from .system import System
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -102,41 +102,35 @@ class Contact:
 
 
 def contact_facts(
-    domain: Domain,
-    facets: npt.NDArray[np.int32],
+    data: OnMesh,
+    system: System,
     u: fem.Function,
     residual: fem.Function,
     diagonal: FloatArray,
-    lower: FloatArray,
-    obstacle_at_vertices: FloatArray,
-    load: float,
     rounding: FloatArray,
     iterations: Iterations,
 ) -> Contact:
     """Read the state of Γ1 off a solution.
 
     Args:
-        domain: Mesh and boundary parts.
-        facets: The contact facets this rank owns, ascending, shape (n,).
+        data: The physics on the mesh.
+        system: The variational inequality.
         u: u_h, ghosts up to date.
         residual: r = A u_h − b, ghosts up to date.
         diagonal: Diagonal of A, owned dofs.
-        lower: Bound of each dof, `PETSc.NINFINITY` where there is none, ghosts included.
-        obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
-        load: What the residual is measured against.
         rounding: What rounding makes of r, owned dofs with a bound only.
         iterations: What the solver says about its errors.
     """
     V = u.function_space
-    mesh = domain.mesh
-    comm, owned = mesh.comm, V.dofmap.index_map.size_local
+    mesh, facets = data.domain.mesh, system.bounded_facets
+    comm, owned = mesh.comm, len(diagonal)
     vertices, measure = facet_measures(mesh, facets)
-    dofs = closure_dofs(V, facets)
+    dofs, bounded, lower = system.contact_dofs, system.bounded, system.lower
+    obstacle_at_vertices = system.obstacle_at_vertices
 
     work = fem.Function(V)
     np.add.at(work.x.array, dofs, (measure / dofs.shape[1])[:, None])
     work.x.scatter_reverse(InsertMode.add)
-    bounded = np.flatnonzero(lower[:owned] > PETSc.NINFINITY)
     weight = work.x.array[bounded]
     work.x.array[:] = 0.0
 
@@ -161,13 +155,14 @@ def contact_facts(
     left[bounded] = np.minimum(raw, stiff_gap)
     left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[:owned])] = 0.0
 
-    local = _cells_values(u, facets)
+    local = data.at_vertices(u, facets)
     total = _Totals(comm)
+    of_load = float(np.sqrt(total.sum(left @ left))) / (system.load or 1.0)
     kkt = Kkt(
         min_gap=total.min(gap),
         min_pressure=total.min(pressure),
         complementarity=total.sum(np.abs(force * gap)),
-        residual=max(float(np.sqrt(total.sum(left @ left))) / (load or 1.0), iterations.imbalance),
+        residual=max(of_load, iterations.imbalance),
         force_error=iterations.force_error,
     )
     fields: dict[str, npt.NDArray] = {
@@ -205,11 +200,3 @@ class _Totals:
 
     def min(self, values: npt.NDArray) -> float:
         return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), op=MPI.MIN))
-
-
-def _cells_values(u: fem.Function, facets: npt.NDArray[np.int32]) -> FloatArray:
-    """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
-    mesh = u.function_space.mesh
-    cells, local = facet_entities(mesh, facets).T
-    corners = facet_corners(mesh)
-    return np.take_along_axis(vertex_values(u, cells), corners[local], axis=1)

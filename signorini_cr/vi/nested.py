@@ -21,7 +21,6 @@ from mpi4py import MPI
 
 from .. import compat
 from ..fem.space import (
-    closure_dofs,
     facet_corners,
     facet_entities,
     facet_measures,
@@ -57,15 +56,18 @@ def nested_start(coarse: Solved, level: Level, start: fem.Function) -> None:
     values = x[system.dirichlet].copy()
     x[:] = prolongate(coarse.u, V, parents, before)
     x[system.dirichlet] = values
-    facets = system.bounded_facets
-    dofs = closure_dofs(V, facets)
+    facets, dofs = system.bounded_facets, system.contact_dofs
     if dofs.shape[1] > 1:  # a P1 dof has many cells, and no one to change its residual through
         return
-    facets = facets[np.argsort(dofs[:, 0])]  # the order of the operator's bounded dofs
+    order = np.argsort(dofs[:, 0])  # the order of the operator's bounded dofs
+    facets, block = facets[order], V.dofmap.index_map_bs
+    component = dofs[order, 0] % block
     bounded, b = operator.dofs, system.b.x.array[operator.dofs]
     lower = system.lower[bounded]
     vector, layout = ghosted_vector(V, x), Layout.of_space(V)
-    active, force, at_front = _from_parents(coarse, level.domain.mesh, parents.cell, facets)
+    active, force, at_front = _from_parents(
+        coarse, level.domain.mesh, parents.cell, facets, component
+    )
     on_bound = operator.times(vector) - b - operator.diagonal * (x[bounded] - lower)
     active = np.where(at_front, on_bound > 0.0, active)
     force = np.where(at_front, on_bound, force)
@@ -74,6 +76,7 @@ def nested_start(coarse: Solved, level: Level, start: fem.Function) -> None:
     x[bounded] = np.where(active, lower, np.maximum(x[bounded], above))
 
     others = V.dofmap.list[facet_entities(level.domain.mesh, facets)[:, 0]]
+    others = block * others + component[:, None]
     free = np.ones(len(x), dtype=bool)
     free[system.dirichlet] = free[bounded] = False
     surplus = operator.times(vector) - b - force
@@ -95,6 +98,7 @@ def _from_parents(
     fine: Mesh,
     parent_cell: npt.NDArray[np.int32],
     facets: npt.NDArray[np.int32],
+    component: npt.NDArray[np.int32],
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
     """What the fine contact facets' parents say.
 
@@ -113,7 +117,7 @@ def _from_parents(
     mesh.topology.create_connectivity(tdim, tdim - 1)
     c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
     _, parent_measure = facet_measures(mesh, c2f[parents, local])
-    dof = V.dofmap.list[parents, local]
+    dof = V.dofmap.index_map_bs * V.dofmap.list[parents, local] + component
     force = coarse.residual.x.array[dof]
     active = (coarse.u.x.array[dof] <= coarse.level.system.lower[dof]) & (force > 0.0)
     ends = Layout.of_p1(mesh).cells[parents[:, None], facet_corners(mesh)[local]]

@@ -12,11 +12,9 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..data.moments import OnFacets
-from ..data.onmesh import OnMesh
 from ..errors import InputError, raise_together
-from ..fem.conditions import facets_of
-from ..fem.space import closure_dofs, ghosted_vector, shared_maximum
+from ..fem.physics import Imposed, OnMesh
+from ..fem.space import ghosted_vector, shared_maximum, unknowns
 from ..garbage import release
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
@@ -40,6 +38,7 @@ class System:
         bounded: Owned local dofs with a bound, ascending.
         u_D: Function with the Dirichlet values, 0 elsewhere.
         bounded_facets: Owned facets of Γ1, ascending, shape (n,).
+        contact_dofs: The dofs with a bound that each of them has, shape (n, 1) or (n, d).
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
         load: Norm of the residual at the most trivial start, which all residuals are measured
             against: the number in the middle of the values u_D takes, raised to α on Γ1 where that
@@ -51,27 +50,25 @@ class System:
         """Assemble it; collective.
 
         Args:
-            data: The problem on the mesh.
+            data: The physics on the mesh.
 
         Raises:
             InputError: Data are not finite, or κ is not above 0.
         """
-        forms, domain, V = data.forms, data.domain, data.V
-        comm = domain.mesh.comm
-        self.bounded_facets = facets_of(domain, forms.bounded)
-        on_dirichlet, self.u_D, _ = _boundary_values(data.fixed, V)
-        on_contact, lower, self.obstacle_at_vertices = _boundary_values(data.bounded, V)
+        self._data, V = data, data.V
+        comm, layout = V.mesh.comm, Layout.of_space(V)
+        on_dirichlet, self.u_D = _imposed(data.fixed, V)
+        on_contact, lower = _imposed(data.lower, V)
+        self._read_contact(data.lower)
         # Where the two parts meet in a P1 vertex the Dirichlet value holds
         bounded = on_contact & ~on_dirichlet
         self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
-        owned = V.dofmap.index_map.size_local
-        self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
-        bc = fem.dirichletbc(self.u_D, self.dirichlet)
-        self._a = a = forms.a.on(domain, [V, V])
+        self.bounded = np.flatnonzero(bounded[: layout.size[0]]).astype(np.int32)
+        bc, a = self._bc(self.u_D), data.a
         with defaults(NO_INODES, prefix=""):
-            if forms.element == "CR":
-                self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
+            if layout.cr:
+                self.A = assemble_matrix(empty_matrix(layout), a, [bc])
             else:
                 self.A = assemble_matrix(a, [bc])
         self.A.assemble()
@@ -82,10 +79,7 @@ class System:
         raise_together(comm, None if positive else complaint)
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
-        if forms.element == "CR" and forms.loaded:
-            self.chi.x.array[:] = data.chi()
-        elif forms.chi is not None:
-            fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
+        self.chi.x.array[:] = data.chi()
         self.b = fem.Function(V)
         self.b.x.array[:] = self.chi.x.array
         fem.apply_lifting(self.b.x.array, [a], [[bc]])
@@ -114,12 +108,40 @@ class System:
             raise InputError("data: so large that their squares overflow; choose other units")
         return load
 
+    @property
+    def held(self) -> npt.NDArray[np.int32]:
+        """Local dofs on Γ0, or on which a_h(1, ·) does not vanish; collective."""
+        of_constants = self._data.of_constants()
+        if of_constants is None:
+            return self.dirichlet
+        layout = Layout.of_space(self._data.V)
+        of_constants[self.dirichlet] = 1.0
+        return np.flatnonzero(layout.shared_sum(of_constants) > 0.0).astype(np.int32)
+
+    def _bc(self, values: fem.Function) -> fem.DirichletBC:
+        """Values on Γ0, where all unknowns of a node are set."""
+        block = values.function_space.dofmap.index_map_bs
+        return fem.dirichletbc(values, np.unique(self.dirichlet // block))
+
+    def _read_contact(self, bounds: Sequence[Imposed]) -> None:
+        """Note what the owned facets of Γ1 have, in ascending order."""
+        V = self._data.V
+        facets = np.concatenate([each.facets for each in bounds])
+        dofs = [unknowns(V, each.facets, each.components) for each in bounds]
+        order = np.argsort(facets)
+        topology = V.mesh.topology
+        order = order[facets[order] < topology.index_map(topology.dim - 1).size_local]
+        self.bounded_facets = facets[order]
+        self.contact_dofs = np.concatenate([each[:, :, 0] for each in dofs])[order]
+        self.obstacle_at_vertices = np.concatenate([each.ends[:, :, 0] for each in bounds])[order]
+
     def row_sums(self) -> FloatArray:
-        """Sum up the owned rows of A: 0 where no neighbour is on Γ0, whose columns A is without."""
+        """Sum up the owned rows of A: a_h(1, ·) but where a neighbour is on Γ0."""
         ones, sums = (fem.Function(self.u_D.function_space) for _ in range(2))
         ones.x.array[:] = 1.0
-        bc = fem.dirichletbc(ones, self.dirichlet)
-        fem.apply_lifting(sums.x.array, [self._a], [[bc]])
+        fem.apply_lifting(sums.x.array, [self._data.a], [[self._bc(ones)]])
+        if (of_constants := self._data.of_constants()) is not None:
+            sums.x.array[:] += of_constants
         sums.x.scatter_reverse(InsertMode.add)
         sums.x.array[self.dirichlet] = 1.0
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
@@ -143,35 +165,30 @@ class System:
         return norm
 
 
-def _boundary_values(
-    sampled: Sequence[OnFacets], V: fem.FunctionSpace
-) -> tuple[npt.NDArray[np.bool_], fem.Function, FloatArray]:
+def _imposed(
+    imposed: Sequence[Imposed], V: fem.FunctionSpace
+) -> tuple[npt.NDArray[np.bool_], fem.Function]:
     """Data on the boundary as the element takes them: CR facet means, P1 values at vertices.
 
     Returns:
-        Which dofs have some, a Function with the values there, and the values at the vertices of
-        the owned facets in ascending order, shape (n, d).
+        Which dofs have some, and a Function with the values there.
     """
-    owned = V.mesh.topology.index_map(V.mesh.topology.dim - 1).size_local
     values = fem.Function(V)
     on_part = np.zeros_like(values.x.array)
     values.x.array[:] = PETSc.NINFINITY
-    for data in sampled:
-        dofs = closure_dofs(V, data.facets)
+    for data in imposed:
+        dofs = unknowns(V, data.facets, data.components)
         # Π_h K ⊂ K_h holds with facet means for any α and u_D
-        of_dofs = data.means[:, None] if dofs.shape[1] == 1 else data.ends.T
+        of_dofs = data.means[:, None] if dofs.shape[1] == 1 else data.ends
         # before the maximum over the ranks, which a NaN may lose
-        _require_finite(V.mesh.comm, data.condition.key, of_dofs)
+        _require_finite(V.mesh.comm, data.key, of_dofs)
         np.maximum.at(values.x.array, dofs, of_dofs)
         on_part[dofs] = 1.0
     # A rank may own a dof of the part without owning any of its facets
     for array in (values.x.array, on_part):
         shared_maximum(V, array)
     values.x.array[on_part == 0.0] = 0.0
-    facets = np.concatenate([data.facets for data in sampled])
-    at_vertices = np.concatenate([data.ends.T for data in sampled])
-    order = np.argsort(facets)
-    return on_part > 0.0, values, at_vertices[order[facets[order] < owned]]
+    return on_part > 0.0, values
 
 
 def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
