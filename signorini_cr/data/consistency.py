@@ -103,8 +103,11 @@ class _Solution:
                 given = self._values(condition.fixed, x, cells)
                 said = self._same(condition.key, x, given, self._values(self.u, x, cells))
             elif condition.flux is not None:
-                given = self._values(condition.flux, x, cells)
-                said = self._same(condition.key, x, given, self._flux(x, cells, n))
+                given, wanted = self._values(condition.flux, x, cells), self._flux(x, cells, n)
+                added = condition.a(self.u, ufl.as_ufl(1.0))
+                if added is not None:
+                    wanted = _difference(wanted, self._values(-added, x, cells))
+                said = self._same(condition.key, x, given, wanted)
         return said
 
     def _same(self, key: str, x: FloatArray, given: Found, wanted: Found) -> str | None:

@@ -61,8 +61,12 @@ class Condition:
     uncertified: ClassVar[str | None] = None
 
     @classmethod
-    def of(cls, given: Given) -> Condition:
-        """Make it from what the user gives, and what follows from an exact solution."""
+    def of(cls, given: Given) -> Condition | None:
+        """Make it from what the user gives, and what follows from an exact solution.
+
+        Returns:
+            None where the user asks for no condition of this kind.
+        """
         raise NotImplementedError
 
     @property
@@ -150,4 +154,4 @@ def facets_of(domain: Domain, conditions: Sequence[Condition]) -> npt.NDArray[np
 
 
 KINDS: tuple[type[Condition], ...] = (Dirichlet, Neumann, Contact)
-"""The kinds there are; a problem has one condition of each."""
+"""The kinds there are; a problem has at most one condition of each."""

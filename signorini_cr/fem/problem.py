@@ -157,7 +157,8 @@ class Forms:
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
         given = Given(problem, lambda data: as_expression(data, self.x), self.exact, outward)
         self.f, _ = given.or_derived("f", None if flux is None else -ufl.div(flux))
-        self.conditions = tuple(kind.of(given) for kind in KINDS)
+        made = (kind.of(given) for kind in KINDS)
+        self.conditions: tuple[Condition, ...] = tuple(c for c in made if c is not None)
         d = mesh.geometry.dim
         for key, data in self._data.items():
             if data.ufl_shape != () and (key, data.ufl_shape) != ("coefficient", (d, d)):
