@@ -137,6 +137,13 @@ class Forms:
         problem: The data.
         mesh: A mesh of the kind they will be used on; data tied to a mesh must be tied to this one.
         element: "CR" or "P1".
+
+    Attributes:
+        f: Volume load.
+        asked: The load that an exact solution asks for; None if there is none, or a constant.
+        kappa: κ.
+        exact: The exact solution, if it is known.
+        conditions: What holds on the parts of the boundary.
     """
 
     def __init__(self, problem: Problem, mesh: Mesh, element: str = "CR"):
@@ -156,7 +163,8 @@ class Forms:
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
         given = Given(problem, lambda data: as_expression(data, self.x), self.exact, outward)
-        self.f, _ = given.or_derived("f", None if flux is None else -ufl.div(flux))
+        self.asked = None if flux is None else -ufl.div(flux)
+        self.f, _ = given.or_derived("f", self.asked)
         made = (kind.of(given) for kind in KINDS)
         self.conditions: tuple[Condition, ...] = tuple(c for c in made if c is not None)
         d = mesh.geometry.dim
