@@ -47,10 +47,10 @@ class Rule:
         bumps: b_i = 4 λ_j λ_k, i, j, k different, at the points, shape (d + 1, q); for d = 2.
     """
 
-    def __init__(self, forms: Forms, degree: int):
+    def __init__(self, mesh: Mesh, degree: int):
         """Take the rule that is exact for polynomials of a degree."""
         self.degree = degree
-        self.points, weights = basix.make_quadrature(forms.mesh.basix_cell(), degree)
+        self.points, weights = basix.make_quadrature(mesh.basix_cell(), degree)
         self.weights = weights / weights.sum()
         self.hats = np.vstack([1.0 - self.points.sum(axis=1), self.points.T])
         self.bumps = np.stack(
@@ -63,17 +63,17 @@ class Volume:
 
     Args:
         expression: A scalar.
-        forms: The problem's.
+        mesh: The mesh that it was written for.
         rule: Where to evaluate.
     """
 
-    def __init__(self, expression: Expr, forms: Forms, rule: Rule):
+    def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
         """Compile the expression, unless it is a number."""
         self.number, self.rule = number(expression), rule
-        self.expression, self._forms = expression, forms
+        self.expression, self._mesh = expression, mesh
         self._values = None
         if self.number is None:
-            self._values = compat.compile_expression(expression, rule.points, forms.mesh)
+            self._values = compat.compile_expression(expression, rule.points, mesh)
 
     def at(self, cells: Cells) -> FloatArray:
         """Values at the quadrature points of owned cells, shape (cells, q)."""
@@ -93,14 +93,14 @@ class Volume:
         if self.number is not None or self.rule.degree >= degree:
             return self
         if degree not in self._others:
-            rule = Rule(self._forms, degree)
-            self._others[degree] = Volume(self.expression, self._forms, rule)
+            rule = Rule(self._mesh, degree)
+            self._others[degree] = Volume(self.expression, self._mesh, rule)
         return self._others[degree]
 
     @cached_property
     def plain(self) -> Rule:
         """A rule for pieces of cells: what is missed on these is known."""
-        return Rule(self._forms, LOAD_DEGREE)
+        return Rule(self._mesh, LOAD_DEGREE)
 
     @cached_property
     def _others(self) -> dict[int, Volume]:
@@ -275,19 +275,18 @@ class Trace:
         constant: The number that it is, or None.
     """
 
-    def __init__(self, expression: Expr, forms: Forms):
-        """Compile the expression, unless it is a number."""
-        self._expression = expression
-        facet = basix.cell.subentity_types(forms.mesh.basix_cell())[-2][0]
+    def __init__(self, expression: Expr, mesh: Mesh, degree: int):
+        """Compile the expression, written for a mesh, unless it is a number."""
+        self._expression, self.degree = expression, degree
+        facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
         corners = basix.geometry(facet)
-        self.degree = forms.problem.quadrature_degree
-        self.points, self.weights = facet_quadrature(forms.mesh, self.degree)
+        self.points, self.weights = facet_quadrature(mesh, degree)
         self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
         self._corners = len(corners)
         self.constant = number(expression)
         if self.constant is None:
             at = np.vstack([corners, corners.mean(axis=0), self.points])
-            self._values = compat.FacetExpression(expression, at, forms.mesh)
+            self._values = compat.FacetExpression(expression, at, mesh)
 
     @property
     def expression(self) -> Expr:
@@ -363,21 +362,12 @@ class OnFacets:
         means, ends = self.means[:, None], self.ends.T[:, :, None]
         return Imposed(self.condition.key, self.facets, only, means, ends)
 
-    def among(self, which: npt.NDArray[np.bool_]) -> OnFacets:
-        """Leave facets out."""
-        values = self.ends[:, which], self.middle[which], self.inside[:, which]
-        return replace(
-            self,
-            facets=self.facets[which],
-            entities=self.entities[which],
-            ends=values[0],
-            middle=values[1],
-            inside=values[2],
-        )
-
     def seen_from(self, cells: Cells) -> OnFacets:
         """Keep the facets of owned cells, those of the part's `Side`."""
-        return self.among(self.entities[:, 0] < cells.number)
+        own = self.entities[:, 0] < cells.number
+        where = self.facets[own], self.entities[own]
+        values = self.ends[:, own], self.middle[own], self.inside[:, own]
+        return OnFacets(self.condition, self.trace, *where, *values)
 
     def side(self, cells: Cells) -> Side:
         """The facets of owned cells, seen from these."""
@@ -394,22 +384,23 @@ class Compiled:
     def __init__(self, forms: Forms):
         """Note whose data."""
         self.forms = forms
-        self._rule = Rule(forms, forms.problem.quadrature_degree)
+        self._rule = Rule(forms.mesh, forms.problem.quadrature_degree)
         self._traces: dict[Expr, Trace] = {}
 
     @cached_property
     def f(self) -> Volume:
         """Volume load; collective."""
-        return Volume(self.forms.f, self.forms, self._rule)
+        return Volume(self.forms.f, self.forms.mesh, self._rule)
 
     @cached_property
     def kappa(self) -> Volume | None:
         """Coefficient; None if it isn't a scalar; collective."""
         kappa = self.forms.kappa
-        return None if ufl.shape(kappa) else Volume(kappa, self.forms, self._rule)
+        return None if ufl.shape(kappa) else Volume(kappa, self.forms.mesh, self._rule)
 
     def trace(self, expression: Expr) -> Trace:
         """Values of a condition's datum on facets; collective."""
         if expression not in self._traces:
-            self._traces[expression] = Trace(expression, self.forms)
+            degree = self.forms.problem.quadrature_degree
+            self._traces[expression] = Trace(expression, self.forms.mesh, degree)
         return self._traces[expression]
