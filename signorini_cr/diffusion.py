@@ -21,6 +21,11 @@ class Diffusion(Forms):
         """The data, ready for any mesh."""
         return Compiled(self)
 
+    @property
+    def galerkin(self) -> bool:
+        """Whether quadrature sees the same on all meshes: κ is a number, and nothing is added."""
+        return self.uniform and self.of_one is None
+
     def check(self, domain: Domain) -> None:
         """Refuse data for which there is no solution; collective."""
         check_data(self, domain)

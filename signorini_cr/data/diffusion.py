@@ -118,7 +118,8 @@ class DiffusionOnMesh:
         return float(fem.assemble_scalar(self.forms.a_of_w.on(self.domain, (), [u])))
 
     def _assembled(self, kernel: Kernel | None) -> FloatArray:
-        values: FloatArray = np.zeros_like(fem.Function(self.V).x.array)
+        nodes, block = self.V.dofmap.index_map, self.V.dofmap.index_map_bs
+        values: FloatArray = np.zeros(block * (nodes.size_local + nodes.num_ghosts))
         if kernel is not None:
             fem.assemble_vector(values, kernel.on(self.domain, [self.V]))
         return values

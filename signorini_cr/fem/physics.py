@@ -103,8 +103,8 @@ class Physics(Protocol):
     exact: Any
 
     @property
-    def uniform(self) -> bool:
-        """Whether the P1 operators are the Galerkin products of the finer meshes' operators."""
+    def galerkin(self) -> bool:
+        """Whether P1 operators are sure to be the Galerkin products of finer meshes' operators."""
 
     def check(self, domain: Domain) -> None:
         """Refuse data for which there is no solution; collective."""

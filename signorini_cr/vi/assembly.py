@@ -99,7 +99,7 @@ class Level:
         if self._below is not None:
             coarse, coarse_dofs, parents = self._below
             transfer = prolongation(coarse_dofs, dofs, parents)
-            if not (self.physics.uniform or coarse.is_product(system.A, transfer)):
+            if not (self.physics.galerkin or coarse.is_product(system.A, transfer)):
                 coarse = coarse.projected(system.A, transfer)
                 self._below = coarse, coarse_dofs, parents  # P1 on this mesh shall have them, too
             sweeps = LONG_SWEEPS if dofs.cr else SWEEPS
