@@ -4,7 +4,8 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify test ranks test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz docs test test-alone test-pair ranks test-package test-wheels lint \
+    types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -18,8 +19,21 @@ verify:
 	$(run) timeout --kill-after=20 3600 python3 verification --out docs/verification.md
 	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 verification
 
-test:
+# What the tests draw a few of, in numbers; every seed that fails is to become a test.
+fuzz:
+	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --files 20000 --problems 3000
+	$(run) python3 tests/mesh_mutations.py --count 5000
+
+# The site, from docs/ and the docstrings: docs/_build/index.html
+docs:
+	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
+
+test: test-alone test-pair
+
+test-alone:
 	$(run) $(limit) python3 -m pytest
+
+test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
 
 # What depends on how a mesh is shared out, on more ranks than that.

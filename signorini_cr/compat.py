@@ -12,6 +12,8 @@ from dolfinx import cpp, fem
 from dolfinx.mesh import CellType, Mesh
 from mpi4py import MPI
 
+from .jit import compiled
+
 IntArray = npt.NDArray[np.int32]
 _TAG = 1998
 
@@ -142,7 +144,7 @@ def compile_expression(
     nothing = x[0] - x[0]
     if shape := expression.ufl_shape:
         nothing = ufl.as_vector([nothing] * shape[0])
-    return fem.Expression(expression + nothing, points, mesh.comm)
+    return compiled(mesh.comm, fem.Expression, expression + nothing, points, mesh.comm)
 
 
 class FacetExpression:
@@ -160,7 +162,8 @@ class FacetExpression:
     def __init__(self, expression: Any, points: npt.NDArray[np.float64], mesh: Mesh):
         """Compile the expression."""
         self._values = compile_expression(expression, points, mesh)
-        self._where = fem.Expression(ufl.SpatialCoordinate(mesh), points, mesh.comm)
+        x = ufl.SpatialCoordinate(mesh)
+        self._where = compiled(mesh.comm, fem.Expression, x, points, mesh.comm)
         self._shape = (len(points), -1)
         self._hats = np.column_stack([1.0 - points.sum(axis=1), points])
         self._corners = np.array(basix.topology(mesh.basix_cell())[-2])

@@ -2,12 +2,15 @@
 
 import faulthandler
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+
+from signorini_cr import jit
 
 SECONDS = float(os.environ.get("SIGNORINI_TEST_SECONDS", "300"))
 _stderr = 2
@@ -17,6 +20,10 @@ def pytest_configure(config: pytest.Config) -> None:
     # Here fd 2 is the real one; while a test runs it is the capture file
     global _stderr
     _stderr = os.dup(2)
+    # What runs that were killed have left would keep forms of the tests' own waiting
+    if MPI.COMM_WORLD.rank == 0:
+        jit.remove_unfinished(until=time.time() - jit.ABANDONED)
+    MPI.COMM_WORLD.Barrier()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

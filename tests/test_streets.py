@@ -9,7 +9,7 @@ import signorini_cr
 
 PACKAGE = Path(signorini_cr.__file__).parent
 FLOORS = (
-    ("errors", "compat", "options", "garbage", "memory", "__init__"),
+    ("errors", "jit", "compat", "options", "garbage", "memory", "__init__"),
     ("mesh",),
     ("fem",),
     ("data",),

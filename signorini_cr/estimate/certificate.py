@@ -22,6 +22,7 @@ from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
+from ..jit import compiled
 from .companion import Companion, companion, on_facet
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, unbalanced
@@ -89,7 +90,8 @@ class Certificate:
         y = fem.Function(fem.functionspace(mesh, ("RT", 1)))
         points = y.function_space.element.interpolation_points
         points = points() if callable(points) else points
-        y.interpolate(fem.Expression(slope * ufl.SpatialCoordinate(mesh) + shift, points))
+        field = slope * ufl.SpatialCoordinate(mesh) + shift
+        y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 
     @cached_property

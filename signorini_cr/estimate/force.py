@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..fem.cells import dot_rows, sum_rows
 from ..fem.conditions import facets_of
 from ..fem.space import ghosted_vector, shared_sum
+from ..jit import compiled
 from ..options import AMG
 from ..vi.solved import Solved
 from .certificate import Certificate
@@ -112,7 +113,7 @@ def _weight(solution: Certified) -> fem.Function:
     marks.x.array[:] = 0.0
     marks.x.array[bounded] = 1.0
     bc = fem.dirichletbc(marks, known)
-    form = fem.form(ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    form = compiled(mesh.comm, fem.form, ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])

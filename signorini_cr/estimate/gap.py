@@ -275,7 +275,7 @@ def _with_slack(rows: FloatArray, errors: FloatArray, d: int) -> FloatArray:
     for sign, (zz, steep) in ((-2.0, at_z[:2]), (2.0, at_z[2:])):
         products = 2.0 * (inverse_W * yy + W * zz)
         square = np.maximum(pp + bb + sign * pb, 0.0)
-        norm = (1.0 + t) * (np.sqrt(square) + 2.0 * R * np.sqrt(steep)) ** 2
+        norm = (1.0 + t) * (np.sqrt(square) + 2.0 * R * np.sqrt(np.maximum(steep, 0.0))) ** 2
         # on strips κ may be what it is nowhere else, and an affine field (d + 1) times its norm
         strips = strip_low * yy + strip_high * zz
         slack.append(np.fmin(products, norm - square + 2.0 * (d + 1) ** 2 * strips))

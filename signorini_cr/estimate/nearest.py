@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from ..fem.cells import Cells, blocks, dot_rows, pick, sum_rows
 from ..fem.space import ghosted_vector, shared_maximum
 from ..garbage import release
+from ..jit import compiled
 from ..options import AMG
 
 FloatArray = npt.NDArray[np.float64]
@@ -97,7 +98,7 @@ def nearest(
     k = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     k.x.array[: cells.number] = kappa
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    form = fem.form(k * ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    form = compiled(mesh.comm, fem.form, k * ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
     A.assemble()
     ksp = PETSc.KSP().create(mesh.comm)

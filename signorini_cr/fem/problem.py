@@ -23,6 +23,7 @@ from dolfinx.mesh import Mesh
 from ufl.core.expr import Expr
 
 from ..errors import InputError
+from ..jit import compiled
 from ..mesh.domain import Domain
 from .conditions import KINDS, Condition, Given
 from .space import facet_entities, ufl_element
@@ -90,7 +91,7 @@ class Kernel:
     """
 
     def __init__(self, form: ufl.Form, mesh: Mesh, stand_ins: Sequence[ufl.Coefficient] = ()):
-        self._compiled = fem.compile_form(mesh.comm, form)
+        self._compiled = compiled(mesh.comm, fem.compile_form, mesh.comm, form)
         self._mesh = mesh
         self._stand_ins = tuple(stand_ins)
         self._own = {

@@ -26,6 +26,7 @@ from mpi4py import MPI
 
 from ..fem.problem import Data, as_expression
 from ..fem.space import facet_quadrature, facet_to_dof, function_space
+from ..jit import compiled
 from ..mesh.domain import CONTACT, DIRICHLET, Domain
 from ..solution import Solution
 from .exact import Example
@@ -212,7 +213,7 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
         side(MIXED),
         ufl.inner(ufl.grad(u), ufl.grad(w)) * dx - f * w * dx - g * w * ds(_NEUMANN),
     ]
-    integrals = [fem.assemble_scalar(fem.form(form)) for form in forms]
+    integrals = [fem.assemble_scalar(compiled(mesh.comm, fem.form, form)) for form in forms]
     owned = w.function_space.dofmap.index_map.size_local
     integrals.append(float(solution.residual.x.array[:owned] @ w.x.array[:owned]))
     total = np.array(integrals)

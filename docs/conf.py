@@ -1,0 +1,50 @@
+"""The documentation site: `make docs` builds it from this folder's Markdown and the docstrings."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+project = "signorini_cr"
+copyright = "the signorini_cr authors"
+author = "The signorini_cr authors"
+text = (ROOT / "signorini_cr" / "__init__.py").read_text()
+version = release = re.findall(r'^__version__ = "(.*)"', text, re.M)[0]
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "signorini_cr"
+# Debian's Sphinx and pip's spell some things differently; words in code are left as they are.
+smartquotes = False
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+# Tables and pictures of the benchmarks are files beside this folder, for download.
+suppress_warnings = ["myst.header"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_default_options = {"members": True}
+napoleon_use_ivar = True
+napoleon_preprocess_types = False
+nitpicky = False
+# In docstrings `name` is code.
+default_role = "code"
+
+
+def _as_text(app, what, name, obj, options, lines):
+    """Keep |F| the measure of F; reStructuredText takes it for a substitution."""
+    lines[:] = [line.replace("|", r"\|") for line in lines]
+
+
+def _for_download(app, name, content):
+    """Files beside this folder are handed over as they are."""
+    content[0] = re.sub(r"\]\((\.\./[^)]*\.md)\)", r"](path:\1)", content[0])
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _as_text, priority=900)
+    app.connect("source-read", _for_download)
