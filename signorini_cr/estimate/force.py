@@ -13,7 +13,7 @@ from dolfinx.la import InsertMode
 from petsc4py import PETSc
 
 from ..errors import InputError
-from ..fem.cells import dot_rows, sum_rows
+from ..fem.cells import Cells, dot_rows, sum_rows
 from ..fem.space import ghosted_vector, shared_sum
 from ..mesh.domain import CONTACT, DIRICHLET
 from ..options import AMG
@@ -53,7 +53,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     if made is None or certificate.bound_h1 is None:
         raise InputError(f"the contact force has no bounds: {certificate.reason}")
     level = made.level
-    cells = level.cells
+    cells = Cells(level.domain, level.V)
     if made.varies or cells.tdim != 2:
         why = VARIES if made.varies else SPATIAL
         raise InputError(f"the contact force has no bounds: {why}")
@@ -85,7 +85,6 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     middle, energy = cells.total(
         made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)
     )
-    level.tidy()
     reach = made.reach * np.sqrt(energy)
     return max(float(middle - reach), 0.0), float(middle + reach)
 
