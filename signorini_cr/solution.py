@@ -12,8 +12,8 @@ from mpi4py import MPI
 from .estimate.certificate import Certificate
 from .fem.problem import Problem
 from .mesh.domain import Domain
-from .vi.assembly import Level
 from .vi.contact import Contact
+from .vi.level import Level
 from .vi.solver import Iterations
 
 
@@ -29,7 +29,6 @@ class Solution:
         energy: J(u_h) = ½ a_h(u_h, u_h) − χ(u_h).
         iterations: Newton steps and linear iterations.
         seconds: Wall time of the phases mesh, assemble, solve, estimate.
-        before: The solution on the mesh below that it was started from, if it was.
     """
 
     level: Level
@@ -39,7 +38,6 @@ class Solution:
     energy: float
     iterations: Iterations
     seconds: dict[str, float] = field(default_factory=dict)
-    before: fem.Function | None = None
 
     @property
     def domain(self) -> Domain:
@@ -88,4 +86,8 @@ class Solution:
     @cached_property
     def certificate(self) -> Certificate:
         """What is certain about the error; made when first asked for, collectively."""
-        return self.level.physics.certify(self)
+        try:
+            certificate: Certificate = self.level.physics.certify(self)
+            return certificate
+        finally:
+            self.level.tidy()

@@ -9,9 +9,10 @@ from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem import problem as forms_of_problem
 from signorini_cr.fem.conditions import KINDS, Condition
 from signorini_cr.fem.space import ghosted_vector
+from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.transfer import inclusion
-from signorini_cr.vi.assembly import Level
+from signorini_cr.vi.level import Level
 
 SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
 PARTS = ("contact", "neumann", "dirichlet", "dirichlet")
@@ -59,12 +60,12 @@ def test_another_kind_is_solved_right(springs, element):
 
 def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows(springs):
     domain = Polygon(SQUARE, PARTS).mesh(0.3)
-    level = Level(Diffusion(SPRUNG, domain.mesh), domain)
-    grid, p1 = level.conforming
+    mesh = NestedMesh(Diffusion(SPRUNG, domain.mesh), domain)
+    level, (operator, p1, dirichlet) = Level((mesh,)), conforming(mesh)
     product = level.system.A.ptap(inclusion(p1, Layout.of_space(level.V)).matrix())
-    product.zeroRowsColumns(grid.dirichlet + grid.matrix.getOwnershipRange()[0], 1.0)
-    product.axpy(-1.0, grid.matrix)
-    assert product.norm() <= 1e-12 * grid.matrix.norm()
+    product.zeroRowsColumns(dirichlet + operator.matrix.getOwnershipRange()[0], 1.0)
+    product.axpy(-1.0, operator.matrix)
+    assert product.norm() <= 1e-12 * operator.matrix.norm()
     ones = np.ones_like(level.system.b.x.array)
     x, y = (ghosted_vector(level.V, array) for array in (ones, np.zeros_like(ones)))
     level.system.A.mult(x, y)

@@ -30,7 +30,7 @@ from .gap import integrate, integrate_edge
 from .sums import Sums
 
 if TYPE_CHECKING:
-    from ..vi.assembly import Level
+    from ..vi.level import Level
     from ..vi.solved import Solved
 
 FloatArray = npt.NDArray[np.float64]
@@ -181,13 +181,11 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     size = _size(cells, kappa, w, flux, slopes)
     certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
     if certain.reason is not None:
-        data.tidy()
         return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
     flux.left += cells.volume * (certain.load.mean - load.mean)
     load = certain.load
     segments = Segments.of(edge, cells, kappa.low, size)
     if segments.reason is not None:
-        data.tidy()
         return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
     there = edge.side.local, edge.side.cells
     change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
@@ -242,7 +240,6 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
     lift_energy += hidden_energy + total["energy_slack"]
     lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    data.tidy()
     reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
     if reason is not None:
         return Certificate(reason=reason, seconds=time.perf_counter() - began)

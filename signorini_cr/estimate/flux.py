@@ -19,7 +19,7 @@ from ..data.loads import Edge, Load
 from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
 
 if TYPE_CHECKING:
-    from ..vi.assembly import Level
+    from ..vi.level import Level
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -115,10 +115,10 @@ def unbalanced(
         signed: Whether left is known; else it is an upper bound of the absolute value.
     """
     volume, bound = cells.volume, 0.0
-    while level.coarser is not None and level.parent_cell is not None:
-        parent = level.parent_cell[: len(left)].astype(np.intp)
-        level = level.coarser
-        domain = level.domain
+    meshes = level.meshes
+    for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
+        assert mesh.parents is not None
+        parent, domain = mesh.parents.cell[: len(left)].astype(np.intp), coarser.domain
         d = domain.mesh.topology.dim
         number = domain.mesh.topology.index_map(d).size_local
         square, left, volume = (
@@ -134,8 +134,8 @@ def unbalanced(
             square = np.maximum(square - left**2 / volume, 0.0)
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
-    if level.domain is not cells.domain:
-        cells = diffusion(level.data).cells
+    if len(meshes) > 1:
+        cells = diffusion(meshes[0].data).cells
     return float(bound + _carried(cells, left, kappa_min, signed))
 
 

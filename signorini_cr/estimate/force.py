@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from ..data.diffusion import diffusion
 from ..errors import InputError
-from ..fem.cells import dot_rows, sum_rows
+from ..fem.cells import Cells, dot_rows, sum_rows
 from ..fem.conditions import facets_of
 from ..fem.space import ghosted_vector, shared_sum
 from ..jit import compiled
@@ -55,7 +55,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     if made is None or certificate.bound_h1 is None:
         raise InputError(f"the contact force has no bounds: {certificate.reason}")
     level = made.level
-    cells = diffusion(level.data).cells
+    cells = Cells(level.domain, level.V)
     if made.varies or cells.tdim != 2:
         why = VARIES if made.varies else SPATIAL
         raise InputError(f"the contact force has no bounds: {why}")
@@ -87,7 +87,6 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     middle, energy = cells.total(
         made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)
     )
-    level.data.tidy()
     reach = made.reach * np.sqrt(energy)
     return max(float(middle - reach), 0.0), float(middle + reach)
 

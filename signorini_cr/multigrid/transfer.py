@@ -11,6 +11,8 @@ P1 is contained in CR: a conforming function's mean over a facet is the mean of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
@@ -18,7 +20,7 @@ from petsc4py import PETSc
 
 from ..fem.space import ghosted, shared_sum
 from ..garbage import release
-from .masking import rows_of
+from .constrained import rows_of
 from .parents import FloatArray, IntArray, Layout, Parents
 
 
@@ -81,7 +83,7 @@ class Transfer:
         b.restoreLocalVector(self._own, readonly=True)
         b_coarse.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
 
-    def touched(self, dofs: IntArray) -> IntArray:
+    def coarse_support(self, dofs: IntArray) -> IntArray:
         """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
         _, columns, values = rows_of(self._rows, dofs)
         with self._marks.localForm() as local:
@@ -156,37 +158,24 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
     return Transfer(coarse, fine, kept.sum(axis=1, dtype=np.int32), dofs[kept], values[kept])
 
 
-def averaging(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
-    """The matrix of the prolongation from CR to CR, which `prolongate` applies without it.
+@dataclass(frozen=True, eq=False)
+class Ancestor:
+    """What a function was prolonged from.
 
-    Args:
-        coarse: The coarse dofs.
-        fine: The fine dofs.
-        parents: The coarse cells that hold the fine ones.
+    Attributes:
+        u: The function on the mesh below.
+        parents: The cells there that hold those of the mesh above.
     """
-    weights, parent_cell = parents.weights(coarse, fine), parents.cell
-    repeats = len(parent_cell) // max(len(weights), 1)
-    touching = _sums(fine, np.ones(fine.cells.size))
-    values = np.tile(weights, (repeats, 1, 1)) / touching[fine.cells][:, :, None]
-    kept = values != 0.0
-    columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)
-    start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
-    np.cumsum(kept.sum(axis=2), out=start[1:])
-    # no facet touches more than two cells
-    most = 2 * fine.cells.shape[1]
-    matrix = PETSc.Mat().createAIJ((fine.size, coarse.size), nnz=(most, most), comm=fine.mesh.comm)
-    rows = fine.numbers(fine.cells).ravel().astype(PETSc.IntType, copy=False)
-    columns = columns[kept].astype(PETSc.IntType, copy=False)
-    matrix.setValuesIJV(start, columns, values[kept], PETSc.InsertMode.ADD_VALUES, rows)
-    matrix.assemble()
-    return matrix
+
+    u: fem.Function
+    parents: Parents
 
 
 def prolongate(
     u: fem.Function,
     V: fem.FunctionSpace,
     parents: Parents,
-    below: tuple[fem.Function, Parents] | None = None,
+    ancestor: Ancestor | None = None,
 ) -> FloatArray:
     """Apply the prolongation once, without its matrix, and extrapolate if there is what it takes.
 
@@ -198,8 +187,8 @@ def prolongate(
         u: A CR or P1 function on the coarse mesh, ghosts up to date.
         V: The same kind of space on the fine mesh.
         parents: The coarse cells that hold the fine ones.
-        below: u's predecessor on the mesh below, and the cells there that hold the coarse ones.
-            Not used where either of the meshes is not a regular refinement.
+        ancestor: u's predecessor on the mesh below. Not used where either of the meshes is not a
+            regular refinement.
 
     Returns:
         Values of all local dofs, ghosts included.
@@ -208,11 +197,12 @@ def prolongate(
     weights, parent_cell = parents.weights(coarse, fine), parents.cell
     corners, block = fine.cells.shape[1], fine.block
     gain, repeats = None, False
-    if below is not None:
-        repeats = len(weights) < len(parent_cell) and below[1].regular
+    if ancestor is not None:
+        repeats = len(weights) < len(parent_cell) and ancestor.parents.regular
         # A rank without cells has no say, but a part in what follows
         if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
-            gain = 0.25 * (u.x.array - prolongate(below[0], u.function_space, below[1]))
+            before = prolongate(ancestor.u, u.function_space, ancestor.parents)
+            gain = 0.25 * (u.x.array - before)
     result, cells_of_node = np.empty(fine.local), _sums(fine, np.ones(fine.cells.size))
     for component in range(block):
         local = u.x.array[component::block][coarse.cells]

@@ -22,6 +22,7 @@ from ..fem.space import shared_maximum
 from ..garbage import release
 from ..mesh.planar import pieces
 from ..multigrid.parents import Layout
+from .active import ActiveSet
 from .stopping import NOISE
 from .system import System
 
@@ -107,8 +108,8 @@ class Loose:
         residual = fem.Function(start.function_space)
         system.residual(start, residual)
         bounded, lower = system.bounded, system.lower
-        pushed = (x[bounded] <= lower[bounded]) & (residual.x.array[bounded] > 0.0)
-        active = np.bincount(self.piece[bounded], pushed, self.count + 1)
+        pushed = ActiveSet.of(bounded, x[bounded] - lower[bounded], residual.x.array[bounded])
+        active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
         entries = system.A.getDiagonal()
         lift = np.abs(system.b.x.array[: entries.local_size]) / entries.array_r
         release(entries)

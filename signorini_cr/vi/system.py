@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -16,14 +19,33 @@ from ..errors import InputError, raise_together
 from ..fem.physics import Imposed, OnMesh
 from ..fem.space import ghosted_vector, shared_maximum, unknowns
 from ..garbage import release
+from ..multigrid.constrained import ConstrainedMatrix
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
-from ..options import NO_INODES, defaults
+from ..options import MATRICES, defaults
 
 FloatArray = npt.NDArray[np.float64]
 
 ROUNDING = 1e-5
-"""Least load, in parts of what it would be from zero: A u is not known to all digits of u."""
+"""Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """The complementarity problem's vectors.
+
+    Attributes:
+        b: Right-hand side, with the Dirichlet values in their rows.
+        lower: Bound of each dof, `PETSc.NINFINITY` for all but the bounded ones.
+        x: For the solver the start on entry, with the Dirichlet values in place, and the solution
+            on exit.
+        residual: On exit A x − b.
+    """
+
+    b: PETSc.Vec
+    lower: PETSc.Vec
+    x: PETSc.Vec
+    residual: PETSc.Vec
 
 
 class System:
@@ -40,10 +62,10 @@ class System:
         bounded_facets: Owned facets of Γ1, ascending, shape (n,).
         contact_dofs: The dofs with a bound that each of them has, shape (n, 1) or (n, d).
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
-        load: Norm of the residual at the most trivial start, which all residuals are measured
-            against: the number in the middle of the values u_D takes, raised to α on Γ1 where that
-            is larger, u_D on Γ0. A constant added to u_D and α makes no difference unless it is
-            so large that differences drown in it.
+        residual_scale: Norm of the residual at the most trivial start, which all residuals are
+            measured against: the number in the middle of the values u_D takes, raised to α on Γ1
+            where that is larger, u_D on Γ0. A constant added to u_D and α makes no difference
+            unless it is so large that differences drown in it.
     """
 
     def __init__(self, data: OnMesh):
@@ -66,7 +88,7 @@ class System:
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
         self.bounded = np.flatnonzero(bounded[: layout.size[0]]).astype(np.int32)
         bc, a = self._bc(self.u_D), data.a
-        with defaults(NO_INODES, prefix=""):
+        with defaults(MATRICES, prefix=""):
             if layout.cr:
                 self.A = assemble_matrix(empty_matrix(layout), a, [bc])
             else:
@@ -88,10 +110,14 @@ class System:
             vector.x.scatter_forward()
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
-        self.load = self._load(bounded)
+        self.residual_scale = self._scale(bounded)
 
-    def _load(self, bounded: npt.NDArray[np.bool_]) -> float:
-        """The load; ``bounded`` tells for all local dofs whether they have a bound."""
+    def _scale(self, bounded: npt.NDArray[np.bool_]) -> float:
+        """Measure the trivial start's residual.
+
+        Args:
+            bounded: Whether the dofs have a bound, for all local ones.
+        """
         comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
         top = comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
         bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
@@ -103,10 +129,31 @@ class System:
             start.x.array[self.dirichlet] = values
             start.x.array[bounded] = np.maximum(self.lower[bounded], number)
             norms.append(self.residual(start, residual))
-        load = max(norms[0], ROUNDING * norms[-1])
-        if not np.isfinite(load):
+        scale = max(norms[0], ROUNDING * norms[-1])
+        if not np.isfinite(scale):
             raise InputError("data: so large that their squares overflow; choose other units")
-        return load
+        return scale
+
+    @cached_property
+    def operator(self) -> ConstrainedMatrix:
+        """A as the solver uses it."""
+        return ConstrainedMatrix(self.A, self.bounded)
+
+    @property
+    def owned_dirichlet(self) -> npt.NDArray[np.int32]:
+        """The owned ones of the dofs on Γ0."""
+        return self.dirichlet[self.dirichlet < self.A.getLocalSize()[0]]
+
+    @contextmanager
+    def vectors(self, u: fem.Function, residual: fem.Function) -> Iterator[Vectors]:
+        """Lend the complementarity problem's vectors for a block, on the functions' memory."""
+        V = u.function_space
+        arrays = self.b.x.array, self.lower, u.x.array, residual.x.array
+        vectors = Vectors(*(ghosted_vector(V, array) for array in arrays))
+        try:
+            yield vectors
+        finally:
+            release(vectors.b, vectors.lower, vectors.x, vectors.residual)
 
     @property
     def held(self) -> npt.NDArray[np.int32]:
