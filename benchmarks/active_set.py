@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from one_solve import by_case, cases, comm, meshes
+from cases import by_case, comm, finest
 
 from signorini_cr.options import defaults
 from signorini_cr.solution import Solution
@@ -31,12 +31,6 @@ HEAD = (
     "wrong: LU",
 )
 DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
-
-
-def finest(name: str, dofs: float, nested: bool = True) -> Solution:
-    """The solution on the finest mesh."""
-    *_, solution = meshes(*cases()[name], dofs, nested)
-    return solution
 
 
 def forces(solution: Solution) -> npt.NDArray[np.float64]:

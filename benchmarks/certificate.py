@@ -7,11 +7,10 @@ The phases of the finest mesh of a case, and the certificate of its solution; me
 
 from __future__ import annotations
 
-import gc
 from statistics import median
 
-from mpi4py import MPI
-from one_solve import by_case, cases, comm, meshes
+from cases import by_case, finest, slowest
+from harness import in_turns, medians
 
 CERTIFIED = ("mesh", "assemble", "solve")
 HEAD = ("case", "dofs", "mesh, s", "assembly, s", "VI, s", "certificate, s", "µs a dof", "quotient")
@@ -19,20 +18,19 @@ HEAD = ("case", "dofs", "mesh, s", "assembly, s", "VI, s", "certificate, s", "µ
 
 def row(name: str, limit: float, repeats: int) -> list[str]:
     """One line of the table; the first of the solves does not count."""
-    runs: list[list[float]] = []
-    for _ in range(1 + repeats):
-        for solution in meshes(*cases()[name], limit):
-            pass
-        dofs = solution.dofs
-        times = [*(solution.seconds[phase] for phase in CERTIFIED), solution.certificate.seconds]
-        runs.append([comm.allreduce(seconds, op=MPI.MAX) for seconds in times])
-        del solution
-        gc.collect()
-    del runs[0]
-    middle = [median(phase) for phase in zip(*runs, strict=True)]
-    quotient = median(certificate / sum(phases) for *phases, certificate in runs)
-    cells = [f"{seconds:.2f}" for seconds in middle]
-    return [name, f"{dofs:,}", *cells, f"{1e6 * middle[-1] / dofs:.2f}", f"{quotient:.2f}"]
+
+    def run() -> dict[str, float]:
+        solution = finest(name, limit)
+        times = {phase: slowest(solution.seconds[phase]) for phase in CERTIFIED}
+        certificate = slowest(solution.certificate.seconds)
+        return {**times, "certificate": certificate, "dofs": solution.dofs}
+
+    runs = in_turns({name: run}, repeats)[name]
+    middle = medians(runs)
+    quotient = median(run["certificate"] / sum(run[phase] for phase in CERTIFIED) for run in runs)
+    cells = [f"{middle[phase]:.2f}" for phase in (*CERTIFIED, "certificate")]
+    each = 1e6 * middle["certificate"] / middle["dofs"]
+    return [name, f"{middle['dofs']:,.0f}", *cells, f"{each:.2f}", f"{quotient:.2f}"]
 
 
 if __name__ == "__main__":

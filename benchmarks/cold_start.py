@@ -9,31 +9,32 @@ differs.
 
 from __future__ import annotations
 
-import gc
+from functools import partial
 from statistics import median
 
-from mpi4py import MPI
-from one_solve import by_case, cases, comm, meshes
+from cases import by_case, cases, meshes, slowest
+from harness import in_turns
 
 HEAD = ("case", "dofs", "Newton, nested", "VI, s", "Newton, cold", "VI, s")
 
 
+def run(name: str, limit: float, nested: bool) -> tuple[list[int], list[int], float]:
+    """Dofs and Newton steps of all meshes, and the time on the finest."""
+    dofs, newton = [], []
+    for solution in meshes(*cases()[name], limit, nested):
+        dofs.append(solution.dofs)
+        newton.append(solution.iterations.newton)
+    return dofs, newton, slowest(solution.seconds["solve"])
+
+
 def row(name: str, limit: float, repeats: int) -> list[str]:
     """One line of the table; the first solves do not count."""
-    newton: dict[bool, list[int]] = {}
-    seconds: dict[bool, list[float]] = {True: [], False: []}
-    for _ in range(1 + repeats):
-        for nested, times in seconds.items():
-            dofs, newton[nested] = [], []
-            for solution in meshes(*cases()[name], limit, nested):
-                dofs.append(solution.dofs)
-                newton[nested].append(solution.iterations.newton)
-            times.append(comm.allreduce(solution.seconds["solve"], op=MPI.MAX))
-            del solution
-            gc.collect()
+    starts = {nested: partial(run, name, limit, nested) for nested in (True, False)}
+    found = in_turns(starts, repeats)
+    dofs = found[True][0][0]
     cells = [name, f"{dofs[0]:,} to {dofs[-1]:,}"]
-    for nested, times in seconds.items():
-        cells += [", ".join(map(str, newton[nested])), f"{median(times[1:]):.2f}"]
+    for runs in found.values():
+        cells += [", ".join(map(str, runs[-1][1])), f"{median(run[2] for run in runs):.2f}"]
     return cells
 
 

@@ -2,26 +2,25 @@
 
     container/run python3 benchmarks/limits.py
 
-What the cases of one_solve.py leave out, each on nested meshes up to about 1.5 M dofs; 0.3 M where
-cells are squashed or the tensor is extreme, as CG and BoomerAMG take long there. Beside the
-steps on each mesh stand those of one linear solve of the finest matrix by CG and BoomerAMG, with
-PETSc's defaults to rtol 1e-8, and the time of the finest mesh's variational inequality over that
-of this solve, the median of several. Where multigrid was given up the last column says for what.
+What the cases of the other benchmarks leave out, each on nested meshes up to about 1.5 M dofs;
+0.3 M where cells are squashed or the tensor is extreme, as CG and BoomerAMG take long there. Beside
+the steps on each mesh stand those of one linear solve of the finest matrix by CG and BoomerAMG,
+with PETSc's defaults to rtol 1e-8, and the time of the finest mesh's variational inequality over
+that of this solve, the median of several. Where multigrid was given up the last column says for
+what.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from statistics import median
 
 import numpy as np
 import numpy.typing as npt
 import ufl
-from one_solve import CROOKED, MOST, PUSHED, comm, facts, meshes
-from tables import tabulate
+from cases import CROOKED, MOST, PUSHED, by_case, comm, meshes, slowest, solved_once
+from harness import in_turns
 from ufl.core.expr import Expr
 
 from signorini_cr import Polygon, Problem, exact
@@ -35,14 +34,8 @@ SQUARES = 4
 SIZE = 0.3
 """Size of the coarsest cells of a thin corner."""
 
-REPEATS = 3
-"""Solves that count; one more, the first, finds what memory the process needs."""
-
-DOFS = 1.5e6
-"""Of the finest mesh, about."""
-
 THIN_DOFS = 3e5
-"""The same where BoomerAMG takes too many steps."""
+"""Of the finest mesh, at most, where BoomerAMG takes too many steps."""
 
 
 def squares() -> Domain:
@@ -152,37 +145,28 @@ CASES = {
 HEAD = ("case", "dofs", "Newton", "CG", "CG with BoomerAMG", "VI / linear solve", "with")
 
 
-def row(name: str, dofs: float) -> list[str]:
+def row(name: str, dofs: float, repeats: int) -> list[str]:
     """One line of the table."""
-    quotients = []
-    for _ in range(1 + REPEATS):
+    limit = min(dofs, THIN_DOFS) if name in THIN else dofs
+
+    def run() -> tuple[float, list[str]]:
         steps = []
-        for solution in meshes(*CASES[name], min(dofs, THIN_DOFS) if name in THIN else dofs):
+        for solution in meshes(*CASES[name], limit):
             steps.append(solution.iterations)
-        finest = facts(solution)
-        quotients.append(finest["vi"] / finest["linear"])
-    much = finest["linear_cg"] >= MOST
-    return [
-        name,
-        f"{finest['dofs'] / 1e6:.2f} M",
-        " ".join(f"{s.newton}" for s in steps),
-        " ".join(f"{s.linear}" for s in steps),
-        f"{'> ' if much else ''}{finest['linear_cg']}",
-        f"{'< ' if much else ''}{median(quotients[1:]):.2f}",
-        solution.iterations.preconditioner.split(",")[0].split(" on ")[0],
-    ]
+        seconds, cg = solved_once(solution)
+        return slowest(solution.seconds["solve"]) / seconds, [
+            f"{solution.dofs / 1e6:.2f} M",
+            " ".join(f"{s.newton}" for s in steps),
+            " ".join(f"{s.linear}" for s in steps),
+            f"{'> ' if cg >= MOST else ''}{cg}",
+            steps[-1].preconditioner.split(",")[0].split(" on ")[0],
+        ]
 
-
-def main() -> None:
-    """Print and keep the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--dofs", type=float, default=DOFS, help="of the finest mesh, about")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
-    rows = (row(name, arguments.dofs) for name in arguments.cases)
-    tabulate(HEAD, rows, arguments.out / "limits.md", comm.rank == 0)
+    runs = in_turns({name: run}, repeats)[name]
+    *cells, preconditioner = runs[-1][1]
+    below = "< " if cells[-1].startswith(">") else ""
+    return [name, *cells, f"{below}{median(quotient for quotient, _ in runs):.2f}", preconditioner]
 
 
 if __name__ == "__main__":
-    main()
+    by_case(__doc__, HEAD, row, "limits.md", CASES, 1.5e6)

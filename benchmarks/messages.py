@@ -12,19 +12,20 @@ import re
 import tempfile
 from pathlib import Path
 
-import petsc4py
+from cases import comm
+from harness import command_line, tabulate
+from petsc4py import PETSc
 
-petsc4py.init(["messages", "-options_left", "no"])
-
-from petsc4py import PETSc  # noqa: E402
-
-from signorini_cr import exact, solve_levels  # noqa: E402
+from signorini_cr import exact, solve_levels
 
 LEVELS = 7
 
+HEAD = ("mesh", "dofs", "CG", "flops a dof", "messages", "reductions", "bytes a message")
+
 
 def main() -> None:
-    """Print one row a mesh."""
+    """Print and keep one row a mesh."""
+    arguments = command_line(__doc__).parse_args()
     PETSc.Log.begin()
     stages = [PETSc.Log.Stage(f"mesh {i}") for i in range(LEVELS)]
     facts = []
@@ -37,22 +38,20 @@ def main() -> None:
             if counted:
                 stage.pop()
                 facts.append((solution.dofs, solution.iterations.linear))
-    comm = PETSc.COMM_WORLD.tompi4py()
     folder = comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None)
     path = Path(folder) / "log.txt"
     PETSc.Log.view(PETSc.Viewer().createASCII(str(path), comm=PETSc.COMM_WORLD))
     if comm.rank > 0:
         return
-    print("| mesh | dofs | CG | flops a dof | messages | reductions | bytes a message |")
-    print("|---:|---:|---:|---:|---:|---:|---:|")
+    rows = []
     number = r"(\S+) +\S+% +"  # and the part of the whole
     row = re.compile(rf"^ *\d+: +mesh (\d+): +{number}{number}{number}(\S+) +\S+% +(\S+)", re.M)
-    for mesh, _, flops, messages, length, reductions in row.findall(path.read_text()):
+    for mesh, _, flops, *counts in row.findall(path.read_text()):
+        messages, length, reductions = (f"{float(count):,.0f}" for count in counts)
         dofs, cg = facts[int(mesh)]
-        print(
-            f"| {mesh} | {dofs:,} | {cg} | {float(flops) / dofs:,.0f} | {float(messages):,.0f} "
-            f"| {float(reductions):,.0f} | {float(length):,.0f} |"
-        )
+        each = f"{float(flops) / dofs:,.0f}"
+        rows.append([mesh, f"{dofs:,}", f"{cg}", each, messages, reductions, length])
+    tabulate(HEAD, rows, arguments.out / f"messages-{comm.size}.md")
 
 
 if __name__ == "__main__":

@@ -13,14 +13,11 @@ from a cold start as there is no other, and its time in units of BoomerAMG's lin
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from statistics import median
 
-from mpi4py import MPI
-from one_solve import CROOKED, PUSHED, comm, linear_solve, timed
+from cases import CROOKED, PUSHED, comm, linear_solve, slowest, timed
+from harness import command_line, in_turns, keep_memory, tabulate
 from petsc4py import PETSc
-from tables import tabulate
 
 from signorini_cr import exact, solve
 from signorini_cr.diffusion import Diffusion
@@ -72,18 +69,19 @@ def inequality(problem: Problem, domain: Domain) -> tuple[float, str]:
     """Time and steps of the variational inequality."""
     solution = solve(problem, domain)
     steps = f"{solution.iterations.newton} / {solution.iterations.linear}"
-    return comm.allreduce(solution.seconds["solve"], op=MPI.MAX), steps
+    return slowest(solution.seconds["solve"]), steps
 
 
 def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:
     """One line of the table."""
     level = Level((NestedMesh(Diffusion(problem, domain.mesh, "CR"), domain),))
     b = ghosted_vector(level.V, level.system.b.x.array)
-    ours, theirs = [], []
-    for _ in range(repeats):
-        theirs.append(linear_solve(level.system.A, b))
-        ours.append(two_levels(level, b))
-    whole = [inequality(problem, domain) for _ in range(repeats)]
+    actions = {
+        "theirs": lambda: linear_solve(level.system.A, b),
+        "ours": lambda: two_levels(level, b),
+    }
+    theirs, ours = in_turns(actions, repeats, warm=0).values()
+    whole = in_turns({"VI": lambda: inequality(problem, domain)}, repeats, warm=0)["VI"]
     dofs = b.getSize()
     ratio = median(mine[0] / other[0] for mine, other in zip(ours, theirs, strict=True))
     mine, other, vi = (1e6 * median(t for t, _ in runs) / dofs for runs in (ours, theirs, whole))
@@ -102,11 +100,10 @@ def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:
 
 def main() -> None:
     """Print and keep the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = command_line(__doc__, repeats=5)
     parser.add_argument("--sizes", type=float, nargs="*", default=[0.01, 0.005, 0.0025])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
+    keep_memory()
     cases = (
         ("rectangle", exact.S1.problem, exact.S1.polygon),
         ("polygon", PUSHED, CROOKED),

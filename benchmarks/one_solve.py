@@ -20,63 +20,23 @@ made of all that is there.
 
 from __future__ import annotations
 
-import argparse
 import csv
-import gc
-import os
 import resource
-import sys
-import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import median
+from typing import Any
 
-KEEP = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": str(1 << 40)}
-if not KEEP.items() <= os.environ.items():  # glibc reads them once, when a process starts
-    os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **KEEP})
+import numpy as np
+from cases import cases, comm, meshes, slowest, solved_once, timed
+from harness import command_line, head, in_turns, keep, keep_memory, line, medians
+from petsc4py import PETSc
 
-import numpy as np  # noqa: E402
-import petsc4py  # noqa: E402
-
-petsc4py.init(["one_solve", "-options_left", "no"])
-
-import ufl  # noqa: E402
-from mpi4py import MPI  # noqa: E402
-from petsc4py import PETSc  # noqa: E402
-from tables import head, line, tabulate  # noqa: E402
-
-from signorini_cr import Polygon, Problem, exact, solve_levels  # noqa: E402
-from signorini_cr.fem.space import ghosted_vector  # noqa: E402
-from signorini_cr.mesh.domain import Domain  # noqa: E402
-from signorini_cr.solution import Solution  # noqa: E402
-
-comm = MPI.COMM_WORLD
-
-COARSEST = 23
-"""Squares per unit length on the coarsest mesh: 0.05, 0.2, 0.8, 3.3, 13 M dofs on the third on."""
-
-SIZE = 0.08
-"""Size of the polygon's coarsest cells: as many dofs as the others."""
+from signorini_cr.solution import Solution
 
 SHOWN = 4e4
 """Meshes with more dofs are in the table and in the picture."""
-
-MOST = 500
-"""CG steps after which a linear solve that is compared with is ended."""
-
-Coarsest = Callable[[], Domain]
-
-EXAMPLES = {"S1": exact.S1, "A": exact.A, "C 7/2": exact.root(3.5), "C 11/2": exact.root(5.5)}
-
-CROOKED = Polygon(
-    [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],
-    ["contact", "contact", "dirichlet", "neumann", "dirichlet"],
-    holes=[Polygon([[1, 0.5], [1.7, 0.4], [1.3, 0.9]], ["contact", "neumann", "dirichlet"])],
-)
-PUSHED = Problem(
-    f=lambda x: 12 * ufl.sin(5 * x[0]) - 5, g=lambda x: x[1] - 1, dirichlet=lambda x: 0.2 + x[1]
-)
 
 
 @dataclass(frozen=True)
@@ -120,55 +80,9 @@ class Row:
     bytes: float
 
 
-def cases() -> dict[str, tuple[Problem, Coarsest]]:
-    """Problems and what makes their coarsest meshes, by name."""
-    result: dict[str, tuple[Problem, Coarsest]] = {}
-    for name, example in EXAMPLES.items():
-        for kind, shift in (("", 0.0), (" mapped", 0.31)):
-            result[name + kind] = (
-                example.problem,
-                lambda example=example, shift=shift: example.structured(
-                    COARSEST, comm, shift=shift
-                ),
-            )
-    result["polygon"] = (PUSHED, lambda: CROOKED.mesh(SIZE, comm))
-    return result
-
-
 def peak() -> int:
     """Peak memory of this run in bytes, over all ranks (Linux)."""
     return int(comm.allreduce(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
-
-
-def timed(action: Callable[[], object]) -> float:
-    """Wall time of the slowest rank."""
-    comm.barrier()
-    began = time.perf_counter()
-    action()
-    return float(comm.allreduce(time.perf_counter() - began, op=MPI.MAX))
-
-
-def linear_solve(A: PETSc.Mat, b: PETSc.Vec) -> tuple[float, int]:
-    """Time and steps of CG + BoomerAMG with PETSc's defaults, rtol 1e-8, set-up included.
-
-    It ends after `MOST` steps.
-    """
-    x, steps = b.duplicate(), 0
-
-    def action() -> None:
-        nonlocal steps
-        ksp = PETSc.KSP().create(A.getComm())
-        ksp.setOperators(A)
-        ksp.setType("cg")
-        ksp.getPC().setType("hypre")
-        ksp.setTolerances(rtol=1e-8, max_it=MOST)
-        ksp.solve(b, x)
-        steps = ksp.getIterationNumber()
-        ksp.destroy()
-
-    seconds = timed(action)
-    x.destroy()
-    return seconds, steps
 
 
 def product(A: PETSc.Mat) -> float:
@@ -184,11 +98,8 @@ def product(A: PETSc.Mat) -> float:
 def facts(solution: Solution) -> dict[str, float]:
     """What one mesh shows in one repetition."""
     memory = peak()
-    system = solution.level.system
-    b = ghosted_vector(solution.level.V, system.b.x.array)
-    linear, linear_cg = linear_solve(system.A, b)
-    b.destroy()
-    times = {name: comm.allreduce(value, op=MPI.MAX) for name, value in solution.seconds.items()}
+    linear, linear_cg = solved_once(solution)
+    times = {name: slowest(value) for name, value in solution.seconds.items()}
     return {
         "dofs": solution.dofs,
         "newton": solution.iterations.newton,
@@ -196,7 +107,7 @@ def facts(solution: Solution) -> dict[str, float]:
         "vi": times["solve"],
         "linear": linear,
         "linear_cg": linear_cg,
-        "product": product(system.A),
+        "product": product(solution.level.system.A),
         "mesh": times["mesh"],
         "assemble": times["assemble"],
         "estimate": times["estimate"],
@@ -204,50 +115,40 @@ def facts(solution: Solution) -> dict[str, float]:
     }
 
 
-def meshes(
-    problem: Problem, coarsest: Coarsest, dofs: float, nested: bool = True
-) -> Iterator[Solution]:
-    """Solve one case on meshes of up to about so many dofs."""
-    for solution in solve_levels(problem, coarsest(), 99, nested=nested):
-        yield solution
-        if 4 * solution.dofs > 1.1 * dofs:
-            return
-
-
 def measure(name: str, dofs: float, repeats: int) -> Iterator[Row]:
     """Solve one case several times over."""
     before = peak()
-    runs: list[list[dict[str, float]]] = []
-    for _ in range(1 + repeats):
-        runs.append([facts(solution) for solution in meshes(*cases()[name], dofs)])
-        gc.collect()
-    memory = [row["memory"] for row in runs.pop(0)]
-    for level in range(len(memory)):
+
+    def run() -> list[dict[str, float]]:
+        return [facts(solution) for solution in meshes(*cases()[name], dofs)]
+
+    first, *runs = in_turns({name: run}, 1 + repeats, warm=0)[name]
+    for level, at_first in enumerate(first):
         sums = [sum(row["vi"] for row in run[: level + 1]) for run in runs]
-        at = {key: [run[level][key] for run in runs] for key in runs[0][level]}
-        middle = {key: median(values) for key, values in at.items()}
+        at = [run[level] for run in runs]
+        middle, memory = medians(at), at_first["memory"]
         yield Row(
             case=name,
             ranks=comm.size,
             dofs=int(middle["dofs"]),
-            newton=int(max(at["newton"])),
-            cg=int(max(at["cg"])),
+            newton=int(max(row["newton"] for row in at)),
+            cg=int(max(row["cg"] for row in at)),
             vi=middle["vi"],
             all_levels=median(sums),
             linear=middle["linear"],
             linear_cg=int(middle["linear_cg"]),
             product=middle["product"],
-            finest_ratio=median(v / s for v, s in zip(at["vi"], at["linear"], strict=True)),
-            all_ratio=median(v / s for v, s in zip(sums, at["linear"], strict=True)),
+            finest_ratio=median(row["vi"] / row["linear"] for row in at),
+            all_ratio=median(s / row["linear"] for s, row in zip(sums, at, strict=True)),
             mesh=middle["mesh"],
             assemble=middle["assemble"],
             estimate=middle["estimate"],
-            bytes=memory[level] / middle["dofs"] if memory[level] > 1.1 * before else np.nan,
+            bytes=memory / middle["dofs"] if memory > 1.1 * before else np.nan,
         )
 
 
-KINDS = {"str": str, "int": int, "float": float}
-COLUMNS = {
+KINDS: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
+COLUMNS: dict[str, Callable[[Row], str]] = {
     "case": lambda r: r.case,
     "ranks": lambda r: f"{r.ranks}",
     "dofs": lambda r: f"{r.dofs / 1e6:.2f} M",
@@ -276,37 +177,6 @@ def share(row: Row, seconds: float) -> str:
 def columns(row: Row) -> list[str]:
     """A row's cells in the table."""
     return [show(row) for show in COLUMNS.values()]
-
-
-def table(rows: list[Row]) -> str:
-    """The results in Markdown."""
-    return "\n".join([head(COLUMNS), *(line(columns(r)) for r in rows)]) + "\n"
-
-
-def command_line(text: str) -> argparse.ArgumentParser:
-    """What benchmarks of the cases can be told; the text is their docstring."""
-    parser = argparse.ArgumentParser(description=text.split("\n")[0])
-    parser.add_argument("--dofs", type=float, default=3.5e6, help="of the finest mesh, about")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cases", nargs="*", choices=list(cases()), default=list(cases()))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    return parser
-
-
-def by_case(
-    text: str, names: Collection[str], row: Callable[[str, float, int], list[str]], file: str
-) -> None:
-    """A benchmark with one row a case.
-
-    Args:
-        text: Its docstring.
-        names: Of the columns.
-        row: Makes a row of a case, the finest mesh's dofs and the number of repetitions.
-        file: What the table is called in the folder of results.
-    """
-    arguments = command_line(text).parse_args()
-    rows = (row(name, arguments.dofs, arguments.repeats) for name in arguments.cases)
-    tabulate(names, rows, arguments.out / file, comm.rank == 0)
 
 
 def picture(rows: list[Row], path: Path) -> None:
@@ -357,7 +227,8 @@ def read(paths: Iterable[Path]) -> list[Row]:
 
 def main() -> None:
     """Measure what the command line asks for."""
-    arguments = command_line(__doc__).parse_args()
+    arguments = command_line(__doc__, cases=cases(), dofs=3.5e6, repeats=3).parse_args()
+    keep_memory()
     path = arguments.out / f"ranks-{comm.size}.csv"
     if comm.rank == 0:
         arguments.out.mkdir(parents=True, exist_ok=True)
@@ -375,7 +246,8 @@ def main() -> None:
                 writer.writerows(vars(row) for row in [*others, *rows])
     if comm.rank == 0:
         everything = read(sorted(arguments.out.glob("ranks-*.csv")))
-        (arguments.out / "table.md").write_text(table([r for r in everything if r.dofs > SHOWN]))
+        shown = [line(columns(row)) for row in everything if row.dofs > SHOWN]
+        keep([head(COLUMNS), *shown], arguments.out / "table.md")
         picture(everything, arguments.out / "one_solve.png")
 
 

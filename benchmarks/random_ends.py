@@ -2,19 +2,17 @@
 
     container/run python3 benchmarks/random_ends.py
 
-The cases of one_solve.py on meshes that are mapped by a random shift, so that contact ends anywhere
+The examples of cases.py on meshes that are mapped by a random shift, so that contact ends anywhere
 in its facet. Counted are the meshes from the third on, each started from the one below.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
-from one_solve import EXAMPLES, comm
-from tables import tabulate
+from cases import EXAMPLES, comm
+from harness import command_line, tabulate
 
 from signorini_cr import solve_levels
 
@@ -57,10 +55,9 @@ def row(name: str, shifts: list[float]) -> list[str]:
 
 def main() -> None:
     """Print and keep the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = command_line(__doc__)
     parser.add_argument("--draws", type=int, default=65, help="shifts of each case")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
     random = np.random.default_rng(arguments.seed)
     shifts = random.uniform(-SHIFT, SHIFT, (len(EXAMPLES), arguments.draws)).tolist()

@@ -13,17 +13,14 @@ second, and who comes first would pay for both.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import time
-from pathlib import Path
-from statistics import median
+from functools import partial
 
-from launch import launched
-from tables import tabulate
+from harness import command_line, in_turns, launched, medians, tabulate
 
 HEAD = ("", "dofs", "H1 error", "Newton, finest", "mesh", "assembly", "VI", "whole run")
 
@@ -111,34 +108,38 @@ def p1(n: int) -> dict[str, float]:
     }  # fmt: skip
 
 
+ELEMENTS = {"cr": cr, "p1": p1}
+NAMES = {"cr": "CR, this program", "p1": "P1, plain DOLFINx"}
+
+
+def alone(n: int, element: str) -> dict[str, float]:
+    """One run in a process of its own, that finds memory."""
+    subprocess.run([sys.executable, "-c", WARM], check=True)
+    # what Python needs to get as far as this file belongs to the whole run
+    found: dict[str, float] = launched("--n", str(n), "--only", element, SAME_ERROR_AGE="0.03")
+    return found
+
+
+def row(name: str, runs: list[dict[str, float]]) -> list[str]:
+    """One line of the table."""
+    mid = medians(runs)
+    facts = f"{mid['dofs'] / 1e6:.2f} M", f"{mid['error']:.2e}", f"{mid['newton']:.0f}"
+    times = f"{mid['mesh']:.2f} s", f"{mid['assemble']:.2f} s"
+    return [name, *facts, *times, f"**{mid['vi']:.2f} s**", f"**{mid['whole']:.2f} s**"]
+
+
 def main() -> None:
-    """Let the two take turns, each in a process of its own."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    """Let the two take turns; the first run of each fills the cache of compiled forms."""
+    parser = command_line(__doc__, repeats=3)
     parser.add_argument("--n", type=int, default=720)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--only", choices=["cr", "p1"], help="one run, as JSON")
+    parser.add_argument("--only", choices=list(ELEMENTS), help="one run, as JSON")
     arguments = parser.parse_args()
     if arguments.only:
-        print(json.dumps({"cr": cr, "p1": p1}[arguments.only](arguments.n)))
+        print(json.dumps(ELEMENTS[arguments.only](arguments.n)))
         return
-    runs: dict[str, list[dict[str, float]]] = {"cr": [], "p1": []}
-    for repetition in range(arguments.repeats + 1):
-        for element, kept in runs.items():
-            subprocess.run([sys.executable, "-c", WARM], check=True)
-            # what Python needs to get as far as this file belongs to the whole run
-            command = "--n", str(arguments.n), "--only", element
-            found = launched(*command, SAME_ERROR_AGE="0.03")
-            if repetition:  # the first one fills the cache of compiled forms
-                kept.append(found)
-    names = {"cr": "CR, this program", "p1": "P1, plain DOLFINx"}
-    rows = []
-    for element, kept in runs.items():
-        mid = {key: median(run[key] for run in kept) for key in kept[0]}
-        facts = f"{mid['dofs'] / 1e6:.2f} M", f"{mid['error']:.2e}", f"{mid['newton']:.0f}"
-        times = f"{mid['mesh']:.2f} s", f"{mid['assemble']:.2f} s"
-        results = f"**{mid['vi']:.2f} s**", f"**{mid['whole']:.2f} s**"
-        rows.append([names[element], *facts, *times, *results])
+    actions = {element: partial(alone, arguments.n, element) for element in ELEMENTS}
+    found = in_turns(actions, arguments.repeats)
+    rows = (row(NAMES[element], runs) for element, runs in found.items())
     tabulate(HEAD, rows, arguments.out / "same_error.md")
 
 

@@ -2,7 +2,7 @@
 
     container/run python3 benchmarks/two_ranks.py
 
-One rank and two ranks solve the cases of one_solve.py in turns, at 3 M dofs, each time in new
+One rank and two ranks solve the cases of cases.py in turns, at 3 M dofs, each time in new
 processes; the times are those of the variational inequality on the finest mesh. In the middle of
 each of these solves, before its first Newton step and after each, all ranks stream through arrays
 for some hundredths of a second. That is not part of the solve's time, and its bandwidth is the
@@ -24,17 +24,16 @@ changes to the solver remove the file and begin anew.
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import math
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from statistics import median, quantiles
 
-from launch import launched
-from tables import head, line
+from harness import command_line, head, in_turns, keep, keep_memory, launched, line
 
 FIRST, SOLVES = 2, 6
 """Solves of each process that don't count, and of those that do."""
@@ -52,7 +51,7 @@ FINEST = 2.5e6
 
 PLAIN = ["S1", "A", "C 7/2", "C 11/2"]
 NAMES = [*PLAIN, *(f"{name} mapped" for name in PLAIN), "polygon"]
-"""The keys of `one_solve.cases`, which needs MPI: mpirun can't be started from within that."""
+"""The keys of `cases.cases`, which needs MPI: mpirun can't be started from within that."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +68,12 @@ class Solve:
 def run(name: str) -> None:
     """What one process does; rank 0 prints its solves as JSON."""
     import numpy as np
-    import one_solve  # before MPI: where memory is not yet kept it starts the process anew
-    from mpi4py import MPI
+    from cases import cases, comm, slowest, timed
 
     from signorini_cr import solve_levels
 
-    comm = MPI.COMM_WORLD
-    problem, domain = one_solve.cases()[name]
+    keep_memory()
+    problem, domain = cases()[name]
     a, b, c = (np.ones(STREAM // comm.size) for _ in range(3))
     streaming: list[float] = []
     finest = False
@@ -86,25 +84,24 @@ def run(name: str) -> None:
 
     def monitor(*_: object) -> None:
         if finest:
-            streaming.append(one_solve.timed(stream))
+            streaming.append(timed(stream))
 
-    found = []
-    for _ in range(FIRST + SOLVES):
+    def solve() -> tuple[int, int, int, float, float]:
+        nonlocal finest
+        finest = False
+        streaming.clear()
         for solution in solve_levels(problem, domain(), 99, monitor=monitor):
             if finest:
                 break
             finest = 4 * solution.dofs > FINEST
-        seconds = comm.allreduce(solution.seconds["solve"], op=MPI.MAX) - sum(streaming)
+        seconds = slowest(solution.seconds["solve"]) - sum(streaming)
         bandwidth = 3 * 8 * STREAM * PASSES / max(streaming) / 1e9
         steps = solution.iterations
-        times = round(seconds, 4), round(bandwidth, 2)
-        found.append((solution.dofs, steps.newton, steps.linear, *times))
-        finest = False
-        streaming.clear()
-        del solution
-        gc.collect()  # the next solve finds its memory
+        return solution.dofs, steps.newton, steps.linear, round(seconds, 4), round(bandwidth, 2)
+
+    found = in_turns({name: solve}, SOLVES, warm=FIRST)[name]
     if comm.rank == 0:
-        print(json.dumps(found[FIRST:]))
+        print(json.dumps(found))
 
 
 def solved(ranks: int, name: str) -> list[Solve]:
@@ -132,11 +129,8 @@ class Case:
     @classmethod
     def measured(cls, name: str, turns: int) -> Case:
         """Let one rank and two take turns."""
-        case = cls(name, [], [])
-        for _ in range(turns):
-            case.one.extend(solved(1, name))
-            case.two.extend(solved(2, name))
-        return case
+        runs = in_turns({ranks: partial(solved, ranks, name) for ranks in (1, 2)}, turns, warm=0)
+        return cls(name, *([solve for run in found for solve in run] for found in runs.values()))
 
     @property
     def alone(self) -> list[Solve]:
@@ -219,11 +213,9 @@ def picture(cases: list[Case], path: Path) -> None:
 
 def main() -> None:
     """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--cases", nargs="*", default=NAMES, choices=NAMES)
+    parser = command_line(__doc__, cases=NAMES)
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--run", help=argparse.SUPPRESS)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
     if arguments.run:
         run(arguments.run)
@@ -246,7 +238,7 @@ def main() -> None:
     points = [point for case in every for point in case.points()]
     lines = [head(HEAD), *(line(case.row()) for case in every), ""]
     lines += [head(BINS), *(line(cells) for cells in by_bandwidth(points))]
-    kept.with_suffix(".md").write_text("\n".join(lines) + "\n")
+    keep(lines, kept.with_suffix(".md"))
     picture(every, kept.with_suffix(".png"))
 
 

@@ -19,13 +19,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from launch import launched
-from tables import tabulate
+from harness import command_line, in_turns, launched, tabulate
 
 PROBLEM = Path(__file__).parents[1] / "meshes" / "s1.toml"
 
@@ -145,16 +144,15 @@ def times(column: Run) -> dict[str, float]:
 
 def main() -> None:
     """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=5)
+    parser = command_line(__doc__, repeats=5)
     parser.add_argument("--run", nargs=3, help=argparse.SUPPRESS)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
     if arguments.run:
         meshes, folder, began = arguments.run
         run(int(meshes), folder, float(began))
     times(RUNS[1])  # compiles what the columns but the first expect to find
-    measured = [[times(column) for _ in range(arguments.repeats)] for column in RUNS]
+    columns = {column: partial(times, column) for column in RUNS}
+    measured = in_turns(columns, arguments.repeats, warm=0).values()
 
     def row(title: str, of: Callable[[dict[str, float]], float]) -> list[str]:
         return [title, *(f"{median(map(of, runs)):.2f}" for runs in measured)]

@@ -8,11 +8,11 @@ writes FOLDER/studies.md and the pictures in FOLDER/studies (FOLDER is docs with
 from __future__ import annotations
 
 import gc
-import runpy
 import sys
 import time
 from pathlib import Path
 
+import notebook
 import study
 from mpi4py import MPI
 
@@ -76,9 +76,10 @@ def main() -> None:
     sys.argv[1:] = [str(folder)]
     here = Path(__file__).parent
     clock, began = time.perf_counter(), time.process_time()
+    pages = {}
     for name in DEMOS:
         start = time.perf_counter()
-        runpy.run_path(str(here / f"{name}.py"))
+        pages[name] = notebook.run(here / f"{name}.py")
         gc.collect()
         if comm.rank == 0:
             print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
@@ -88,27 +89,38 @@ def main() -> None:
         "minutes": comm.allreduce(time.process_time() - began, op=MPI.MAX) / 60,
         "dofs": study.most_dofs(),
     }
-    on_root(comm, _put_together, target, folder, facts)
+
+    def write() -> None:
+        text = _put_together(pages, folder.name, facts)
+        (target / "studies.md").write_text(text, encoding="utf-8")
+        for name in DEMOS:  # their own pages, without prose
+            (folder / f"{name}.md").unlink()
+
+    on_root(comm, write)
 
 
-def _put_together(target: Path, folder: Path, facts: dict[str, float]) -> None:
-    """Make one page of the demos' pages; they go, the pictures stay."""
-    pages, figures, anchors = [], [], {}
-    for name in DEMOS:
-        path = folder / f"{name}.md"
-        lines = path.read_text(encoding="utf-8").splitlines()
-        heading = lines[0].removeprefix("## ")
-        kept = [c for c in heading.lower() if c.isalnum() or c in " -_"]
+def _put_together(
+    pages: dict[str, tuple[str, list[str]]], folder: str, facts: dict[str, float]
+) -> str:
+    """Make one page of the demos' pages.
+
+    Args:
+        pages: Title and parts of each.
+        folder: Where the pictures are, seen from the page.
+        facts: Figures of the introduction.
+    """
+    bodies, figures, anchors = [], [], {}
+    for name, (title, parts) in pages.items():
+        kept = [c for c in title.lower() if c.isalnum() or c in " -_"]
         anchors[name.removeprefix("demo_")] = "".join(kept).replace(" ", "-")
-        body = "\n".join(lines[1:]).strip().replace("](", f"]({folder.name}/")
-        pages.append(f"## {heading}\n\n{body}\n")
+        body = "\n\n".join(parts).replace("](", f"]({folder}/")
+        bodies.append(f"## {title}\n\n{body}\n")
         figures += [
-            f"| [{file}]({folder.name}/{file}) | `mpirun -n 2 python3 demos/{name}.py` |"
-            for file in (line.split("](")[1].rstrip(")") for line in lines if line[:2] == "![")
+            f"| [{file}]({folder}/{file}) | `mpirun -n 2 python3 demos/{name}.py` |"
+            for file in (part.split("](")[1].split(")")[0] for part in parts if part[:2] == "![")
         ]
-        path.unlink()
     introduction = INTRODUCTION.format(figures="\n".join(figures), **facts, **anchors)
-    (target / "studies.md").write_text("\n".join([introduction, *pages]), encoding="utf-8")
+    return "\n".join([introduction, *bodies])
 
 
 main()

@@ -19,24 +19,16 @@
 #     mpirun -n 2 python3 demos/demo_adaptive.py [FOLDER]
 
 # %%
-import os
-import sys
-from pathlib import Path
-
 import numpy as np
-from mpi4py import MPI
+from study import Study, canvas, levels_wanted
 
 from signorini_cr import Polygon, Problem, exact, plots, solve_adaptive, solve_levels
-from signorini_cr.errors import on_root
-from signorini_cr.output import canvas
 from signorini_cr.output.errorplot import plot_error
 from signorini_cr.output.report import level_record, table_header, table_row
 
-comm = MPI.COMM_WORLD
-folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
-on_root(comm, lambda: folder.mkdir(parents=True, exist_ok=True))
+study = Study("demo_adaptive", "Meshes that adapt, and stop when the error is certified")
 # The limit for a quick look is that of the other demos: each level less is a factor of 4
-size = 4 ** max(0, 8 - int(os.environ.get("SIGNORINI_DEMO_LEVELS", "8")))
+size = 4 ** (8 - levels_wanted(8))
 max_dofs = max(100_000 // size, 2_000)
 
 
@@ -47,9 +39,9 @@ def show(solutions, title):
         record = level_record(solution)
         first = first or record
         rows.append((solution.dofs, solution.certificate.bound_h1))
-        if comm.rank == 0:
-            print((f"\n{title}\n{table_header(first)}\n" if len(rows) == 1 else "")
-                  + table_row(record, first), flush=True)  # fmt: skip
+        if len(rows) == 1:
+            study.tell(f"\n{title}\n{table_header(first)}")
+        study.tell(table_row(record, first))
     return np.array(rows), solution
 
 
@@ -92,18 +84,19 @@ for name, (problem, mesh) in CASES.items():
 # %%
 for name, solution in finest.items():
     file = "adaptive-" + name.split()[0].strip(",").lower()
-    plots.plot_solution(solution, folder / f"{file}-solution.png", name)
+    plots.plot_solution(solution, study.folder / f"{file}-solution.png", name)
+    study.show(f"{file}-solution.png", f"{name}: the solution.")
     # a mesh that can be seen
     problem, mesh = CASES[name]
     *_, small = solve_adaptive(problem, mesh(), max_dofs=min(4_000, max_dofs))
-    plots.plot_mesh(small.domain, folder / f"{file}-mesh.png", name)
-    plot_error(small, folder / f"{file}-error.png", name)
+    plots.plot_mesh(small.domain, study.folder / f"{file}-mesh.png", name)
+    study.show(f"{file}-mesh.png", f"{name}: a mesh that adapted.")
+    plot_error(small, study.folder / f"{file}-error.png", name)
+    study.show(f"{file}-error.png", f"{name}: where the error sits.")
 
 
-def draw():
+def draw(axes):
     """Bounds against degrees of freedom."""
-    figure = canvas.new_figure(8.0, 6.0)
-    axes = figure.subplots()
     colours = dict(zip(CASES, (canvas.BLUE, canvas.RED, canvas.YELLOW), strict=True))
     for (name, kind), rows in curves.items():
         style = "o-" if kind == "adaptive" else "s--"
@@ -115,10 +108,14 @@ def draw():
     axes.set_ylabel(r"certified bound of $\|\nabla_h(u-u_h)\|$", fontsize=13)
     axes.grid(which="both", alpha=0.25)
     axes.legend(fontsize=10)
-    canvas.save(figure, folder / "adaptive-convergence.png")
 
 
-on_root(comm, draw)
+study.picture(
+    "adaptive-convergence.png",
+    "Certified bounds on adaptive and on uniform meshes.",
+    draw,
+    size=(8.0, 6.0),
+)
 
 # %% [markdown]
 # ## Check
@@ -129,8 +126,7 @@ on_root(comm, draw)
 for (name, kind), rows in curves.items():
     late = rows[rows[:, 0] > 0.01 * max_dofs]
     slope = np.polyfit(*np.log(late).T, 1)[0]
-    if comm.rank == 0:
-        print(f"{name}, {kind}: bound {rows[-1, 1]:.3e} with {rows[-1, 0]:.0f}, slope {slope:.2f}")
+    study.tell(f"{name}, {kind}: bound {rows[-1, 1]:.3e} with {rows[-1, 0]:.0f}, slope {slope:.2f}")
     if kind == "adaptive":
         assert abs(slope + 0.5) < 0.08, (name, slope)
     elif name == "L-shape":
@@ -138,3 +134,4 @@ for (name, kind), rows in curves.items():
 
 *_, last = solve_adaptive(exact.S1.problem, exact.S1.mesh(0.4), tolerance=0.1)
 assert last.errors[0] <= last.certificate.bound_h1 <= 0.1
+study.finish()

@@ -17,22 +17,14 @@
 #     mpirun -n 2 python3 demos/demo_certificate.py [FOLDER]
 
 # %%
-import os
-import sys
-from pathlib import Path
-
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
+from study import COLOURS, Study, canvas, levels_wanted
 
 from signorini_cr import exact, solve, solve_adaptive, solve_levels
-from signorini_cr.errors import on_root
-from signorini_cr.output import canvas
 
-comm = MPI.COMM_WORLD
-folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
-on_root(comm, lambda: folder.mkdir(parents=True, exist_ok=True))
-levels = min(7, int(os.environ.get("SIGNORINI_DEMO_LEVELS", "7")))
+study = Study("demo_certificate", "Certified against true error")
+levels = levels_wanted(7)
 NAMES = ("S1", "A", "B", "C", "I", "D")
 
 # %% [markdown]
@@ -59,12 +51,12 @@ for name in NAMES:
             if example.energy is not None:
                 assert low <= example.energy <= high
         curves[name, kind] = np.array(rows)
-        if comm.rank == 0:
-            dofs, error, bound, low, high = curves[name, kind].T
-            print(f"{name:3s} {kind:9s} {dofs[0]:.0f} … {dofs[-1]:.0f} dofs,"
-                  f" error {error[-1]:.3e}, bound/error {bound[0] / error[0]:.3f}"
-                  f" … {bound[-1] / error[-1]:.3f}, J in [{low[-1]:.7f}, {high[-1]:.7f}]",
-                  flush=True)  # fmt: skip
+        dofs, error, bound, low, high = curves[name, kind].T
+        study.tell(
+            f"{name:3s} {kind:9s} {dofs[0]:.0f} … {dofs[-1]:.0f} dofs, error {error[-1]:.3e}, "
+            f"bound/error {bound[0] / error[0]:.3f} … {bound[-1] / error[-1]:.3f}, "
+            f"J in [{low[-1]:.7f}, {high[-1]:.7f}]"
+        )
 
 # %% [markdown]
 # ## A solver that is stopped early
@@ -81,9 +73,9 @@ for tolerance in (1e-9, 1e-5, 1e-4, 1e-3, 1e-2, 0.1):
     residual = solution.contact.kkt.residual
     stopped.append((residual, error, certificate.bound_h1, certificate.parts["solver"]))
     assert error <= certificate.bound_h1
-    if comm.rank == 0:
-        print("residual {:.1e}: error {:.3e}, bound {:.3e}, of which solver {:.1e}".format(
-            *stopped[-1]), flush=True)  # fmt: skip
+    study.tell(
+        "residual {:.1e}: error {:.3e}, bound {:.3e}, of which solver {:.1e}".format(*stopped[-1])
+    )
 for name in ("snes_atol", "ksp_rtol"):
     options.delValue(name)
 
@@ -92,12 +84,10 @@ for name in ("snes_atol", "ksp_rtol"):
 
 
 # %%
-def draw():
+def draw(left, middle, right):
     """Error and bound, their ratio, and the unfinished solutions."""
-    figure = canvas.new_figure(17.0, 5.5)
-    left, middle, right = figure.subplots(1, 3)
-    colours = (canvas.BLUE, canvas.RED, canvas.YELLOW, "#117733", "#882255", canvas.GREY)
-    for name, colour in zip(NAMES, colours, strict=True):
+    colours = dict(zip(NAMES, COLOURS, strict=False))
+    for name, colour in colours.items():
         for kind, style in (("uniform", "-"), ("adaptive", ":")):
             dofs, error, bound, *_ = curves[name, kind].T
             middle.semilogx(dofs, bound / error, style, color=colour, label=f"{name}, {kind}")
@@ -116,10 +106,15 @@ def draw():
     for axes in (left, middle, right):
         axes.grid(which="both", alpha=0.25)
         axes.legend(fontsize=9, ncols=2 if axes is middle else 1)
-    canvas.save(figure, folder / "certificate.png")
 
 
-on_root(comm, draw)
+study.picture(
+    "certificate.png",
+    "Errors and bounds, their quotients, and a solver that is stopped early.",
+    draw,
+    panels=3,
+    size=(17.0 / 3, 5.5),
+)
 
 # %% [markdown]
 # ## Check
@@ -132,3 +127,4 @@ for name in NAMES[:-1]:
     assert np.all(bound[1:] <= 1.45 * error[1:]), name
     rate = np.log2((high - low)[-2] / (high - low)[-1])
     assert rate > 1.85, (name, rate)
+study.finish()

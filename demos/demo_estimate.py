@@ -71,6 +71,7 @@ def values(rows, term):
     return np.array([getattr(estimate, term) for _, estimate in rows])
 
 
+sizes, rates = {}, {}
 for (name, family), rows in found.items():
     h = np.array([h for h, _ in rows])
     floor = 1e-7 * values(rows, "error")
@@ -82,8 +83,10 @@ for (name, family), rows in found.items():
     balance = values(rows, "best") + values(rows, "interior") + values(rows, "dirichlet")
     balance += values(rows, "contact") - values(rows, "slack") - values(rows, "error")
     size["imbalance"] = ("{:.0e}", abs(balance) / values(rows, "error"))
-    study.table(f"{name} on the {family} meshes: the terms", size)
-    study.table(f"{name} on the {family} meshes: their orders", order)
+    sizes[f"{name} on the {family} meshes: the terms"] = size
+    rates[f"{name} on the {family} meshes: their orders"] = order
+for caption, table in (*sizes.items(), *rates.items()):
+    study.table(caption, table)
 
 
 # %% [markdown]

@@ -20,20 +20,16 @@
 #     mpirun -n 2 python3 demos/demo_s1.py [FOLDER]
 
 # %%
-import os
-import sys
-from pathlib import Path
-
 import numpy as np
-from mpi4py import MPI
+from study import Study, comm, levels_wanted
 
 from signorini_cr import exact, plots, solve_levels
+from signorini_cr.errors import on_root
 from signorini_cr.output.report import level_record, table_header, table_row
 from signorini_cr.output.tables import markdown_table
 
-comm = MPI.COMM_WORLD
-folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
-levels = int(os.environ.get("SIGNORINI_DEMO_LEVELS", "6"))
+study = Study("demo_s1", "S1 on unstructured meshes")
+levels = levels_wanted(6)
 
 # %% [markdown]
 # ## Solve
@@ -45,10 +41,10 @@ domain = exact.S1.mesh(0.25)
 records = []
 for solution in solve_levels(exact.S1.problem, domain, levels):
     records.append(level_record(solution, records[-1] if records else None))
-    if comm.rank == 0:
-        if len(records) == 1:
-            print(table_header(records[0]))
-        print(table_row(records[-1], records[0]), flush=True)
+    if len(records) == 1:
+        study.tell(table_header(records[0]))
+    study.tell(table_row(records[-1], records[0]))
+study.parts.append(markdown_table(records).strip())
 
 # %% [markdown]
 # ## Look
@@ -56,22 +52,13 @@ for solution in solve_levels(exact.S1.problem, domain, levels):
 # $\lambda_h$ along $\Gamma_1$, the third the errors.
 
 # %%
-if comm.rank == 0:
-    folder.mkdir(parents=True, exist_ok=True)
-comm.barrier()
-plots.plot_solution(solution, folder / "s1-solution.png", "S1")
-plots.plot_contact(solution, folder / "s1-contact.png", "S1")
-if comm.rank == 0:
-    plots.plot_convergence(records, folder / "s1-convergence.png", "S1")
-    captions = {
-        "s1-solution.png": "u_h of S1 on the finest mesh, in contact for x < 0.",
-        "s1-contact.png": "S1: u_h and the pressure along Γ1.",
-        "s1-convergence.png": "S1: the errors fall like h and like h².",
-    }
-    pages = [f"![{caption}]({file})\n\n*{caption}*\n" for file, caption in captions.items()]
-    text = "\n".join(["## S1 on unstructured meshes\n", markdown_table(records), *pages])
-    (folder / "demo_s1.md").write_text(text, encoding="utf-8")
-    print(f"pictures: {', '.join(str(folder / file) for file in captions)}")
+plots.plot_solution(solution, study.folder / "s1-solution.png", "S1")
+study.show("s1-solution.png", "u_h of S1 on the finest mesh, in contact for x < 0.")
+plots.plot_contact(solution, study.folder / "s1-contact.png", "S1")
+study.show("s1-contact.png", "S1: u_h and the pressure along Γ1.")
+rates = study.folder / "s1-convergence.png"
+on_root(comm, lambda: plots.plot_convergence(records, rates, "S1"))
+study.show("s1-convergence.png", "S1: the errors fall like h and like h².")
 
 # %% [markdown]
 # ## Check
@@ -86,3 +73,4 @@ assert np.all(abs(l2 - 2.0) < 0.10), l2
 assert np.linalg.norm(transition) < solution.h, transition
 gap = exact.S1.energy - solution.energy
 assert 0.0 < gap < 3.0 * records[-1]["error_h1"] ** 2, gap
+study.finish()

@@ -2,6 +2,7 @@
 
 A demo takes a folder as its argument (`demo-output` without one) and leaves there its pictures
 and its tables, as Markdown. SIGNORINI_DEMO_LEVELS in the environment limits the number of meshes.
+`notebook.py` runs a demo cell by cell and has its prose as well.
 """
 
 from __future__ import annotations
@@ -173,28 +174,35 @@ def edges(mesh: Mesh) -> np.ndarray:
 
 
 class Study:
-    """The tables and pictures of one demo.
+    """The tables and pictures of one demo, in the order in which they are made.
 
     Args:
         name: The demo's file name without ending; its tables go to `name.md`.
         title: The heading.
+
+    Attributes:
+        folder: Where all of it goes; there from now on, on every rank.
+        parts: Paragraphs, tables and references to pictures, in Markdown.
     """
 
     def __init__(self, name: str, title: str):
         """Take the folder from the command line and make it; collective."""
         self.name = name
+        self.title = title
         self.folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
-        self._title = title
-        self._parts: list[tuple[int, str]] = []
+        self.parts: list[str] = []
         on_root(comm, lambda: self.folder.mkdir(parents=True, exist_ok=True))
+        self.tell(f"\n{title}\n{'=' * len(title)}")
+
+    def tell(self, text: str) -> None:
+        """Print on rank 0, and keep nothing."""
         if comm.rank == 0:
-            print(f"\n{title}\n{'=' * len(title)}", flush=True)
+            print(text, flush=True)
 
     def say(self, text: str) -> None:
         """Add a paragraph."""
-        self._keep(text)
-        if comm.rank == 0:
-            print("\n" + text, flush=True)
+        self.parts.append(text)
+        self.tell("\n" + text)
 
     def table(self, caption: str, columns: dict[str, tuple[str, Sequence]]) -> None:
         """Print a table and keep it.
@@ -218,9 +226,8 @@ class Study:
             "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
             for row in (rows[0], rule, *rows[1:])
         ]
-        self._keep("\n".join([f"{caption}\n", *markdown]))
-        if comm.rank == 0:
-            print("\n".join(["", caption, *("  ".join(row) for row in rows)]), flush=True)
+        self.parts.append("\n".join([f"{caption}\n", *markdown]))
+        self.tell("\n".join(["", caption, *("  ".join(row) for row in rows)]))
 
     def picture(
         self,
@@ -248,39 +255,18 @@ class Study:
             canvas.save(figure, self.folder / file)
 
         on_root(comm, paint)
-        self._keep(f"![{caption}]({file})\n\n*{caption}*")
+        self.show(file, caption)
 
-    def _keep(self, text: str) -> None:
-        """Remember a part of the page and the line of the demo it belongs to."""
-        frame = sys._getframe(2)
-        self._script = Path(frame.f_code.co_filename)
-        self._parts.append((frame.f_lineno, text))
+    def show(self, file: str, caption: str) -> None:
+        """Keep a reference to a picture that is there."""
+        self.parts.append(f"![{caption}]({file})\n\n*{caption}*")
 
     def finish(self) -> None:
-        """Write what was kept, among the demo's Markdown cells."""
-
-        def write() -> None:
-            parts = sorted([*_markdown_cells(self._script), *self._parts], key=lambda part: part[0])
-            page = [f"## {self._title}", *(text for _, text in parts)]
-            path = self.folder / f"{self.name}.md"
-            path.write_text("\n\n".join(page) + "\n", encoding="utf-8")
-
-        on_root(comm, write)
-        if comm.rank == 0:
-            print(f"\nwritten: {self.folder}/{self.name}.md and the pictures it shows", flush=True)
-
-
-def _markdown_cells(script: Path) -> Iterator[tuple[int, str]]:
-    """Line numbers and texts of the Markdown cells, headings one level down, the title left out."""
-    lines = script.read_text(encoding="utf-8").splitlines()
-    starts = [k for k, line in enumerate(lines) if line.startswith("# %%")]
-    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
-        if lines[start].endswith("[markdown]"):
-            text = [line.removeprefix("#").removeprefix(" ") for line in lines[start + 1 : end]]
-            text = [f"#{line}" if line.startswith("## ") else line for line in text]
-            body = "\n".join(line for line in text if not line.startswith("# ")).strip()
-            if "\n" in body:  # more than a heading
-                yield start, body
+        """Write what was kept."""
+        path = self.folder / f"{self.name}.md"
+        page = "\n\n".join([f"## {self.title}", *self.parts]) + "\n"
+        on_root(comm, lambda: path.write_text(page, encoding="utf-8"))
+        self.tell(f"\nwritten: {path} and the pictures it shows")
 
 
 def _cell(form: str, value: object) -> str:

@@ -27,30 +27,20 @@ class Alphabet:
         raise AttributeError(name)
 
 
-NUMBERS = Alphabet(
-    sin=np.sin,
-    cos=np.cos,
-    exp=np.exp,
-    log=np.log,
-    sqrt=np.sqrt,
-    atan=np.arctan,
-    where=np.where,
-    above=np.greater,
-    larger=np.maximum,
-    smaller=np.minimum,
-)
-SYMBOLS = Alphabet(
-    sin=ufl.sin,
-    cos=ufl.cos,
-    exp=ufl.exp,
-    log=ufl.ln,
-    sqrt=ufl.sqrt,
-    atan=ufl.atan,
-    where=ufl.conditional,
-    above=ufl.gt,
-    larger=ufl.max_value,
-    smaller=ufl.min_value,
-)
+_BOTH: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    "sin": (np.sin, ufl.sin),
+    "cos": (np.cos, ufl.cos),
+    "exp": (np.exp, ufl.exp),
+    "log": (np.log, ufl.ln),
+    "sqrt": (np.sqrt, ufl.sqrt),
+    "atan": (np.arctan, ufl.atan),
+    "where": (np.where, ufl.conditional),
+    "above": (np.greater, ufl.gt),
+    "larger": (np.maximum, ufl.max_value),
+    "smaller": (np.minimum, ufl.min_value),
+}
+NUMBERS = Alphabet(**{name: number for name, (number, _) in _BOTH.items()})
+SYMBOLS = Alphabet(**{name: symbol for name, (_, symbol) in _BOTH.items()})
 
 Formula = Callable[[Any, Any, Any, Sequence[Any]], Any]
 """Called with an alphabet, x, y and the parameters."""

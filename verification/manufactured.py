@@ -84,12 +84,22 @@ class Exact:
         a, b = self.gradient(NUMBERS, x, y, self.parameters)
         return np.broadcast_to(a, np.shape(x)), np.broadcast_to(b, np.shape(x))
 
+    def _value(self, formula: Formula | None, x: Any, y: Any, absent: float = 0.0) -> FloatArray:
+        """A formula at points."""
+        if formula is None:
+            return np.full(np.shape(x), absent)
+        found: FloatArray = numeric(formula, self.parameters)(x, y)
+        return found
+
     def kappa(self, x: Any, y: Any) -> FloatArray:
         """κ at points."""
-        if self.coefficient is None:
-            return np.ones(np.shape(x))
-        found: FloatArray = numeric(self.coefficient, self.parameters)(x, y)
-        return found
+        return self._value(self.coefficient, x, y, absent=1.0)
+
+    def _flux(self, x: Any, y: Any, normal: FloatArray) -> FloatArray:
+        """κ∂ₙu at points."""
+        a, b = self.slope(x, y)
+        flux: FloatArray = self.kappa(x, y) * (normal[0] * a + normal[1] * b)
+        return flux
 
     def pieces(self, points: FloatArray) -> Pieces:
         """Cells, in pieces on which u is smooth."""
@@ -118,9 +128,7 @@ class Exact:
         total = 0.0
         for part, x, y, w, n in self._sides():
             if part != "neumann":
-                a, b = self.slope(x, y)
-                flux = self.kappa(x, y) * (n[0] * a + n[1] * b)
-                total += float(w @ (flux * numeric(self.u, self.parameters)(x, y)))
+                total += float(w @ (self._flux(x, y, n) * self._value(self.u, x, y)))
         return total
 
     def checked(self) -> float:
@@ -137,7 +145,7 @@ class Exact:
         inside = self.pieces(cells)
         x, y = inside.x, inside.y
         kappa, (u_x, u_y) = self.kappa(x, y), self.slope(x, y)
-        f = np.zeros_like(x) if self.f is None else numeric(self.f, self.parameters)(x, y)
+        f = self._value(self.f, x, y)
         worst = 0.0
         edges = self._sides()
         tests: list[tuple[Callable, Callable, Callable]] = [
@@ -152,22 +160,18 @@ class Exact:
                 -inside.integral(f * phi(x, y)),
             ]
             for _, s, t, w, normal in edges:
-                a, b = self.slope(s, t)
-                flux = self.kappa(s, t) * (normal[0] * a + normal[1] * b)
-                terms.append(-float(w @ (flux * phi(s, t))))
+                terms.append(-float(w @ (self._flux(s, t, normal) * phi(s, t))))
             worst = max(worst, abs(sum(terms)) / sum(map(abs, terms)))
         for part, s, t, w, normal in edges:
-            u = numeric(self.u, self.parameters)(s, t)
-            a, b = self.slope(s, t)
-            flux = self.kappa(s, t) * (normal[0] * a + normal[1] * b)
+            u, flux = self._value(self.u, s, t), self._flux(s, t, normal)
             if part == "dirichlet":
-                wrong = numeric(self.dirichlet, self.parameters)(s, t) - u
+                wrong = self._value(self.dirichlet, s, t) - u
                 worst = max(worst, float(w @ abs(wrong) / (w @ abs(u) + 1e-3)))
             elif part == "neumann":
-                g = np.zeros_like(s) if self.g is None else numeric(self.g, self.parameters)(s, t)
-                worst = max(worst, float(w @ abs(g - flux) / (w @ abs(flux) + 1e-3)))
+                wrong = self._value(self.g, s, t) - flux
+                worst = max(worst, float(w @ abs(wrong) / (w @ abs(flux) + 1e-3)))
             else:
-                gap = u - numeric(self.obstacle, self.parameters)(s, t)
+                gap = u - self._value(self.obstacle, s, t)
                 size_u, size_f = w @ abs(u) + 1e-3, w @ abs(flux) + 1e-3
                 worst = max(worst, float(w @ np.maximum(-gap, 0) / size_u))
                 worst = max(worst, float(w @ np.maximum(-flux, 0) / size_f))
@@ -227,6 +231,30 @@ def _lowered(u: Formula, P: int, x0: int) -> Formula:
     return alpha
 
 
+def _across(
+    kind: str,
+    rng: np.random.Generator,
+    parameters: Sequence[float],
+    u: Formula,
+    gradient: Fields,
+    line: Line,
+    **data: Formula,
+) -> Exact:
+    """Data that jump across a line; from the ninth on the parameters are those of `_lowered`."""
+    p = tuple(map(float, parameters))
+    return Exact(
+        kind,
+        p,
+        HELD if rng.random() < 0.6 else FREE,
+        u,
+        gradient,
+        _lowered(u, 9, 10),
+        u,
+        lines=(line, (1.0, 0.0, p[10])),
+        **data,
+    )
+
+
 def load_jumps(rng: np.random.Generator) -> Exact:
     """F jumps across a level or a slant line."""
     level = bool(rng.random() < 0.6)
@@ -242,17 +270,9 @@ def load_jumps(rng: np.random.Generator) -> Exact:
         K, Q, P = A + f1 * c, rng.uniform(1, 8), rng.uniform(0.5, 3)
     else:
         K, Q, P = abs(A) + 1.6 * max(abs(f1), abs(f2)) + 0.1, 0.0, 0.0
-    return Exact(
-        "f jumps across a line",
-        tuple(map(float, (n_x, n_y, c, f1, f2, A, K, e, Q, P, x0, kink))),
-        HELD if rng.random() < 0.6 else FREE,
-        _f_u,
-        _f_gradient,
-        _lowered(_f_u, 9, 10),
-        _f_u,
-        f=_f_f,
-        g=_f_g,
-        lines=(line, (1.0, 0.0, float(x0))),
+    parameters = (n_x, n_y, c, f1, f2, A, K, e, Q, P, x0, kink)
+    return _across(
+        "f jumps across a line", rng, parameters, _f_u, _f_gradient, line, f=_f_f, g=_f_g
     )
 
 
@@ -311,19 +331,9 @@ def _coefficient_jumps(rng: np.random.Generator, ratio: float) -> Exact:
         if not level:
             q, e = q / ratio, e / ratio
         A = -(1.6 * abs(f0) + 6 * abs(B) + 4 * (abs(q) + abs(e)) * ratio * abs(n_x) + 0.2) / n_y
-    return Exact(
-        f"κ jumps 1 : {ratio:.0f} across a line",
-        tuple(map(float, (n_x, n_y, c, k1, k2, A, f0, B, q, P, x0, kink, e, Q))),
-        HELD if rng.random() < 0.6 else FREE,
-        _k_u,
-        _k_gradient,
-        _lowered(_k_u, 9, 10),
-        _k_u,
-        f=_k_f,
-        g=_k_g,
-        coefficient=_k,
-        lines=(line, (1.0, 0.0, float(x0))),
-    )
+    kind, data = f"κ jumps 1 : {ratio:.0f} across a line", {"f": _k_f, "g": _k_g, "coefficient": _k}
+    parameters = (n_x, n_y, c, k1, k2, A, f0, B, q, P, x0, kink, e, Q)
+    return _across(kind, rng, parameters, _k_u, _k_gradient, line, **data)
 
 
 def coefficient_jumps(rng: np.random.Generator) -> Exact:
@@ -423,28 +433,22 @@ def _polar(m: Any, x: Any, y: Any, p: Sequence[Any]) -> tuple[Any, Any, Any, Any
     return X, Y, m.log(X**2 + Y**2) / 2, turn - m.atan(X / Y)
 
 
-def _polar_numbers(x: Any, y: Any, p: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+def _polar_numbers(m: Any, x: Any, y: Any, p: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+    """The same inside as well, in numbers only."""
     X, Y = 1.0 - x, y - p[1]
     return X, Y, np.log(np.maximum(np.hypot(X, Y), 1e-300)), np.arctan2(Y, X)
 
 
-def _trace(value: Callable[..., Any]) -> Formula:
+def _formula(value: Callable[..., Any], polar: Callable[..., Any]) -> Formula:
     def formula(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
-        return value(m, *_polar(m, x, y, p), p) - p[2] * y
-
-    return formula
-
-
-def _inside(value: Callable[..., Any]) -> Formula:
-    def formula(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
-        return value(m, *_polar_numbers(x, y, p), p) - p[2] * y
+        return value(m, *polar(m, x, y, p), p) - p[2] * y
 
     return formula
 
 
 def _slopes(pair: Callable[..., tuple[Any, Any]]) -> Fields:
     def gradient(m: Any, x: Any, y: Any, p: Sequence[Any]) -> tuple[Any, Any]:
-        a, b = pair(m, *_polar_numbers(x, y, p), p)
+        a, b = pair(m, *_polar_numbers(m, x, y, p), p)
         return -a, b - p[2]
 
     return gradient
@@ -500,10 +504,10 @@ def _at_side(
         kind,
         parameters,
         FREE,
-        _inside(value),
+        _formula(value, _polar_numbers),
         _slopes(pair),
-        _trace(value),
-        _trace(value),
+        _formula(value, _polar),
+        _formula(value, _polar),
         g=_beside(right, pair),
         lines=((0.0, 1.0, c),),
         corners=((1.0, c, 1e-9),),
@@ -573,9 +577,9 @@ def boundary_bends(rng: np.random.Generator) -> Exact:
         "u_D has a kink",
         (J, c, abs(J) + 0.1),
         GATE,
-        _inside(_corner),
+        _formula(_corner, _polar_numbers),
         _slopes(_corner_slope),
-        _trace(_corner),
+        _formula(_corner, _polar),
         _corner_dirichlet,
         g=_corner_g,
         lines=((0.0, 1.0, c),),

@@ -119,6 +119,15 @@ class Harmonic:
             total += float(self.kappa[sector[cells]] @ square)
         return float(np.sqrt(solution.domain.mesh.comm.allreduce(total)))
 
+    def runs(
+        self, problem: Problem, domain: Domain, quick: bool
+    ) -> list[tuple[str, Solution, float]]:
+        """Solve a problem that this is the solution of, and tell the errors; collective."""
+        return [
+            (f"level {solution.level.number}", solution, self.error(solution))
+            for solution in solve_levels(problem, domain, 2 if quick else 4)
+        ]
+
     def _offset(self, m: FloatArray, own: FloatArray, sector: Any) -> Any:
         return self._at(m[:, :1], m[:, 1:], sector)[0]
 
@@ -236,15 +245,12 @@ def _checkerboard(quick: bool) -> Row:
         dirichlet=_kellogg_data,
         coefficient=lambda x: ufl.conditional(ufl.gt(x[0] * x[1], 0.0), RATIO, 1.0),
     )
-    runs = []
     domain = families.structured(polygon, 4, COMM)
-    for solution in solve_levels(problem, domain, 2 if quick else 4):
-        runs.append((f"level {solution.level.number}", solution, KELLOGG.error(solution)))
     return row_of(
         "checkerboard 1 : 161, u like r^0.1",
         "Kellogg's solution, by Green's formula on each cell; u and κ∂ₙu are the same from both "
         f"sides to {max(_kellogg_transmits(), LEAST):.0e}",
-        runs,
+        KELLOGG.runs(problem, domain, quick),
     )
 
 
@@ -282,14 +288,11 @@ def _slit(quick: bool) -> Row:
         return size * ufl.conditional(steep, up, across)
 
     problem = Problem(f=0.0, obstacle=0.0, dirichlet=0.0, g=flux)
-    runs = []
-    for solution in solve_levels(problem, polygon.mesh(0.3, COMM), 2 if quick else 4):
-        runs.append((f"level {solution.level.number}", solution, known.error(solution)))
     return row_of(
         "contact meets Γ0 at the tip of a slit",
         "u = r^s sin sθ, s = π/2ω for the angle ω: harmonic, 0 on one face, no flux through the "
         "other; by Green's formula on each cell",
-        runs,
+        known.runs(problem, polygon.mesh(0.3, COMM), quick),
     )
 
 

@@ -1,0 +1,124 @@
+"""Draw docs/architecture.svg: the streets of the package, and who imports from whom.
+
+    container/run python3 docs/architecture.py
+
+All of it is read from the sources: a sub-package is a street, the modules beside them are the
+drivers, if they import from a street, and the ground floor if they do not; a street stands above
+all that it imports from. An arrow's number is that of the import statements.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+HERE = Path(__file__).parent
+PACKAGE = HERE.parent / "signorini_cr"
+PICTURE = HERE / "architecture.svg"
+
+GROUND, DRIVERS = "ground floor", "drivers"
+COLOURS = ("#004488", "#BB5566", "#997700", "#117733", "#882255", "#555555")
+
+Arrows = Counter[tuple[str, str]]
+
+
+def imports(path: Path) -> Iterator[Path]:
+    """The places in the package that a module imports from: streets, or modules beside them."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = path.parents[node.level - 1]
+            if node.module:
+                yield base.joinpath(*node.module.split("."))
+            else:
+                yield from (base / alias.name for alias in node.names)
+
+
+def read(package: Path = PACKAGE) -> Arrows:
+    """Count the imports from street to street; those within one are left out."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(package.rglob("*.py")):
+        if path.parent == package and path.stem.startswith("__"):
+            continue  # the public names, loaded when they are first used
+        names = found.setdefault(path.relative_to(package).parts[0].removesuffix(".py"), [])
+        places = [place.relative_to(package).parts[0] for place in imports(path)]
+        names += [place for place in places if not place.startswith("__")]
+    streets = {name for name in found if (package / name).is_dir()}
+    beside = {
+        name: DRIVERS if streets & set(found[name]) else GROUND for name in set(found) - streets
+    }
+    arrows: Arrows = Counter()
+    for here, others in found.items():
+        for there in others:
+            ends = beside.get(here, here), beside.get(there, there)
+            arrows[ends] += ends[0] != ends[1]
+    return +arrows
+
+
+def floors(arrows: Arrows) -> list[str]:
+    """The streets from the top to the bottom.
+
+    Raises:
+        graphlib.CycleError: If there is a circle.
+    """
+    below: dict[str, set[str]] = {}
+    for here, there in sorted(arrows):
+        below.setdefault(here, set()).add(there)
+    return list(TopologicalSorter(below).static_order())[::-1]
+
+
+def charter(name: str) -> str:
+    """The first line of a street's charter."""
+    if name == GROUND:
+        return "Errors, PETSc's options and memory, versions of DOLFINx."
+    if name == DRIVERS:
+        return "`solve`, `solve_levels`, `solve_adaptive`, and the solution they give."
+    text = ast.get_docstring(ast.parse((PACKAGE / name / "__init__.py").read_text("utf-8")))
+    return (text or "").split("\n")[0]
+
+
+def draw(arrows: Arrows, path: Path = PICTURE) -> None:
+    """Make the picture; the `id` of each arrow says what it joins."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    from matplotlib import pyplot as plt
+
+    plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "signorini_cr"})
+    order = floors(arrows)
+    row = {name: -k for k, name in enumerate(order)}
+    text, lane, column = 8.4, 0.24, 0.0
+    lanes = []
+    for k, here in enumerate(order):
+        targets = [there for there in order if (here, there) in arrows]
+        for there in targets:
+            lanes.append((text + column, here, there, COLOURS[k % len(COLOURS)]))
+            column += lane
+        column += lane * bool(targets)
+    width = text + column
+    figure, axes = plt.subplots(figsize=(12.5, 0.62 * len(order)), layout="constrained")
+    for name, y in row.items():
+        box = plt.Rectangle((0, y - 0.28), width, 0.56, facecolor="#F2F2F2", edgecolor="#888888")
+        axes.add_patch(box)
+        axes.text(0.1, y, name, weight="bold", size=11, va="center")
+        axes.text(2.15, y, charter(name), size=8, va="center")
+    for x, here, there, colour in lanes:
+        top, bottom, number = row[here], row[there], arrows[here, there]
+        axes.plot(x, top, "o", color=colour, markersize=3.5)
+        arrow = axes.annotate(
+            "",
+            xy=(x, bottom + 0.12),
+            xytext=(x, top),
+            arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 0.7 + 0.08 * number},
+        )
+        arrow.arrow_patch.set_gid(f"{here} > {there}")
+        axes.text(x, bottom - 0.08, f"{number}", size=7.5, color=colour, ha="center", va="center")
+    axes.set(xlim=(-0.1, width + 0.1), ylim=(0.6 - len(order), 0.4))
+    axes.axis("off")
+    figure.savefig(path, metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    draw(read())
