@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 from dolfinx.mesh import create_unit_square
 from mpi4py import MPI
 
@@ -10,6 +11,8 @@ from signorini_cr import Polygon, Problem, exact, solve
 from signorini_cr.app import expressions
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.jets import Boxes, Enclosure, indices, lowered
+from signorini_cr.data.ranges import Deviation, Pieces
+from signorini_cr.fem.cells import Cells
 from signorini_cr.mesh.families import structured
 
 WORLD = MPI.COMM_WORLD
@@ -86,6 +89,28 @@ def test_jets_are_sharp_to_first_order(text):
 
 
 # ---- exact problems in one variable, whose data jump inside cells
+
+
+def test_slanted_cells_are_enclosed_in_their_own_coordinates():
+    """R is no less than what the best quadratic leaves at random points, and not much more."""
+    sides = ("contact", "dirichlet", "dirichlet", "dirichlet")
+    domain = structured(Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides), 8, WORLD)
+    mesh = domain.mesh
+    mesh.geometry.x[:, 0] += 50 * mesh.geometry.x[:, 1]
+    cells = Cells(domain, fem.functionspace(mesh, ("CR", 1)))
+    x = ufl.SpatialCoordinate(mesh)
+    deviation = Deviation(ufl.sin(2 * (x[0] - 50 * x[1]) + 0.3) * ufl.cos(2 * x[1]))
+    pieces = Pieces.of_cells(cells)
+    boxes = pieces.boxes(cells)
+    bound, _ = deviation(boxes, pieces.half(boxes))
+    hats = np.random.default_rng(1).dirichlet(np.ones(3), 60).T
+    values = deviation.values(pieces, cells, hats)
+    basis = np.stack([hats[i] * hats[j] for i in range(3) for j in range(i + 1)], axis=1)
+    rest = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+    rough = np.sqrt((rest**2).mean(axis=0))
+    assert (rough <= bound).all()
+    # third derivatives are at most 1, the arguments change by ⅛ from the middle along both edges
+    assert (bound <= 0.25**3 / 6 * (1 + 1e-9)).all()
 
 
 def clipped(triangle, normal, c):

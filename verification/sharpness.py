@@ -577,7 +577,7 @@ def _parallelograms(quick: bool) -> list[Row]:
     plain = (_sheared_u, _sheared_gradient, _sheared_f)
     along = (_along_u, _along_gradient, _along_f)
     even = (_even_load_u, _even_load_gradient, _even_load_f)
-    flat = 1 / SHEAR
+    flat, root = 1 / SHEAR, 0.5**0.5
     return [
         _thin(
             "squares sheared 1 : 50, f constant",
@@ -598,6 +598,13 @@ def _parallelograms(quick: bool) -> list[Row]:
             plain,
             (1.0, 3.0, 0.3, 3.0, 0.0, 0.5),
             ([1, 0], [flat, flat]),
+            quick,
+        ),
+        _thin(
+            "squares squashed to 50 : 1, and turned by 45°",
+            plain,
+            (0.1, 3.0, 0.3, 3.0, 0.0, 1.0),
+            ([root, root], [-flat * root, flat * root]),
             quick,
         ),
         _thin(

@@ -81,6 +81,8 @@ class Boxes:
         cells: A cell that holds each box, shape (n,), for data that are given by cells.
         normal: Outward normals, shape (gdim, n).
         mesh: The mesh of the cells.
+        slanted: Boxes that are much larger than their simplices, shape (k,).
+        edges: Two edges of each of these, from one vertex, shape (variables, gdim, k).
     """
 
     low: FloatArray
@@ -90,6 +92,16 @@ class Boxes:
     cells: npt.NDArray[np.intp] | None = None
     normal: FloatArray | None = None
     mesh: Any = None
+    slanted: npt.NDArray[np.intp] | None = None
+    edges: FloatArray | None = None
+
+    @property
+    def own(self) -> Boxes:
+        """The slanted ones with coordinates along the edges, in which simplices lie in [0, 1]^d."""
+        assert self.slanted is not None
+        low, high = self.low[:, self.slanted], self.high[:, self.slanted]
+        cells = None if self.cells is None else self.cells[self.slanted]
+        return Boxes(low, high, self.edges, cells=cells, mesh=self.mesh)
 
     @property
     def variables(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..fem.cells import Cells, Side, blocks, measures, pick, poincare
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare
 from ..fem.space import facet_quadrature
 from .jets import Boxes, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
@@ -43,6 +43,15 @@ class Load:
         half = 0 if rows is None else len(rows) // 2
         self.hats = None if rows is None else rows[:half]
         self.bumps = None if rows is None else rows[half:]
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """Means of (f − f_T − ℓ)², d = 2, shape (cells,), with the affine function ℓ nearest to f.
+
+        ℓ is 12 times its moment (f − f_T) λ_i at the vertex i.
+        """
+        assert self.variance is not None and self.hats is not None
+        return np.maximum(self.variance - 12.0 * dot_rows(self.hats, self.hats), 0.0)
 
     def shares(self, cells: Cells, part: slice) -> FloatArray:
         """∫_T f ψ_i for the Crouzeix-Raviart functions ψ_i = 1 − d λ_i, shape (d + 1, n)."""
@@ -305,10 +314,26 @@ class Segments:
         )
         return at, sizes.astype(np.float64)
 
-    def oscillation(self) -> tuple[IntArray, FloatArray]:
-        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each."""
-        squares = self.measure * (self.weights @ self.rest**2)
-        return self._by_cell(np.sqrt(np.bincount(self.place, squares, minlength=len(self.through))))
+    @cached_property
+    def slope(self) -> FloatArray:
+        """The a with a (λ_j − λ_k) nearest to q − g_F, j < k the ends, d = 2, shape (facets,)."""
+        moments = self.measure * (self.weights @ (self.rest * (self.hats[:, 0] - self.hats[:, 1])))
+        return np.asarray(3.0 * self._over_facets(moments) / self._over_facets(self.measure))
+
+    def _over_facets(self, amounts: FloatArray) -> FloatArray:
+        found = np.bincount(self.place, amounts, minlength=len(self.through))
+        return found.astype(np.float64)
+
+    def oscillation(self, carried: bool) -> tuple[IntArray, FloatArray]:
+        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each.
+
+        Args:
+            carried: Whether y carries q's affine part, and what is left of q − g_F is meant.
+        """
+        squares = self._over_facets(self.measure * (self.weights @ self.rest**2))
+        if carried:
+            squares = squares - self._over_facets(self.measure) * self.slope**2 / 3.0
+        return self._by_cell(np.sqrt(np.maximum(squares, 0.0)))
 
     def beyond(self) -> tuple[IntArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""

@@ -69,6 +69,8 @@ DEEP = 60.0
 """How far above the threshold pieces are cut twice at once."""
 IDLE = 0.25
 """Exponent of the number of pieces by which a cut lowers the error that does little."""
+SLANTED = 4.0
+"""Box of a triangle over twice its area, from which on its own coordinates are tried, too."""
 _FEW = 1e-9
 _CUBIC = {1: 1.0, 2: 0.5, 3: 0.25}
 """Distance on [−1, 1]^m of xyz, x²y and x³ from quadratics, by the largest exponent."""
@@ -166,6 +168,11 @@ class Deviation:
         if hats is not None and boxes.corners is not None and self.singular:
             rough, missed = allowance(self.expression, boxes.corners, hats)
             quadratic, cubic = np.fmin(quadratic, rough), np.fmin(cubic, missed)
+        if boxes.slanted is not None and len(boxes.slanted):
+            own = boxes.own
+            there = remainders(self._jet(Enclosure(own), inverse), np.full_like(own.low, 0.5))
+            for row, values in zip((quadratic, cubic), there, strict=True):
+                row[boxes.slanted] = np.fmin(row[boxes.slanted], values)
         return quadratic, cubic
 
     def apart(self, pieces: Pieces) -> Pieces:
@@ -435,7 +442,11 @@ class Pieces:
             low, high = ends.min(axis=0), ends.max(axis=0)
             room = 1e-15 * np.maximum(np.abs(low), np.abs(high))
             low, high = low - room, high + room
-        return self._boxes(low, high, self.parent, cells, self.corners if decide else None)
+        boxes = self._boxes(low, high, self.parent, cells, self.corners if decide else None)
+        if self.corners.shape[:2] != (3, 2):
+            return boxes
+        slanted, edges = self._slanted(low, high)
+        return replace(boxes, slanted=slanted, edges=edges)
 
     def points(self, cells: Cells, hats: FloatArray) -> Boxes:
         """Points with some barycentric coordinates, shape (d + 1, q), piece by piece for each."""
@@ -456,6 +467,18 @@ class Pieces:
             return Boxes(low, high, corners=corners, cells=parent, mesh=mesh)
         along, normal = frame.along[..., parent], frame.normal[:, parent]
         return Boxes(low, high, along, corners, frame.cells[parent], normal, mesh)
+
+    def _slanted(self, low: FloatArray, high: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Triangles whose boxes are much larger than they are, and two edges; see `Boxes`."""
+        (a, b), (c, d) = self.corners[1:] - self.corners[0]
+        large = (high - low).prod(axis=0) > SLANTED * np.abs(a * d - b * c)
+        which = np.flatnonzero(large & self.whole)
+        corners, at = self.corners[..., which], np.arange(len(which))
+        edges = np.roll(corners, -1, axis=0) - corners
+        apex = ((edges**2).sum(axis=1).argmax(axis=0) + 2) % 3  # opposite the longest
+        first = corners[apex, :, at]
+        ends = [corners[(apex + i) % 3, :, at] - first for i in (1, 2)]
+        return which, np.stack(ends).transpose(0, 2, 1)
 
     def half(self, boxes: Boxes) -> FloatArray:
         """Half extents in the boxes' variables."""
@@ -513,6 +536,9 @@ def cut(
     if not local:
         low, high = _extents(cells)
         levels = int(np.log2(max(total / GROUPS, 1.0)) / 2)
+        slanted = (high - low).prod(axis=0) > 2.0 * SLANTED * cells.volume
+        if cells.tdim == 2 and 2 * comm.allreduce(np.count_nonzero(slanted)) > total:
+            levels = 0  # boxes that hold many such cells tell nothing of any
         for level in range(levels, 0, -2):
             every = len(pending) == n
             ends = (low, high) if every else (low[:, pending], high[:, pending])

@@ -23,7 +23,10 @@ from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from ..jit import compiled
+from .beyond import Beyond
 from .companion import Companion, companion, on_facet
+from .cubic import cubed, with_thirds
+from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, unbalanced
 from .gap import integrate, integrate_edge
@@ -68,7 +71,10 @@ class Certificate:
 
     @cached_property
     def flux(self) -> fem.Function | None:
-        """The flux y as a function in the Raviart-Thomas space of lowest order; collective."""
+        """The flux y; collective.
+
+        It is in the Raviart-Thomas space of lowest order, on thin cells perhaps in the next one.
+        """
         if self._made is None:
             return None
         made = self._made
@@ -87,18 +93,21 @@ class Certificate:
         ).ravel()
         for function in (slope, shift):
             function.x.scatter_forward()
-        y = fem.Function(fem.functionspace(mesh, ("RT", 1)))
+        field, beyond = slope * ufl.SpatialCoordinate(mesh) + shift, made.beyond
+        if beyond is not None:
+            field += beyond.field(cells)
+        y = fem.Function(fem.functionspace(mesh, ("RT", 1 if beyond is None else 2)))
         points = y.function_space.element.interpolation_points
         points = points() if callable(points) else points
-        field = slope * ufl.SpatialCoordinate(mesh) + shift
         y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 
     @cached_property
     def companion(self) -> fem.Function | None:
-        """The companion v of degree 2 for d = 2, affine else; collective.
+        """The companion v; collective.
 
-        Without its lifting and, where there are some, its cusps.
+        It is of degree 2 for d = 2, on thin cells perhaps 3, and affine else; without its lifting
+        and, where there are some, its cusps.
         """
         if self._made is None:
             return None
@@ -113,7 +122,7 @@ class Certificate:
             middle = (values.sum(axis=0) - values) / 2 + made.bumps[cells.facets]
             v.x.array[dofs[:, 3:]] = middle.T
         v.x.scatter_forward()
-        return v
+        return v if made.thirds is None else with_thirds(cells, v, made.thirds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +142,8 @@ class _Made:
     bumps: FloatArray
     hats: FloatArray | None
     segments: Segments
+    beyond: Beyond | None
+    thirds: FloatArray | None
     cusps: Cusps | None
     varies: bool
     force: float
@@ -207,6 +218,11 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
     v = companion(cells, kappa.mean, w, u.x.array, flux, u_D, alpha, sweeps, steady, goal)
     sums = integrate(cells, kappa, w, load, flux, v)
+    if promising(cells, kappa.mean, flux, sums):
+        if kappa.values is None and v.cusps is None:
+            v = cubed(cells, kappa.mean, flux, v)
+        improve(cells, kappa.mean, load, segments, flux, v)
+        sums = integrate(cells, kappa, w, load, flux, v)
     cusps, known = v.cusps, (v.excess, v.bumps)
     unsure = 0.0 if cusps is None else cusps.add(cells, w, load, kappa.low, flux, known, sums)
     assert sums.indicators is not None
@@ -222,7 +238,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     )
     lift = np.sqrt(lift)
     hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums)
-    rounding = _rounding(cells, kappa, w, load)
+    rounding = _rounding(cells, kappa, w, load, flux)
     loose = np.sqrt(edge_square) + left + hidden + rounding
     same = total["flux"] + total["companion"] + total["load"]
     same += 2 * (total["load_flux"] + total["slack"])
@@ -270,8 +286,10 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
             segments=segments,
             varies=kappa.values is not None,
             excess=flux.excess,
+            beyond=flux.beyond,
             vertices=v.vertices,
             bumps=v.bumps,
+            thirds=v.thirds,
             cusps=v.cusps,
             force=float(flux.contact.sum()),
             reach=float(bound - near / 2 + loose + lift / 2),
@@ -319,11 +337,12 @@ ROUNDING = 64 * np.finfo(np.float64).eps
 """Relative error of what a cell adds to the certificate's norms."""
 
 
-def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load) -> float:
+def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux: Flux) -> float:
     """What rounding may do to ‖p ± b‖; collective.
 
     Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
-    is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller.
+    is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
+    with ω, of which y may have the curl.
     """
     values = np.abs(w).max(axis=0)
     trace = cells.trace(slice(0, cells.number))
@@ -332,6 +351,8 @@ def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load) -> fl
     if load.variance is not None:
         of_load = of_load + np.sqrt(load.variance)
     square += cells.diameter2 * cells.volume * of_load**2 / kappa.low
+    if flux.beyond is not None:
+        square += trace * flux.beyond.largest(cells) ** 2 / kappa.low
     return float(ROUNDING * np.sqrt(cells.total(np.sum(square))[0]))
 
 

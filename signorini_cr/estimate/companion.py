@@ -10,6 +10,7 @@ which the norm is known. `docs/certificate.md` has the mathematics.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,11 +22,13 @@ from ..data.moments import OnFacets
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
 from .cusps import Cusps
 from .flux import Flux
-from .lifting import Lift, Quadratic, affine, lift
+from .lifting import Cubic, Lift, affine, lift
 from .nearest import Slopes, nearest
+from .shapes import bump_slopes, local_thirds, third_slopes
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+Lifted = tuple[npt.NDArray[np.intp], FloatArray, FloatArray]
 
 JUMP = "u_D jumps where boundary facets meet: no function of finite energy has such values"
 BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
@@ -52,16 +55,45 @@ class Companion:
         contact: Σ over Γ1 of ∫_F (y·n)(v + ℓ − α), by facet, shape (n,).
         lift: Pairs of cells and bounds of ‖∇ℓ‖_T, ‖ℓ‖_T, shapes (n,).
         reason: Why v is not admissible, if it isn't.
+        boundary: What v has to be on Γ0 and above on Γ1.
         cusps: What v has beyond vertices and bumps; None if nothing, then on all ranks.
+        thirds: Heights of the cubic functions of facets by facet dof, see `cubic`; or None.
     """
 
     vertices: FloatArray
     bumps: FloatArray
     excess: FloatArray
     contact: FloatArray
-    lift: tuple[npt.NDArray[np.intp], FloatArray, FloatArray]
+    lift: Lifted
     reason: str | None
+    boundary: Boundary
     cusps: Cusps | None = None
+    thirds: FloatArray | None = None
+
+    def slopes(
+        self, cells: Cells, where: slice | npt.NDArray[np.intp]
+    ) -> Callable[[FloatArray], FloatArray]:
+        """∇(v − u_h) without cusps, as γ_i with ∇(v − u_h) = Σ γ_i ∇λ_i, as a function.
+
+        Args:
+            cells: The mesh.
+            where: Which cells.
+
+        Returns:
+            A function of a point's barycentric coordinates, shape (d + 1, 1) or (d + 1, n); its
+            values are of shape (d + 1, n).
+        """
+        excess, height, third = self.excess[:, where], None, None
+        if cells.tdim == 2:
+            height = self.bumps[cells.facets[:, where]]
+        if self.thirds is not None:
+            third = local_thirds(cells, self.thirds, where)
+
+        def at(hat: FloatArray) -> FloatArray:
+            gamma = excess if height is None else excess + bump_slopes(cells, height, hat)
+            return gamma if third is None else gamma + third_slopes(cells, third, hat)
+
+        return at
 
 
 def companion(
@@ -133,31 +165,56 @@ def companion(
                 cells, kappa, steady, w, (v, bumps), (loose, free), contact, (obstacle, middle)
             )
             excess = v[cells.vertices] - w
-    lifts = [
-        _lift(cells, data, v, bumps, scale, goal, obstacle)
-        for data, obstacle in ((u_D, False), (alpha, True))
-    ]
-    wrong += [lift.reason for lift in lifts]
-    # y·n is constant on a facet: the mean of v + ℓ − α
-    above = v[contact.ends].mean(axis=0) - lifts[1].least
-    if cells.tdim == 2:
-        above += 2.0 / 3.0 * bumps[contact.dofs]
-    above += lifts[1].beyond / measures(cells, contact)
-    words = [word for word in wrong if word]
+    boundary = Boundary(u_D, alpha, scale, goal)
+    above, lifts, reasons = boundary.lifted(cells, flux, v, bumps, np.zeros(len(u)))
+    words = [word for word in (*wrong, *reasons) if word]
     words = [word for rank in cells.comm.allgather(words) for word in rank]
-    return Companion(
-        v,
-        bumps,
-        excess,
-        np.where(flux.contact > 0, flux.contact * np.maximum(above, 0.0), 0.0),
-        (
-            np.concatenate([fixed.cells, contact.cells]),
-            np.concatenate([lift.steep for lift in lifts]),
-            np.concatenate([lift.area for lift in lifts]),
-        ),
-        words[0] if words else None,
-        cusps,
-    )
+    return Companion(v, bumps, excess, above, lifts, words[0] if words else None, boundary, cusps)
+
+
+@dataclass(frozen=True, eq=False)
+class Boundary:
+    """What v has to be on Γ0 and above on Γ1.
+
+    Attributes:
+        u_D: Values on Γ0, seen from the cells.
+        alpha: Obstacle on Γ1, seen from the cells.
+        scale: Size of the values.
+        goal: What ‖∇ℓ‖ need not be known better than.
+    """
+
+    u_D: OnFacets
+    alpha: OnFacets
+    scale: float
+    goal: float
+
+    def lifted(
+        self, cells: Cells, flux: Flux, v: FloatArray, bumps: FloatArray, thirds: FloatArray
+    ) -> tuple[FloatArray, Lifted, list[str | None]]:
+        """Bring what u_D and α have beyond v into the cells; collective.
+
+        Returns:
+            `Companion.contact`, `Companion.lift`, and why there are none.
+        """
+        fixed, contact = self.u_D.side(cells), self.alpha.side(cells)
+        lifts = [
+            _lift(cells, data, v, bumps, thirds, self.scale, self.goal, obstacle)
+            for data, obstacle in ((self.u_D, False), (self.alpha, True))
+        ]
+        # y·n is constant on a facet: the mean of v + ℓ − α
+        above = v[contact.ends].mean(axis=0) - lifts[1].least
+        if cells.tdim == 2:
+            above += 2.0 / 3.0 * bumps[contact.dofs]
+        above += lifts[1].beyond / measures(cells, contact)
+        return (
+            np.where(flux.contact > 0, flux.contact * np.maximum(above, 0.0), 0.0),
+            (
+                np.concatenate([fixed.cells, contact.cells]),
+                np.concatenate([lift.steep for lift in lifts]),
+                np.concatenate([lift.area for lift in lifts]),
+            ),
+            [lift.reason for lift in lifts],
+        )
 
 
 def _at_vertices(
@@ -392,6 +449,7 @@ def _lift(
     data: OnFacets,
     v: FloatArray,
     bumps: FloatArray,
+    thirds: FloatArray,
     scale: float,
     goal: float,
     obstacle: bool,
@@ -400,6 +458,7 @@ def _lift(
     side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
     if cells.tdim != 2:
         return affine(cells, side, trace, v[side.ends], ends, scale)
-    companion = Quadratic(v[side.ends], bumps[side.dofs])
-    base = Quadratic(ends, middle - ends.mean(axis=0)) if obstacle else companion
+    third = cells.ways[side.local, side.cells] * thirds[side.dofs]
+    companion = Cubic(v[side.ends], bumps[side.dofs], third)
+    base = Cubic(ends, middle - ends.mean(axis=0), third) if obstacle else companion
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

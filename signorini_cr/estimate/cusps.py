@@ -215,6 +215,8 @@ class Cusps:
         steeper = more + 2.0 * self._products(cells, np.repeat(w[None, :, at], len(slope), axis=0))
         P = flux.excess[:, at]
         through = self.hats * sum_rows(P) - P
+        if flux.beyond is not None:
+            through += np.stack([flux.beyond.through(cells, at, hat) for hat in self.hats])
         cross = np.einsum("q,qin,qin->n", self.weights, through, slope) / d
         sums.companion += float(np.sum(more))
         sums.cross += float(np.sum(cross))

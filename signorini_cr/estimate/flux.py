@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ..data.diffusion import diffusion
 from ..data.loads import Edge, Load
 from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
+from .beyond import Beyond
 
 if TYPE_CHECKING:
     from ..vi.level import Level
@@ -27,19 +28,21 @@ IntArray = npt.NDArray[np.intp]
 
 @dataclass(eq=False)
 class Flux:
-    """y ∈ H(div), a Raviart-Thomas field of lowest order.
+    """y ∈ H(div), a Raviart-Thomas field of lowest order, and what it has beyond on thin cells.
 
     Attributes:
         excess: Fluxes out of each cell of y − κ_T ∇u_h, shape (d + 1, cells), κ_T the mean of κ.
         contact: Fluxes through the facets of Γ1, not negative, shape (n,).
         touching: Whether the facet of Γ1 is in contact, shape (n,).
         left: ∫_T (f + div y), shape (cells,).
+        beyond: What y has beyond the Raviart-Thomas field; None where that is all.
     """
 
     excess: FloatArray
     contact: FloatArray
     touching: npt.NDArray[np.bool_]
     left: FloatArray
+    beyond: Beyond | None = None
 
 
 def equilibrate(

@@ -20,6 +20,7 @@ from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bump_squares, on_facet
 from .flux import Flux, field_squares
+from .shapes import local_thirds, quadrature
 from .sums import Sums
 
 FloatArray = npt.NDArray[np.float64]
@@ -45,12 +46,10 @@ def integrate(
         P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
         height = v.bumps[cells.facets[:, part]] if d == 2 else None
         around, beside = np.zeros((2, part.stop - part.start))
-        if kappa.values is None:
+        if kappa.values is None and flux.beyond is None:
             pp, bb, pb, vv = _exact(cells, kappa, part, P, c, W, height)
         else:
-            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(
-                cells, kappa, part, P, c, W, height
-            )
+            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(cells, kappa, part, flux, v, w)
             around += near
             beside += far
             sums.far += float(np.sum(far))
@@ -71,24 +70,38 @@ def integrate(
             if height is not None:
                 moment += dot_rows(bumps, height)
             fv += moment
-            square = poincare(d) ** 2 * cells.diameter2[part] * volume * load.variance[part]
+            left = load.variance if flux.beyond is None else load.rest
+            square = poincare(d) ** 2 * cells.diameter2[part] * volume * left[part]
             osc = square / pick(kappa.low, part)
             share += osc
-            against, slack = np.zeros_like(osc), np.zeros_like(osc)
-            if d == 2:
-                against = _against_potential(cells, P, s, hats, bumps, part)
-                against /= pick(kappa.mean, part)
-            else:
-                slack = np.sqrt(osc * pp)
-            if kappa.values is not None:
-                # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
-                slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
             sums.load += float(np.sum(osc))
-            sums.load_companion += float(np.sum(volume * moment))
-            sums.load_flux += float(np.sum(against))
-            sums.slack += float(np.sum(slack))
-            around += osc + 2.0 * (against + slack + volume * moment)
-            beside += osc + 2.0 * (against + slack - volume * moment)
+            if v.thirds is not None:
+                third = local_thirds(cells, v.thirds, part)
+                rise = 12.0 / 180.0 * np.stack([hats[j] - hats[k] for j, k in cells.others])
+                fv += dot_rows(third, rise)
+                off = volume * np.sqrt(left[part] / 840.0) * sum_rows(np.abs(third))
+                sums.energy_slack += float(np.sum(off))
+            if flux.beyond is not None:
+                far, near = _swollen(beside, osc), _swollen(around, osc)
+                sums.far += float(np.sum(far))
+                sums.near += float(np.sum(near))
+                around += osc + near
+                beside += osc + far
+            else:
+                against, slack = np.zeros_like(osc), np.zeros_like(osc)
+                if d == 2:
+                    against = _against_potential(cells, P, s, hats, bumps, part)
+                    against /= pick(kappa.mean, part)
+                else:
+                    slack = np.sqrt(osc * pp)
+                if kappa.values is not None:
+                    # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
+                    slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
+                sums.load_companion += float(np.sum(volume * moment))
+                sums.load_flux += float(np.sum(against))
+                sums.slack += float(np.sum(slack))
+                around += osc + 2.0 * (against + slack + volume * moment)
+                beside += osc + 2.0 * (against + slack - volume * moment)
         sums.flux += float(np.sum(pp))
         sums.companion += float(np.sum(bb))
         sums.cross += float(np.sum(pb))
@@ -127,7 +140,7 @@ def integrate_edge(
         This rank's share of the square of what goes into ω.
     """
     side, d = edge.side, cells.tdim
-    at, sizes = edge.oscillation()
+    at, sizes = edge.oscillation(flux.beyond is not None)
     low = pick(kappa.low, at)
     assert sums.indicators is not None
     assert sums.middle is not None and sums.across is not None
@@ -135,6 +148,14 @@ def integrate_edge(
     sums.neumann = float(np.sum(sizes**2 / low))
     if d != 2:
         return sums.neumann
+    if flux.beyond is not None:
+        sums.load += sums.neumann
+        far, near = (_swollen(row[at], sizes**2 / low) for row in (sums.across, sums.middle))
+        sums.far += float(np.sum(far))
+        sums.near += float(np.sum(near))
+        sums.across[at] += sizes**2 / low + far
+        sums.middle[at] += sizes**2 / low + near
+        return 0.0
     of_f: npt.NDArray[np.float64] = np.zeros(len(at))
     if load.variance is not None:
         square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
@@ -168,6 +189,11 @@ def integrate_edge(
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
     return 0.0
+
+
+def _swollen(squares: FloatArray, more: FloatArray) -> FloatArray:
+    """What (a + b)² is at most above a² + b², a² and b² given."""
+    return 2.0 * np.sqrt(np.maximum(squares, 0.0) * more)
 
 
 def _twist(
@@ -228,46 +254,42 @@ def _exact(
 
 
 def _by_quadrature(
-    cells: Cells,
-    kappa: Coefficient,
-    part: slice,
-    P: FloatArray,
-    c: FloatArray,
-    W: FloatArray,
-    height: FloatArray | None,
+    cells: Cells, kappa: Coefficient, part: slice, flux: Flux, v: Companion, w: FloatArray
 ) -> tuple[FloatArray, ...]:
-    """The same for any κ, and how far it may be from the truth.
+    """The same for any κ and any y, and how far it may be from the truth.
 
     Returns:
         ∫_T of |p|², |b|², p·b and κ|∇v|²; and bounds of what quadrature may miss of ∫_T |p − b|²,
         ∫_T |p + b|² and ½∫_T κ|∇v|².
     """
-    values, cut = kappa.values, kappa.cut
-    assert values is not None and cut is not None
-    rule, mean = kappa.rule, kappa.mean
+    values, cut, mean = kappa.values, kappa.cut, kappa.mean
+    if values is None or cut is None:
+        exact = ((pick(mean, part), weight, hat) for hat, weight in zip(*quadrature(), strict=True))
+        rows = _at_points(cells, mean, part, flux, v, w, exact)
+        return *rows[:4], *np.zeros((3, part.stop - part.start))
+    rule = kappa.rule
     points = zip(values[:, part], rule.weights, rule.hats.T, strict=True)
-    rows = _at_points(cells, mean, part, P, c, W, height, points)
-    rows = _with_slack(rows, cut.errors[:, part], cells.tdim)
+    rows = _at_points(cells, mean, part, flux, v, w, points)
+    largest = (3 if flux.beyond is None else 6) ** 2 if cells.tdim == 2 else (cells.tdim + 1) ** 2
+    rows = _with_slack(rows, cut.errors[:, part], cells.tdim, largest)
     first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
     if first < last:
         pieces, within = cut.pieces[np.arange(first, last)], cut.errors_inside[:, first:last]
-        at = pieces.parent - part.start
         hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
         points = zip(kappa.inside[:, first:last], rule.weights, hats, strict=True)
-        of_cell = P[:, at], c[:, at], W[:, at], None if height is None else height[:, at]
-        there = _at_points(cells, mean, pieces.parent, *of_cell, points)
-        there = _with_slack(there, within, cells.tdim) * pieces.part
-        which, place = np.unique(at, return_inverse=True)
+        there = _at_points(cells, mean, pieces.parent, flux, v, w, points)
+        there = _with_slack(there, within, cells.tdim, largest) * pieces.part
+        which, place = np.unique(pieces.parent - part.start, return_inverse=True)
         rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
     return tuple(rows)
 
 
-def _with_slack(rows: FloatArray, errors: FloatArray, d: int) -> FloatArray:
+def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:
     """The first four rows, and what quadrature may miss; see `Coefficient.enclose` for the errors.
 
     With z = v or 2u_h − v it is the smaller of two bounds of what it misses of ∫ κ⁻¹|y − κ∇z|²:
     that of its three products, and what follows from ‖κ^{-1/2}(y − κ∇z)‖ ≤ N(y − κ∇z) + 2R N(∇z),
-    where N(·)² is 1 + t times the quadrature of κ⁻¹|·|².
+    where N(·)² is 1 + t times the quadrature of κ⁻¹|·|². |y|² is at most `largest` times its mean.
     """
     pp, bb, pb, vv, yy, *at_z = rows
     R, t, W, inverse_W, strip_low, strip_high, _ = errors
@@ -277,8 +299,8 @@ def _with_slack(rows: FloatArray, errors: FloatArray, d: int) -> FloatArray:
         square = np.maximum(pp + bb + sign * pb, 0.0)
         norm = (1.0 + t) * (np.sqrt(square) + 2.0 * R * np.sqrt(np.maximum(steep, 0.0))) ** 2
         # on strips κ may be what it is nowhere else, and an affine field (d + 1) times its norm
-        strips = strip_low * yy + strip_high * zz
-        slack.append(np.fmin(products, norm - square + 2.0 * (d + 1) ** 2 * strips))
+        strips = largest * strip_low * yy + (d + 1) ** 2 * strip_high * zz
+        slack.append(np.fmin(products, norm - square + 2.0 * strips))
     return np.stack([pp, bb, pb, vv, *slack, W * at_z[0]])
 
 
@@ -286,10 +308,9 @@ def _at_points(
     cells: Cells,
     mean: FloatArray,
     where: slice | npt.NDArray[np.intp],
-    P: FloatArray,
-    c: FloatArray,
-    W: FloatArray,
-    height: FloatArray | None,
+    flux: Flux,
+    v: Companion,
+    w: FloatArray,
     points: Iterable[tuple[FloatArray, float, FloatArray]],
 ) -> FloatArray:
     """Means over points of |T| times what the gap is made of.
@@ -297,31 +318,30 @@ def _at_points(
     It is |p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and κ⁻¹|∇z|² for z = v and z = 2u_h − v.
 
     At a point with barycentric coordinates λ_k, y − κ_T∇u_h = Σ Q_k X_k / (d |T|) with
-    Q_k = λ_k ΣP − P_k, and ∇(v − u_h) = Σ γ_k ∇λ_k with γ_k = c_k + 4 Σ_l height_l λ_m, where
-    k, l, m are the three vertices. As Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
+    Q_k = λ_k ΣP − P_k plus what y has beyond, and ∇(v − u_h) = Σ γ_k ∇λ_k with
+    γ_k = c_k + 4 Σ_l height_l λ_m, where k, l, m are the three vertices, plus what v has beyond. As
+    Σ Q_k = 0, (Σ Q_k X_k)·∇λ_i = Q_i.
 
     Args:
         cells: The mesh.
         mean: κ_T.
         where: Which cells.
-        P: Fluxes of y − κ_T∇u_h out of the cells.
-        c: v − u_h at the vertices.
-        W: u_h at the vertices.
-        height: Heights of v's bumps.
+        flux: y.
+        v: v.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
         points: κ, a weight, and the point's barycentric coordinates, shape (d + 1,) or (d + 1, n).
     """
     d, mean, volume = cells.tdim, pick(mean, where), cells.volume[where]
+    P, W, slopes = flux.excess[:, where], w[:, where], v.slopes(cells, where)
     s = sum_rows(P)
     gg = dot_rows(W, cells.apply(W, where))
     rows = np.zeros((9, len(volume)))
     for k, weight, hat in points:
         hat = hat.reshape(len(hat), -1)
         Q = hat * s - P
-        gamma = c.copy()
-        if height is not None:
-            for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
-                gamma[i] += 4.0 * hat[m] * height[j]
-                gamma[j] += 4.0 * hat[m] * height[i]
+        if flux.beyond is not None:
+            Q += flux.beyond.through(cells, where, hat)
+        gamma = slopes(hat)
         qq = np.zeros_like(s)
         for (i, j), length in zip(cells.pairs, cells.lengths[:, where], strict=True):
             qq -= Q[i] * Q[j] * length

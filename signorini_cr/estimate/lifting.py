@@ -1,6 +1,6 @@
-"""What u_D and α have beyond quadratics on boundary facets, enclosed and lifted into the cells.
+"""What u_D and α have beyond v on boundary facets, enclosed and lifted into the cells.
 
-δ is u_D − v on Γ0, and (α − α_I)⁺ on Γ1, where α_I ≤ v is the quadratic that α is interpolated by.
+δ is u_D − v on Γ0, and (α − α_I)⁺ on Γ1, where α_I ≤ v is the polynomial that α is interpolated by.
 It vanishes at the facets' ends, and ℓ(P + t(z − P)) = t^k δ(z) brings it into the cell, P opposite
 the facet. What is needed are bounds of |δ| and |δ'|, piece by piece; k is the best for them.
 """
@@ -36,31 +36,36 @@ JUMP = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Quadratic:
-    """Quadratic polynomials on facets, (1 − s) a + s b + 4 s (1 − s) height for 0 ≤ s ≤ 1.
+class Cubic:
+    """Cubic polynomials on facets.
+
+    For 0 ≤ s ≤ 1 they are (1 − s) a + s b + 4 s (1 − s) height + s (1 − s) (1 − 2s) third.
 
     Attributes:
         ends: a and b, shape (2, n).
         height: Shape (n,).
+        third: Shape (n,).
     """
 
     ends: FloatArray
     height: FloatArray
+    third: FloatArray
 
     def at(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
         """Values at s on some facets."""
         a, b = self.ends[:, which]
-        return a + s * (b - a) + 4.0 * s * (1.0 - s) * self.height[which]
+        bend = 4.0 * self.height[which] + (1.0 - 2.0 * s) * self.third[which]
+        return a + s * (b - a) + s * (1.0 - s) * bend
 
     def slope(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
         """Derivative in s."""
         a, b = self.ends[:, which]
-        return b - a + 4.0 * (1.0 - 2.0 * s) * self.height[which]
+        bend = 4.0 * (1.0 - 2.0 * s) * self.height[which]
+        return b - a + bend + (1.0 - 6.0 * s * (1.0 - s)) * self.third[which]
 
-    @property
-    def mean(self) -> FloatArray:
-        """Mean over the facet, shape (n,)."""
-        return self.ends.mean(axis=0) + 2.0 / 3.0 * self.height
+    def bend(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
+        """Half the second derivative in s."""
+        return (6.0 * s - 3.0) * self.third[which] - 4.0 * self.height[which]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +91,13 @@ def lift(
     cells: Cells,
     side: Side,
     trace: Trace,
-    base: Quadratic,
-    v: Quadratic,
+    base: Cubic,
+    v: Cubic,
     scale: float,
     goal: float,
     obstacle: bool,
 ) -> Lift:
-    """Enclose data less a quadratic, and bound the lifting; collective.
+    """Enclose data less a polynomial, and bound the lifting; collective.
 
     Args:
         cells: The mesh, of triangles.
@@ -166,7 +171,7 @@ def lift(
 def _bounds(
     trace: Trace,
     pieces: Pieces,
-    base: Quadratic,
+    base: Cubic,
     cells: Cells,
     length: FloatArray,
     scale: float,
@@ -184,19 +189,20 @@ def _bounds(
     there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(trace.deviation.expression)
     c, m = _balls(over, len(at)), _balls(there, len(at))
     slope = base.slope(at, s) / length[at]
-    bend = -4.0 * base.height[at] / length[at] ** 2
+    bend = base.bend(at, s) / length[at] ** 2
+    cube = 2.0 * base.third[at] / length[at] ** 3
     with np.errstate(invalid="ignore"):
         first = np.abs(m[1][0] - slope) + m[1][1]
         by_order = (
-            np.abs(c[1][0] - slope) + c[1][1] + 2.0 * e * np.abs(bend),
-            first + 2.0 * e * (np.abs(c[2][0] - bend) + c[2][1]),
+            np.abs(c[1][0] - slope) + c[1][1] + e * (2.0 * np.abs(bend) + 3.0 * e * np.abs(cube)),
+            first + 2.0 * e * (np.abs(c[2][0] - bend) + c[2][1] + 3.0 * e * np.abs(cube)),
             first
             + 2.0 * e * (np.abs(m[2][0] - bend) + m[2][1])
-            + 3.0 * e**2 * (np.abs(c[3][0]) + c[3][1]),
+            + 3.0 * e**2 * (np.abs(c[3][0] - cube) + c[3][1]),
         )
         steep = np.where(np.isnan(d := np.fmin.reduce(by_order)), np.inf, d)
         ends = np.stack([base.at(at, t) for t in (*pieces.hats[:, 1], s)])
-        swing = np.abs(bend) * e**2
+        swing = np.abs(bend) * e**2 + np.abs(cube) * e**3
         above = over.high - ends.min(axis=0) + swing
         below = ends.max(axis=0) - over.low + swing
         middle = m[0][0] - ends[2]
@@ -224,7 +230,7 @@ def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def _jump_at_ends(
-    trace: Trace, whole: Pieces, base: Quadratic, cells: Cells, jump: float, obstacle: bool
+    trace: Trace, whole: Pieces, base: Cubic, cells: Cells, jump: float, obstacle: bool
 ) -> npt.NDArray[np.bool_]:
     """Where δ does not vanish at a facet's end: the data's limit there is not the value there."""
     found = np.zeros(len(whole.parent), dtype=bool)

@@ -25,7 +25,7 @@ from ..options import AMG
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-SHARE = 1e-6
+SHARE = 1e-10
 """Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on
 any number of ranks."""
 

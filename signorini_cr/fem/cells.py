@@ -132,6 +132,24 @@ class Cells:
         return self.lengths.max(axis=0)
 
     @cached_property
+    def turns(self) -> FloatArray:
+        """1 for triangles whose vertices turn left, −1 for others, shape (cells,)."""
+        x = self.domain.mesh.geometry.x[compat.cell_nodes(self.domain.mesh)[: self.number]]
+        (a, b), (c, d) = (x[:, 1:, :2] - x[:, :1, :2]).transpose(1, 2, 0)
+        return np.where(a * d > b * c, 1.0, -1.0)
+
+    @cached_property
+    def ways(self) -> FloatArray:
+        """1 where a triangle goes along its facet as its neighbour does, shape (3, cells).
+
+        That is from the end with the lower local number to the other; −1 on one of both sides where
+        they do not agree.
+        """
+        name = self.domain.mesh.topology.index_map(0).local_to_global
+        names = name(self.vertices.ravel().astype(np.int32)).reshape(self.vertices.shape)
+        return np.stack([np.where(names[j] < names[k], 1.0, -1.0) for j, k in self.others])
+
+    @cached_property
     def sides(self) -> dict[int, Side]:
         """Boundary facets of owned cells."""
         sides = {}

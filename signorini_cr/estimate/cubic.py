@@ -1,0 +1,95 @@
+"""Cubic functions of facets for v on thin cells.
+
+What u_D and α have beyond quadratics has to fall off within a cell's height, which is dear where
+cells are thin. There v gets a function c_F = λ_j λ_k (λ_j − λ_k) for each facet. On Γ0 and Γ1 their
+heights are those of the data's best cubics, on Γg they are 0; the others are what brings ∇v nearest
+to ∇u_h, by conjugate gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from ..data.moments import OnFacets
+from ..fem.cells import Cells, blocks, dot_rows, pick
+from .companion import Companion
+from .flux import Flux
+from .lifting import Cubic
+from .shapes import best_heights, local_thirds, quadrature, third_slopes
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companion:
+    """Give v cubic functions; collective.
+
+    Args:
+        cells: The mesh, d = 2.
+        kappa: κ, constant on each cell, shape (cells,) or ().
+        flux: y.
+        v: Without cusps.
+    """
+    boundary, thirds = v.boundary, np.zeros(len(cells.exterior))
+    for data in (boundary.u_D, boundary.alpha):
+        side = data.side(cells)
+        thirds[side.dofs] = cells.ways[side.local, side.cells] * _of_data(data)
+    cells.share(thirds)
+    thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
+    contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)
+    words = [word for rank in cells.comm.allgather(reasons) for word in rank if word]
+    reason = v.reason or (words[0] if words else None)
+    return replace(v, thirds=thirds, contact=contact, lift=lift, reason=reason)
+
+
+def with_thirds(cells: Cells, v: fem.Function, thirds: FloatArray) -> fem.Function:
+    """A function of degree 2 plus the cubic functions with some heights; collective."""
+    mesh = cells.domain.mesh
+    pieces = fem.Function(fem.functionspace(mesh, ("DG", 3)))
+    pieces.interpolate(v)
+    points = pieces.function_space.element.interpolation_points
+    points = points() if callable(points) else points
+    hats = np.column_stack([1.0 - points.sum(axis=1), points])
+    values = np.stack(
+        [hats[:, j] * hats[:, k] * (hats[:, j] - hats[:, k]) for j, k in cells.others]
+    )
+    dofs = pieces.function_space.dofmap.list[: cells.number]
+    pieces.x.array[dofs] += local_thirds(cells, thirds, slice(0, cells.number)).T @ values
+    pieces.x.scatter_forward()
+    cubic = fem.Function(fem.functionspace(mesh, ("Lagrange", 3)))
+    cubic.interpolate(pieces)
+    return cubic
+
+
+def _of_data(data: OnFacets) -> FloatArray:
+    """Heights of c_F in the data, as seen from the facets' cells, shape (n,)."""
+    trace, ends, middle, inside = data.trace, data.ends, data.middle, data.inside
+    n = len(middle)
+    quadratic = Cubic(ends, middle - ends.mean(axis=0), np.zeros(n))
+    first, second = trace.hats.T
+    cubic = first * second * (first - second)
+    size = trace.weights @ cubic**2
+    if not size > 0.0:
+        return np.zeros(n)
+    rest = inside - np.stack([quadratic.at(np.arange(n), np.full(n, s)) for s in second])
+    return np.asarray((trace.weights * cubic) @ rest / size)
+
+
+def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> FloatArray:
+    """What brings ∇v nearest to ∇u_h, to be added to the heights of inner facets; collective."""
+    hats, weights = quadrature()
+    matrix, pull = np.zeros((3, 3, cells.number)), np.zeros((3, cells.number))
+    for part in blocks(cells.number):
+        slopes, signs = v.slopes(cells, part), cells.ways[:, part]
+        for hat, weight in zip(hats[:, :, None], weights, strict=True):
+            off = slopes(hat)
+            each = [third_slopes(cells, signs * row[:, None], hat) for row in np.eye(3)]
+            for i, own in enumerate(each):
+                flow = weight * pick(kappa, part) * cells.apply(own, part)
+                pull[i, part] -= dot_rows(flow, off)
+                for j, other in enumerate(each):
+                    matrix[i, j, part] += dot_rows(flow, other)
+    return best_heights(cells, matrix, pull, ~cells.exterior)

@@ -1,0 +1,108 @@
+"""What y gains on thin cells, where fluxes that are constant on facets cannot follow κ∇u.
+
+y gets the curl of a continuous function ω, which changes no divergence, and on each cell a field τ
+without normal components that carries the affine part of f − f_T. ω is made of the bumps of facets;
+their heights are those that bring y + τ + curl ω nearest to κ∇(u_h + v)/2, the middle of what the
+bound is made of. On Γ1 they are 0, so that y·n stays what it is there; on Γg they are such that y·n
+is the affine function nearest to g. `docs/certificate.md`
+has the mathematics.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..data.loads import Load, Segments
+from ..fem.cells import Cells, blocks, measures, pick
+from .beyond import Beyond
+from .companion import Companion
+from .flux import Flux, field_squares
+from .nearest import Slopes, nearest
+from .shapes import quadrature
+from .sums import Sums
+
+FloatArray = npt.NDArray[np.float64]
+
+THIN = 25.0
+"""h_T²/|T| of cells from which on they are thin: 2.3 if all sides are equal, 4 for half a square,
+20 for half a rectangle 1 : 10."""
+
+HELD = 0.1
+"""Part of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖² that ‖p‖² on thin cells must make up."""
+
+
+def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
+    """Whether y on thin cells makes up much of the bound; collective.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        flux: y.
+        sums: The parts of the bound with y as it is.
+    """
+    if cells.tdim != 2:
+        return False
+    assert sums.indicators is not None
+    thin = np.flatnonzero(cells.diameter2 > THIN * cells.volume)
+    squares = field_squares(cells, flux.excess[:, thin], thin) / pick(kappa, thin)
+    there, whole = cells.total(np.sum(squares), np.sum(sums.indicators))
+    return bool(there > HELD * whole)
+
+
+def improve(
+    cells: Cells, kappa: FloatArray, load: Load, edge: Segments, flux: Flux, v: Companion
+) -> None:
+    """Give y the curl and τ; collective.
+
+    Args:
+        cells: The mesh, d = 2.
+        kappa: Mean of κ, shape (cells,) or ().
+        load: Moments of f.
+        edge: Values of g.
+        flux: y, changed in place.
+        v: v; its cusps do not count.
+    """
+    rise = None if load.hats is None else 12.0 * load.hats
+    given, held = np.zeros((2, len(cells.exterior)))
+    # ω = 4 height λ_j λ_k has the slope 4 height (λ_j − λ_k)/|F|; to the left of the facet's normal
+    # it goes from j to k, but for the facet 1 of cells whose vertices turn left
+    side = edge.facets
+    left = np.where(side.local == 1, -1.0, 1.0) * cells.turns[side.cells]
+    given[side.dofs] = left * edge.slope * measures(cells, side) / 4.0
+    for known in (v.boundary.alpha.side(cells), side):
+        held[known.dofs] = 1.0
+    given, free = cells.share(given), cells.share(held) == 0.0
+    flux.beyond = Beyond(given, rise)
+    slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa, flux, v), np.zeros(0))
+    none = np.zeros(len(v.vertices), dtype=bool)
+    _, heights = nearest(cells, np.asarray(1.0 / kappa), slopes, none, free)
+    flux.beyond = Beyond(np.where(free, heights, given), rise)
+
+
+def _pull(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> FloatArray:
+    """−∫ κ⁻¹ (y − κ∇(u_h + v)/2)·curl b_i on each cell, shape (3, cells).
+
+    With V = Σ Q_i X_i/(2|T|), Σ Q_i = 0, and a, b the vertices before and after k,
+    V·curl λ_k = ((Q_a − Q_b) |X_a − X_b|² + Q_k (|X_b − X_k|² − |X_a − X_k|²)) / (8|T|²) if the
+    vertices turn left, else the negative of that.
+    """
+    hats, weights = quadrature()
+    pull = np.zeros((3, cells.number))
+    for part in blocks(cells.number):
+        k, P, volume = pick(kappa, part), flux.excess[:, part], cells.volume[part]
+        slopes = v.slopes(cells, part)
+        opposite = dict(zip(cells.pairs, cells.lengths[:, part], strict=True))
+        lengths = [opposite[1, 2], opposite[0, 2], opposite[0, 1]]
+        for hat, weight in zip(hats[:, :, None], weights, strict=True):
+            Q = hat * P.sum(axis=0) - P - k * cells.apply(slopes(hat), part)
+            if flux.beyond is not None:
+                Q += flux.beyond.through(cells, part, hat)
+            along = [
+                (Q[a] - Q[b]) * lengths[m] + Q[m] * (lengths[a] - lengths[b])
+                for m, a, b in ((0, 2, 1), (1, 0, 2), (2, 1, 0))
+            ]
+            scale = -0.5 * weight * cells.turns[part] / (k * volume)
+            for i, (a, b) in enumerate(cells.others):
+                pull[i, part] += scale * (hat[a] * along[b] + hat[b] * along[a])
+    return pull

@@ -1,0 +1,77 @@
+"""Functions of facets on triangles: bumps b_F = 4 λ_j λ_k, and c_F = λ_j λ_k (λ_j − λ_k)."""
+
+from __future__ import annotations
+
+import basix
+import numpy as np
+import numpy.typing as npt
+
+from ..fem.cells import Cells
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+STEPS = 200
+"""Of conjugate gradients, at most."""
+SHARE = 1e-20
+"""Square of the part of the way that is left when they stop: the same on any number of ranks."""
+
+
+def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
+    """Numbers γ_k with ∇ Σ height_i b_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    gamma = np.zeros_like(height)
+    for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
+        gamma[i] += 4.0 * hat[m] * height[j]
+        gamma[j] += 4.0 * hat[m] * height[i]
+    return gamma
+
+
+def third_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
+    """Numbers γ_k with ∇ Σ height_i c_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    gamma = np.zeros_like(height)
+    for i, (j, k) in enumerate(cells.others):
+        both = 2.0 * hat[j] * hat[k]
+        gamma[j] += (both - hat[k] ** 2) * height[i]
+        gamma[k] += (hat[j] ** 2 - both) * height[i]
+    return gamma
+
+
+def local_thirds(cells: Cells, thirds: FloatArray, where: slice | IntArray) -> FloatArray:
+    """Heights of the c_i of each cell from those of the facets, shape (3, n)."""
+    return np.asarray(cells.ways[:, where] * thirds[cells.facets[:, where]])
+
+
+def quadrature() -> tuple[FloatArray, FloatArray]:
+    """Points and weights of a rule that is exact for |y|², shapes (q, 3) and (q,)."""
+    points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
+    return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
+
+
+def best_heights(
+    cells: Cells, matrix: FloatArray, pull: FloatArray, free: npt.NDArray[np.bool_]
+) -> FloatArray:
+    """Heights that minimise a quadratic functional, by conjugate gradients; collective.
+
+    Args:
+        cells: The mesh.
+        matrix: The cells' shares of the matrix, shape (3, 3, cells).
+        pull: Those of the right side, shape (3, cells).
+        free: Which heights need not be 0, by facet dof.
+    """
+    down = cells.over_facets(pull) * free
+    weight = cells.over_facets(np.stack([matrix[i, i] for i in range(3)]))
+    weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
+    owned, heights = slice(cells.owned_facets()), np.zeros_like(down)
+    way = down / weight
+    first = square = cells.total(down[owned] @ way[owned])[0]
+    for _ in range(STEPS):
+        if not square > SHARE * first:
+            break
+        image = cells.over_facets(np.einsum("ijn,jn->in", matrix, way[cells.facets])) * free
+        length = square / cells.total(way[owned] @ image[owned])[0]
+        heights += length * way
+        down -= length * image
+        straight = down / weight
+        before, square = square, cells.total(down[owned] @ straight[owned])[0]
+        way = straight + square / before * way
+    return heights
