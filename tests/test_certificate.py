@@ -21,12 +21,13 @@ from petsc4py import PETSc
 from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.ranges import range_of
+from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.estimate.force import force_bounds
 from signorini_cr.fem.cells import Cells
-from signorini_cr.fem.problem import Forms
-from signorini_cr.vi.assembly import Level
+from signorini_cr.multigrid.hierarchy import NestedMesh
+from signorini_cr.vi.level import Level
 
 WORLD = MPI.COMM_WORLD
 GOAL = 1.45
@@ -318,7 +319,7 @@ def test_residual_functional_is_bounded():
     V = fem.functionspace(mesh, ("Lagrange", 1))
     fixed = fem.locate_dofs_topological(V, 1, level.domain.tags.find(2))
     rng = np.random.default_rng(3)
-    alone = SimpleNamespace(domain=level.domain, V=level.V, coarser=None, parent_cell=None)
+    alone = SimpleNamespace(meshes=level.meshes[-1:])
     x = mesh.geometry.x[cell_nodes(mesh)[: cells.number]].mean(axis=1)
     for left in (cells.volume * np.sin(3 * x[:, 0]), rng.standard_normal(cells.number)):
         bounds = [unbalanced(which, cells, left, np.array(1.0)) for which in (level, alone)]
@@ -467,7 +468,7 @@ def test_three_dimensions():
     problem = Problem(
         exact=lambda x: (1 - x[0] ** 2) * (1 - x[1] ** 2) * (1 - x[2] ** 2), dirichlet=0.0
     )
-    level = Level(Forms(problem, mesh), domain)
+    level = Level((NestedMesh(Diffusion(problem, mesh), domain),))
     u = fem.Function(level.V)
     dense = level.system.A[:, :]  # nothing is in contact
     u.x.array[:] = np.linalg.solve(dense, level.system.b.x.array)

@@ -244,7 +244,7 @@ def test_a_tolerance_of_zero_ends_in_rounding(options):
 
 def test_a_smaller_tolerance_costs_no_newton_steps(options):
     usual = solve(PROBLEM, SQUARE.mesh(0.05))
-    options("snes_atol", 1e-12 * usual.level.system.load)
+    options("snes_atol", 1e-12 * usual.level.system.residual_scale)
     exact = solve(PROBLEM, SQUARE.mesh(0.05))
     assert exact.contact.kkt.residual <= 1e-12
     assert exact.iterations.newton == usual.iterations.newton
@@ -262,7 +262,7 @@ def test_monitor_sees_every_step():
     solution = solve(PROBLEM, SQUARE.mesh(0.05), monitor=lambda *facts: seen.append(facts))
     steps = [fact[1] for fact in seen]
     assert steps == list(range(solution.iterations.newton + 1))
-    assert seen[-1][2] <= 1e-8 * solution.level.system.load
+    assert seen[-1][2] <= 1e-8 * solution.level.system.residual_scale
     assert seen[-1][3] == solution.contact.number_active
     assert seen[-1][4] == solution.iterations.linear
     assert all(MPI.COMM_WORLD.bcast(fact) == fact for fact in seen)

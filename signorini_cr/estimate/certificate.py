@@ -18,11 +18,11 @@ import ufl
 from dolfinx import fem
 
 from .. import compat
+from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
-from ..data.moments import Coefficient, Sampled
+from ..data.moments import Coefficient
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from ..jit import compiled
-from ..mesh.domain import CONTACT
 from .beyond import Beyond
 from .companion import Companion, companion, on_facet
 from .cubic import cubed, with_thirds
@@ -33,7 +33,7 @@ from .gap import integrate, integrate_edge
 from .sums import Sums
 
 if TYPE_CHECKING:
-    from ..vi.assembly import Level
+    from ..vi.level import Level
     from ..vi.solved import Solved
 
 FloatArray = npt.NDArray[np.float64]
@@ -174,29 +174,29 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     level, u = base.level, base.u
     if base.element != "CR" or base.domain is not solution.domain:
         return Certificate(reason=NO_FLUX)
-    data = Sampled.of(level.forms)
-    if data.kappa is None:
+    data = diffusion(level.data)
+    if data.forms.uncertified is not None:
+        return Certificate(reason=data.forms.uncertified)
+    if data.compiled.kappa is None:
         return Certificate(reason=TENSOR)
-    cells, load, edge = level.cells, level.load, level.edge
-    kappa = Coefficient(data.kappa, cells)
+    cells, load, (edge,) = data.cells, data.load, data.edges
+    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.u_D, data.alpha))
+    kappa = Coefficient(data.compiled.kappa, cells)
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
     slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
-    contact_side = cells.sides[CONTACT]
-    obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
-    gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
-    flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
+    contact_side = alpha.side(cells)
+    gap = u.x.array[contact_side.dofs] - alpha.means
+    flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
     size = _size(cells, kappa, w, flux, slopes)
-    certain = Certain.of(data.f, load, cells, kappa.low, size)
+    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
     if certain.reason is not None:
-        level.tidy()
         return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
     flux.left += cells.volume * (certain.load.mean - load.mean)
     load = certain.load
     segments = Segments.of(edge, cells, kappa.low, size)
     if segments.reason is not None:
-        level.tidy()
         return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
     there = edge.side.local, edge.side.cells
     change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
@@ -216,9 +216,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         w = own
     steady = kappa.high - kappa.low <= STEADY * kappa.mean
     goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
-    v = companion(
-        cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps, steady, goal
-    )
+    v = companion(cells, kappa.mean, w, u.x.array, flux, u_D, alpha, sweeps, steady, goal)
     sums = integrate(cells, kappa, w, load, flux, v)
     if promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
@@ -258,7 +256,6 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
     lift_energy += hidden_energy + total["energy_slack"]
     lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    level.tidy()
     reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
     if reason is not None:
         return Certificate(reason=reason, seconds=time.perf_counter() - began)

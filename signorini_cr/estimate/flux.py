@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from ..data.diffusion import diffusion
 from ..data.loads import Edge, Load
-from ..fem.cells import Cells, blocks, pick, poincare, sum_rows
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN
+from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
 from .beyond import Beyond
 
 if TYPE_CHECKING:
-    from ..vi.assembly import Level
+    from ..vi.level import Level
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -46,7 +46,13 @@ class Flux:
 
 
 def equilibrate(
-    cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge: Edge, gap: FloatArray
+    cells: Cells,
+    kappa: FloatArray,
+    w: FloatArray,
+    load: Load,
+    edge: Edge,
+    on_contact: Side,
+    gap: FloatArray,
 ) -> Flux:
     """Find the facet fluxes of y from the local residuals of u_h.
 
@@ -61,7 +67,8 @@ def equilibrate(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f.
         edge: Integrals of g.
-        gap: u_h − α on the facets of Γ1, by means, shape (n,).
+        on_contact: The facets of Γ1.
+        gap: u_h − α on them, by means, shape (n,).
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
@@ -70,8 +77,7 @@ def equilibrate(
         shares = load.shares(cells, part)
         np.negative(shares, out=excess[:, part])
         fluxes[:, part] = -d * pick(kappa, part) * cells.apply(w[:, part], part) - shares
-    on_contact, on_neumann = cells.sides[CONTACT], cells.sides[NEUMANN]
-    through = edge.shares.sum(axis=0)
+    on_neumann, through = edge.side, edge.shares.sum(axis=0)
     for i, share in enumerate(edge.to_cells()):
         # the facet itself gets all of it further down
         share = np.where(on_neumann.local == i, 0.0, share)
@@ -112,10 +118,10 @@ def unbalanced(
         size: Of the bound, to which what is carried may be small.
     """
     volume, bound = cells.volume, 0.0
-    while level.coarser is not None and level.parent_cell is not None:
-        parent = level.parent_cell[: len(left)].astype(np.intp)
-        level = level.coarser
-        domain = level.domain
+    meshes = level.meshes
+    for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
+        assert mesh.parents is not None
+        parent, domain = mesh.parents.cell[: len(left)].astype(np.intp), coarser.domain
         d = domain.mesh.topology.dim
         number = domain.mesh.topology.index_map(d).size_local
         square, left, volume = (
@@ -130,8 +136,8 @@ def unbalanced(
         square = np.maximum(square - left**2 / volume, 0.0)
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
-    if level.domain is not cells.domain:
-        cells = level.cells  # kept: all finer meshes of a sequence ask for the same walk
+    if len(meshes) > 1:
+        cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
     return float(bound + _carried(cells, left, kappa_min, size))
 
 
@@ -224,7 +230,8 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     """
     d, owned = cells.tdim, cells.owned_facets()
     fixed = np.zeros(len(cells.exterior))
-    fixed[cells.sides[DIRICHLET].dofs] = 1.0
+    for part in cells.fixed:
+        fixed[cells.sides[part].dofs] = 1.0
     free = cells.share(fixed) == 0
 
     def residuals(z: FloatArray) -> FloatArray:
