@@ -11,14 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
-from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..data.moments import Sampled
 from ..errors import InputError, raise_together
 from ..fem.problem import Forms
-from ..fem.space import closure_dofs, facet_entities, ghosted_vector, shared_maximum
+from ..fem.space import closure_dofs, facet_entities, ghosted_vector, shared_maximum, shared_sum
 from ..garbage import release
 from ..mesh.domain import CONTACT, DIRICHLET, Domain
 from ..multigrid.constrained import ConstrainedMatrix
@@ -115,8 +114,7 @@ class System:
         self.b.x.array[:] = self.chi.x.array
         fem.apply_lifting(self.b.x.array, [a], [[bc]])
         for vector in (self.chi, self.b):
-            vector.x.scatter_reverse(InsertMode.add)
-            vector.x.scatter_forward()
+            shared_sum(comm, V.dofmap.index_map, vector.x.array)
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
         self.residual_scale = self._scale(bounded)
@@ -170,7 +168,9 @@ class System:
         ones.x.array[:] = 1.0
         bc = fem.dirichletbc(ones, self.dirichlet)
         fem.apply_lifting(sums.x.array, [self._a], [[bc]])
-        sums.x.scatter_reverse(InsertMode.add)
+        shared_sum(
+            sums.function_space.mesh.comm, sums.function_space.dofmap.index_map, sums.x.array
+        )
         sums.x.array[self.dirichlet] = 1.0
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
