@@ -26,7 +26,7 @@ from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from signorini_cr.mesh.refinement import refine, refine_marked
 from signorini_cr.multigrid import bottom
 from signorini_cr.multigrid.constrained import ConstrainedMatrix
-from signorini_cr.multigrid.cycle import BottomGrid, Multigrid, is_galerkin_product
+from signorini_cr.multigrid.cycle import Grid, Multigrid, is_galerkin_product
 from signorini_cr.multigrid.hierarchy import Hierarchy, NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout, Parents
 from signorini_cr.multigrid.smoothing import GaussSeidel
@@ -296,7 +296,7 @@ def test_the_same_solution_as_a_direct_solver(example, shift, squares, levels, o
     options("ksp_type", "preonly")
     options("pc_type", "lu")
     options("pc_factor_mat_solver_type", "mumps")
-    grid = BottomGrid(system.operator, Layout.of_space(V), system.owned_dirichlet)
+    grid = Grid(system.operator, Layout.of_space(V), system.owned_dirichlet)
     with system.vectors(u, r) as vectors:
         cold = solve_vi(Multigrid([grid]), vectors, system.residual_scale, tolerance=1e-13)
     assert cold.newton > 1
@@ -471,9 +471,9 @@ def test_a_coefficient_that_jumps_inside_coarse_cells(element, jump, options):
         transfer = prolongation(layout, Layout.of_space(level.V), level.parents)
         assert is_galerkin_product(cycle.grids[1], level.system.A, transfer)
     if element == "P1":
-        own = BottomGrid(below.system.operator, layout, below.system.owned_dirichlet)
+        own = Grid(below.system.operator, layout, below.system.owned_dirichlet)
     else:
-        own = BottomGrid(*conforming(below.meshes[-1]))
+        own = Grid(*conforming(below.meshes[-1]))
     assert not is_galerkin_product(own, level.system.A, transfer)
 
     options("pc_type", AMG)

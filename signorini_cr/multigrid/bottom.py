@@ -8,7 +8,7 @@ a handful of steps. On other cells it would need hundreds, and the matrix is fac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -76,8 +76,8 @@ class Bottom:
         self._stale |= comm.allreduce(not known, op=MPI.LOR)
         self._constrained = dofs
 
-    def solve(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Solve with the matrix as it is constrained now."""
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[object] = ()) -> None:
+        """Solve with the matrix as it is constrained now; nothing is below."""
         if self._pc is None:
             self._pc = PETSc.PC().create(self._matrix.getComm())
             self._pc.setOptionsPrefix(self._prefix)

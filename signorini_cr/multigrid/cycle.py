@@ -67,19 +67,36 @@ class Grid:
         operator: Its matrix, with the identity in the rows and columns of the dofs on Γ0.
         dofs: Its dofs.
         dirichlet: Its owned dofs on Γ0, local numbers.
+        transfer: What writes functions of the next coarser space in this one, None at the bottom.
         held: Owned dofs that are left out at present: those on Γ0, and the constrained ones.
     """
 
-    def __init__(self, operator: ConstrainedMatrix, dofs: Layout, dirichlet: IntArray):
-        """Note what it is made of.
+    def __init__(
+        self,
+        operator: ConstrainedMatrix,
+        dofs: Layout,
+        dirichlet: IntArray,
+        transfer: Transfer | None = None,
+        sweeps: int = SWEEPS,
+        alone: bool = False,
+    ):
+        """Prepare a space for the cycle; collective.
 
         Args:
             operator: Its matrix, the identity in the rows and columns of the dofs on Γ0.
             dofs: Its dofs.
             dirichlet: Its owned dofs on Γ0, local numbers.
+            transfer: What writes functions of the next coarser space in this one, if there is one.
+            sweeps: Number of Gauss-Seidel sweeps before and after.
+            alone: Whether this takes the place of a chain.
         """
         self.operator, self.dofs, self.dirichlet = operator, dofs, dirichlet
-        self.held = dirichlet
+        self.transfer, self._sweeps, self.held = transfer, sweeps, dirichlet
+        self.solver: Bottom | TwoGrids
+        if transfer is None:
+            self.solver = Bottom(self.matrix, dofs.cells.shape[1] - 1, alone)
+        else:
+            self.solver = TwoGrids(self.matrix, dofs, transfer, sweeps)
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -88,27 +105,25 @@ class Grid:
 
     @contextmanager
     def constrained(self, dofs: IntArray) -> Iterator[IntArray]:
-        """Leave dofs out for a block; collective at entry. Yields those that are constrained."""
-        with self.operator.constrained(dofs) as constrained:
-            self.held = np.concatenate([self.dirichlet, constrained])
-            try:
-                yield constrained
-            finally:
-                self.held = self.dirichlet
-
-    def coarse_support(self, dofs: IntArray) -> IntArray:
-        """The next coarser space's owned dofs whose functions don't vanish at given owned dofs."""
-        raise NotImplementedError
-
-    def cycle(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[Grid]) -> None:
-        """One V-cycle for A x = b, from x = 0; b is 0 in the dofs that are held.
+        """Leave dofs out for a block; collective at entry.
 
         Args:
-            b: Right-hand side.
-            x: The result.
-            below: The coarser spaces, finest first.
+            dofs: Owned dofs, local numbers; only those with a bound count.
+
+        Yields:
+            Owned dofs of the next coarser space whose functions don't vanish at those left out.
         """
-        raise NotImplementedError
+        with self.operator.constrained(dofs) as constrained:
+            self.held = np.concatenate([self.dirichlet, constrained])
+            self.solver.constrain(constrained)
+            try:
+                yield (
+                    constrained
+                    if self.transfer is None
+                    else self.transfer.coarse_support(constrained)
+                )
+            finally:
+                self.held = self.dirichlet
 
     def rounding(self, x: PETSc.Vec, constrained: IntArray) -> float:
         """Norm of the diagonal times x over the free dofs: what the residual's digits are lost in.
@@ -128,111 +143,43 @@ class Grid:
 
     def remade(self, matrix: PETSc.Mat) -> Grid:
         """The same space with another matrix; the transfer is shared, nothing else is."""
-        raise NotImplementedError
-
-    def free(self) -> None:
-        """Free everything but the matrix with what has been noted of it."""
-        raise NotImplementedError
-
-
-class BottomGrid(Grid):
-    """The coarsest space, or the only one."""
-
-    def __init__(
-        self,
-        operator: ConstrainedMatrix,
-        dofs: Layout,
-        dirichlet: IntArray,
-        alone: bool = False,
-    ):
-        """As for `Grid`; alone tells whether this takes the place of a chain."""
-        super().__init__(operator, dofs, dirichlet)
-        self.solver = Bottom(self.matrix, dofs.cells.shape[1] - 1, alone)
-
-    @contextmanager
-    def constrained(self, dofs: IntArray) -> Iterator[IntArray]:
-        """As for `Grid`."""
-        with super().constrained(dofs) as constrained:
-            self.solver.constrain(constrained)
-            yield constrained
-
-    def coarse_support(self, dofs: IntArray) -> IntArray:
-        """As for `Grid`: there is none."""
-        return dofs[:0]
-
-    def cycle(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[Grid]) -> None:
-        """As for `Grid`."""
-        self.solver.solve(b, x)
-
-    def remade(self, matrix: PETSc.Mat) -> BottomGrid:
-        """As for `Grid`."""
         operator = ConstrainedMatrix(matrix, self.operator.dofs)
-        return BottomGrid(operator, self.dofs, self.dirichlet)
-
-    def free(self) -> None:
-        """As for `Grid`."""
-        self.solver.free()
+        return Grid(operator, self.dofs, self.dirichlet, self.transfer, self._sweeps)
 
 
-class UpperGrid(Grid):
-    """A space with a coarser one below it.
+class TwoGrids:
+    """What a cycle does on a grid that has a coarser one below it."""
 
-    Attributes:
-        transfer: What writes functions of the coarser space in this one.
-    """
-
-    def __init__(
-        self,
-        operator: ConstrainedMatrix,
-        dofs: Layout,
-        dirichlet: IntArray,
-        transfer: Transfer,
-        sweeps: int = SWEEPS,
-    ):
-        """Prepare the sweeps; collective.
-
-        Args:
-            operator: As for `Grid`.
-            dofs: As for `Grid`.
-            dirichlet: As for `Grid`.
-            transfer: What writes functions of the coarser space in this one.
-            sweeps: Number of Gauss-Seidel sweeps before and after.
-        """
-        super().__init__(operator, dofs, dirichlet)
-        self.transfer, self._sweeps = transfer, sweeps
-        self._smoother = GaussSeidel(self.matrix, dofs, sweeps)
-        self._residual = self.matrix.createVecRight()
+    def __init__(self, matrix: PETSc.Mat, dofs: Layout, transfer: Transfer, sweeps: int):
+        """Prepare the sweeps, as for `Grid`; collective."""
+        self._matrix, self._transfer = matrix, transfer
+        self._smoother = GaussSeidel(matrix, dofs, sweeps)
+        self._residual = matrix.createVecRight()
         self._b_coarse, self._x_coarse = transfer.coarse_vector(), transfer.coarse_vector()
 
-    @contextmanager
-    def constrained(self, dofs: IntArray) -> Iterator[IntArray]:
-        """As for `Grid`."""
-        with super().constrained(dofs) as constrained:
-            self._smoother.constrain(constrained)
-            yield constrained
+    def constrain(self, dofs: IntArray) -> None:
+        """Note which owned dofs are constrained from now on."""
+        self._smoother.constrain(dofs)
 
-    def coarse_support(self, dofs: IntArray) -> IntArray:
-        """As for `Grid`."""
-        return self.transfer.coarse_support(dofs)
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[Grid]) -> None:
+        """One V-cycle for A x = b, from x = 0: smooth, correct in the coarser spaces, smooth.
 
-    def cycle(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[Grid]) -> None:
-        """As for `Grid`: smooth, correct in the coarser spaces, smooth."""
+        Args:
+            b: Right-hand side, 0 in the dofs that are held.
+            x: The result.
+            below: The coarser spaces, finest first.
+        """
         self._smoother.forward(b, x)
-        self.matrix.mult(x, self._residual)
+        self._matrix.mult(x, self._residual)
         self._residual.aypx(-1.0, b)
-        self.transfer.restrict(self._residual, self._b_coarse)
+        self._transfer.restrict(self._residual, self._b_coarse)
         self._b_coarse.array[below[0].held] = 0.0
-        below[0].cycle(self._b_coarse, self._x_coarse, below[1:])
-        self.transfer.add(self._x_coarse, x)
+        below[0].solver.solve(self._b_coarse, self._x_coarse, below[1:])
+        self._transfer.add(self._x_coarse, x)
         self._smoother.backward(b, x)
 
-    def remade(self, matrix: PETSc.Mat) -> UpperGrid:
-        """As for `Grid`."""
-        operator = ConstrainedMatrix(matrix, self.operator.dofs)
-        return UpperGrid(operator, self.dofs, self.dirichlet, self.transfer, self._sweeps)
-
-    def free(self) -> None:
-        """As for `Grid`; the transfer is the owner's to free."""
+    def free(self) -> None:  # "destroy" is what PETSc calls a context with
+        """Free everything but the matrix and the transfer."""
         self._smoother.free()
         release(self._residual, self._b_coarse, self._x_coarse)
 
@@ -256,7 +203,7 @@ class Multigrid:
         self.grids = list(grids)
         self.given_up = self._inherited = given_up
         self._on_one_mesh = on_one_mesh
-        self._replacement: BottomGrid | None = None
+        self._replacement: Grid | None = None
 
     @property
     def finest(self) -> Grid:
@@ -282,7 +229,7 @@ class Multigrid:
         """Leave the coarser spaces alone from now on, for BoomerAMG or a factorisation."""
         fine = self.finest
         held = np.setdiff1d(fine.held, fine.dirichlet)
-        self._replacement = BottomGrid(fine.operator, fine.dofs, fine.dirichlet, alone=True)
+        self._replacement = Grid(fine.operator, fine.dofs, fine.dirichlet, alone=True)
         self._replacement.solver.constrain(held)
         self.grids, self.given_up = [self._replacement], True
 
@@ -298,21 +245,21 @@ class Multigrid:
         """
         with ExitStack() as stack:
             for grid in self.grids if deep else self.grids[:1]:
-                dofs = grid.coarse_support(stack.enter_context(grid.constrained(dofs)))
+                dofs = stack.enter_context(grid.constrained(dofs))
             yield
 
     def apply(self, _: PETSc.PC | None, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """One V-cycle, as PETSc's preconditioner of type python."""
-        self.finest.cycle(b, x, self.grids[1:])
+        self.finest.solver.solve(b, x, self.grids[1:])
 
     def describe(self) -> str:
         """What the cycle is, in words."""
-        bottom = self.grids[-1]
-        assert isinstance(bottom, BottomGrid)
+        bottom = self.grids[-1].solver
+        assert isinstance(bottom, Bottom)
         if self.given_up:
             where = " on a coarser mesh" if self._inherited else ""
-            return bottom.solver.describe(f", as multigrid took {PATIENCE} CG steps{where}")
-        solver = bottom.solver.describe()
+            return bottom.describe(f", as multigrid took {PATIENCE} CG steps{where}")
+        solver = bottom.describe()
         if len(self.grids) == 1:
             return solver
         if self._on_one_mesh:
@@ -322,7 +269,7 @@ class Multigrid:
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what has taken the chain's place, if anything has; the chain is its owner's."""
         if self._replacement is not None:
-            self._replacement.free()
+            self._replacement.solver.free()
 
 
 def is_galerkin_product(grid: Grid, finer: PETSc.Mat, transfer: Transfer) -> bool:
@@ -367,6 +314,5 @@ def galerkin_products(chain: Sequence[Grid], finer: PETSc.Mat, transfer: Transfe
         # on Γ0 it holds rubbish, as the finer matrix has the identity there
         finer.zeroRowsColumns(numbers_of(finer, grid.dirichlet), 1.0)
         made.append(grid.remade(finer))
-        if isinstance(grid, UpperGrid):
-            transfer = grid.transfer
+        transfer = grid.transfer or transfer
     return made

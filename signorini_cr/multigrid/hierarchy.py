@@ -34,10 +34,8 @@ from .constrained import ConstrainedMatrix, numbers_of
 from .cycle import (
     LONG_SWEEPS,
     SWEEPS,
-    BottomGrid,
     Grid,
     Multigrid,
-    UpperGrid,
     galerkin_products,
     is_galerkin_product,
 )
@@ -112,7 +110,7 @@ class Hierarchy:
             dirichlet: Its owned dofs on Γ0, local numbers.
         """
         grid = self._discrete_space(operator, dirichlet)
-        below = self._chain if isinstance(grid, UpperGrid) else []
+        below = [] if grid.transfer is None else self._chain
         cycle = Multigrid(
             [grid, *reversed(below)],
             on_one_mesh=len(below) == len(self.meshes),
@@ -142,27 +140,27 @@ class Hierarchy:
         mesh = self.meshes[-1]
         dofs = Layout.of_space(mesh.V)
         if self._given_up or not (dofs.cr or mesh.parents):
-            return BottomGrid(operator, dofs, dirichlet, alone=self._given_up)
+            return Grid(operator, dofs, dirichlet, alone=self._given_up)
         while len(self._chain) < max(len(self.meshes) - 1, 1):
             self._add_conforming(self.meshes[len(self._chain)])
         below = self._chain[-1]
         if mesh.parents is None:
-            return UpperGrid(operator, dofs, dirichlet, inclusion(below.dofs, dofs))
+            return Grid(operator, dofs, dirichlet, inclusion(below.dofs, dofs))
         transfer = prolongation(below.dofs, dofs, mesh.parents)
         if not (mesh.physics.galerkin or is_galerkin_product(below, operator.matrix, transfer)):
             self._remake_chain(operator.matrix, transfer)
         sweeps = LONG_SWEEPS if dofs.cr else SWEEPS
-        return UpperGrid(operator, dofs, dirichlet, transfer, sweeps)
+        return Grid(operator, dofs, dirichlet, transfer, sweeps)
 
     def _add_conforming(self, mesh: NestedMesh) -> None:
         """Add P1 on the mesh that is the next finer one to the chain."""
         operator, dofs, dirichlet = conforming(mesh)
         self._operators.append(operator)
         if mesh.parents is None:
-            self._chain.append(BottomGrid(operator, dofs, dirichlet))
+            self._chain.append(Grid(operator, dofs, dirichlet))
         else:
             transfer = prolongation(self._chain[-1].dofs, dofs, mesh.parents)
-            self._chain.append(UpperGrid(operator, dofs, dirichlet, transfer))
+            self._chain.append(Grid(operator, dofs, dirichlet, transfer))
 
     @defaults(MATRICES, prefix="")
     def _remake_chain(self, finer: PETSc.Mat, transfer: Transfer) -> None:
@@ -170,7 +168,7 @@ class Hierarchy:
         former = self._chain
         self._chain = galerkin_products(former[::-1], finer, transfer)[::-1]
         for grid in former:
-            grid.free()
+            grid.solver.free()
         self._free_operators()
         self._operators = [grid.operator for grid in self._chain]
 
@@ -183,8 +181,8 @@ class Hierarchy:
 
 def _free(grid: Grid) -> None:
     """Free a grid with the way from it to the next coarser one."""
-    grid.free()
-    if isinstance(grid, UpperGrid):
+    grid.solver.free()
+    if grid.transfer is not None:
         grid.transfer.free()
 
 

@@ -61,11 +61,11 @@ class Transfer:
         sizes = rows, coarse.local
         self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
         self._own = self._rows.createVecLeft()
-        self._marks = ghosted(coarse.mesh.comm, coarse.index_map, block=coarse.block)
 
     def coarse_vector(self) -> PETSc.Vec:
         """A vector for coarse functions, with room for ghosts."""
-        return self._marks.duplicate()
+        coarse = self._coarse
+        return ghosted(coarse.mesh.comm, coarse.index_map, block=coarse.block)
 
     def add(self, x_coarse: PETSc.Vec, x: PETSc.Vec) -> None:
         """Add a coarse function to x."""
@@ -86,12 +86,7 @@ class Transfer:
     def coarse_support(self, dofs: IntArray) -> IntArray:
         """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
         _, columns, values = rows_of(self._rows, dofs)
-        with self._marks.localForm() as local:
-            local.set(0.0)
-            local.array[columns[values != 0.0]] = 1.0
-        self._marks.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
-        # numpy is ten times as fast over truth values as over numbers
-        return np.flatnonzero(self._marks.array_r > 0.0).astype(np.int32)
+        return self._coarse.owned_among(columns[values != 0.0])
 
     def matrix(self) -> PETSc.Mat:
         """As a matrix of all ranks, for products."""
@@ -103,7 +98,7 @@ class Transfer:
 
     def free(self) -> None:
         """Free the rows."""
-        release(self._rows, self._own, self._marks)
+        release(self._rows, self._own)
 
 
 def _for_each_unknown(

@@ -68,10 +68,14 @@ class FullJacobian:
         """Make a matrix that has a size and nothing else."""
         sizes = [(index.getLocalSize(), PETSc.DECIDE) for index in (rows, columns)]
         sized = PETSc.Mat().createPython(sizes, comm=matrix.getComm())
-        sized.setPythonContext(object())
+        sized.setPythonContext(_Size())
         sized.setUp()
         sized.setOption(PETSc.Mat.Option.SPD, True)  # PETSc need not find that out
         return sized
+
+
+class _Size:
+    """The context of a matrix that nobody multiplies with."""
 
 
 class ReducedSolver:

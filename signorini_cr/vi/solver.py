@@ -118,8 +118,9 @@ def solve_vi(
         max(1.0, wanted / target),
     )
     test = NewtonTest(cycle, vectors.b, linear, stiffness, target)
+    things: tuple[PETSc.Object, ...] = ()
     try:
-        _prepare(snes, linear, stiffness, vectors, target)
+        things = _prepare(snes, linear, stiffness, vectors, target)
         snes.setConvergenceTest(lambda snes, step, norms: test(snes, step, norms[2]))
         _report(snes, linear, monitor)
         with explained():
@@ -133,7 +134,7 @@ def solve_vi(
             test.imbalance,
         )
     finally:
-        release(snes)
+        release(snes, *things)
         linear.free()
         stiffness.free()
     if reason < 0:
@@ -146,8 +147,8 @@ def solve_vi(
 
 def _prepare(
     snes: PETSc.SNES, linear: ReducedSolver, stiffness: Stiffness, vectors: Vectors, target: float
-) -> None:
-    """Tell SNES what to solve, and what solves its reduced systems."""
+) -> tuple[PETSc.Object, ...]:
+    """Tell SNES what to solve, and what solves its reduced systems; return what is to be freed."""
     snes.setOptionsPrefix(PREFIX)
     outer = snes.getKSP()
     outer.setOptionsPrefix(REDUCED_PREFIX)
@@ -171,7 +172,7 @@ def _prepare(
     upper = vectors.b.duplicate()
     upper.set(PETSc.INFINITY)
     snes.setVariableBounds(vectors.lower, upper)
-    release(jacobian, upper)  # SNES has taken hold of them
+    return outer, jacobian, upper
 
 
 def _report(snes: PETSc.SNES, linear: ReducedSolver, monitor: Monitor | None) -> None:

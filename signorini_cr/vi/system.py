@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
-from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -106,8 +105,7 @@ class System:
         self.b.x.array[:] = self.chi.x.array
         fem.apply_lifting(self.b.x.array, [a], [[bc]])
         for vector in (self.chi, self.b):
-            vector.x.scatter_reverse(InsertMode.add)
-            vector.x.scatter_forward()
+            layout.shared_sum(vector.x.array)
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
         self.residual_scale = self._scale(bounded)
@@ -189,7 +187,7 @@ class System:
         fem.apply_lifting(sums.x.array, [self._data.a], [[self._bc(ones)]])
         if (of_constants := self._data.of_constants()) is not None:
             sums.x.array[:] += of_constants
-        sums.x.scatter_reverse(InsertMode.add)
+        Layout.of_space(sums.function_space).shared_sum(sums.x.array)
         sums.x.array[self.dirichlet] = 1.0
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
