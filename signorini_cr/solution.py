@@ -39,6 +39,16 @@ class Solution:
     iterations: Iterations
     seconds: dict[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """A line; of the certificate only if it has been made, as making it is collective."""
+        contact, known = self.contact, self.__dict__.get("certificate")
+        line = (
+            f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
+            f"{contact.number} facets in contact, force {contact.force:.6g}"
+        )
+        bound = known and known.bound_h1
+        return line + (">" if bound is None else f", error at most {bound:.3g}>")
+
     @property
     def domain(self) -> Domain:
         """Mesh and boundary parts."""

@@ -69,6 +69,15 @@ class Certificate:
     seconds: float = 0.0
     _made: _Made | None = None
 
+    def __repr__(self) -> str:
+        """A line."""
+        if self.bound_h1 is None or self.energy is None:
+            return f"<Certificate: no bound, {self.reason}>"
+        low, high = self.energy
+        return (
+            f"<Certificate: error at most {self.bound_h1:.3g}, energy in [{low:.9g}, {high:.9g}]>"
+        )
+
     @cached_property
     def flux(self) -> fem.Function | None:
         """The flux y; collective.

@@ -9,8 +9,9 @@ with κ = 1 unless a coefficient is given.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -58,6 +59,17 @@ class Problem:
     exact: Data | None = None
     quadrature_degree: int = 4
     error_degree: int = 6
+
+    def __repr__(self) -> str:
+        """What differs from nothing, functions by their names."""
+        given = []
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if value is not each.default and value != each.default:
+                given.append(
+                    f"{each.name}={getattr(value, '__name__', None) or reprlib.repr(value)}"
+                )
+        return f"Problem({', '.join(given)})"
 
     def __post_init__(self) -> None:
         """Refuse degrees that Basix would stop the process for."""

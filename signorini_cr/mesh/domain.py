@@ -53,6 +53,13 @@ class Domain:
     mesh: Mesh
     tags: MeshTags
 
+    def __repr__(self) -> str:
+        """A line; the facets are those of this rank."""
+        cells = self.mesh.topology.index_map(self.mesh.topology.dim).size_global
+        facets = ", ".join(f"{len(self.facets(part))} {name}" for name, part in PARTS.items())
+        here = f" on rank {self.mesh.comm.rank}" if self.mesh.comm.size > 1 else ""
+        return f"<Domain: {cells} cells; facets{here}: {facets}>"
+
     def facets(self, part: int) -> npt.NDArray[np.int32]:
         """Local indices of the facets of one part that this rank owns.
 

@@ -91,6 +91,13 @@ class Contact:
     kkt: Kkt
     _table: dict[str, npt.NDArray] | None
 
+    def __repr__(self) -> str:
+        """A line."""
+        return (
+            f"<Contact: {self.number_active} of {self.number} facets, length {self.length:.6g}, "
+            f"force {self.force:.6g}>"
+        )
+
     @property
     def midpoints(self) -> FloatArray:
         """Midpoints of the facets, shape (n, 3)."""
