@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from .arrays import BoolArray, FloatArray, Int32Array
 from .errors import InputError, NotConverged
 from .fem.problem import Problem
 from .levels import LevelMonitor, solve_sequence
 from .mesh.domain import Domain
 from .mesh.refinement import refine_marked
 from .solution import Solution
-
-FloatArray = npt.NDArray[np.float64]
 
 RESOLUTION = 1e-11
 """Least diameter of a cell to be refined, in parts of the largest coordinate."""
@@ -62,7 +60,7 @@ def solve_adaptive(
     if levels is not None and levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
 
-    def step(solution: Solution) -> tuple[Domain, npt.NDArray[np.int32]] | None:
+    def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
         certificate = solution.certificate
         if certificate.bound_h1 is None or certificate.indicators is None:
             raise InputError(
@@ -90,7 +88,7 @@ def solve_adaptive(
         yield solution
 
 
-def _smallest(domain: Domain, marked: npt.NDArray[np.bool_]) -> float:
+def _smallest(domain: Domain, marked: BoolArray) -> float:
     """Least diameter of the marked cells, in parts of the largest coordinate; collective."""
     mesh = domain.mesh
     h = mesh.h(mesh.topology.dim, np.flatnonzero(marked).astype(np.int32))
@@ -98,7 +96,7 @@ def _smallest(domain: Domain, marked: npt.NDArray[np.bool_]) -> float:
     return mesh.comm.allreduce(float(h.min(initial=np.inf)), op=MPI.MIN) / largest
 
 
-def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> npt.NDArray[np.bool_]:
+def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> BoolArray:
     """Dörfler's marking: the largest indicators that make up a fraction of their sum; collective.
 
     The ranks agree on the value that separates them by bisection; cells that share this value to

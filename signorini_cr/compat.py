@@ -6,19 +6,18 @@ from typing import Any
 
 import basix
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import cpp, fem
 from dolfinx.mesh import CellType, Mesh
 from mpi4py import MPI
 
+from .arrays import FloatArray, Int32Array, Int64Array
 from .jit import compiled
 
-IntArray = npt.NDArray[np.int32]
 _TAG = 1998
 
 
-def cell_nodes(mesh: Mesh) -> IntArray:
+def cell_nodes(mesh: Mesh) -> Int32Array:
     """Rows of `mesh.geometry.x` for every local cell, shape (cells, nodes)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
@@ -32,7 +31,7 @@ def coordinate_map(mesh: Mesh) -> Any:
 
 
 def index_map(
-    comm: MPI.Comm, owned: int, ghosts: npt.NDArray[np.int64], owners: IntArray
+    comm: MPI.Comm, owned: int, ghosts: Int64Array, owners: Int32Array
 ) -> cpp.common.IndexMap:
     """Distribution of entities over the ranks; collective.
 
@@ -49,7 +48,7 @@ def index_map(
 
 
 def create_topology(
-    comm: MPI.Comm, cell_type: CellType, vertices: Any, cells: Any, corners: IntArray
+    comm: MPI.Comm, cell_type: CellType, vertices: Any, cells: Any, corners: Int32Array
 ) -> Any:
     """A C++ topology that knows its vertices and cells only.
 
@@ -85,7 +84,12 @@ def can_take_facets(comm: MPI.Comm) -> bool:
 
 
 def set_facets(
-    topology: Any, facets: Any, of_cells: IntArray, ends: IntArray, cells: IntArray, start: IntArray
+    topology: Any,
+    facets: Any,
+    of_cells: Int32Array,
+    ends: Int32Array,
+    cells: Int32Array,
+    start: Int32Array,
 ) -> None:
     """Give a topology its facets, where `can_take_facets` allows it.
 
@@ -104,7 +108,7 @@ def set_facets(
     topology.set_connectivity(cpp.graph.AdjacencyList_int32(cells, start), tdim - 1, tdim)
 
 
-def with_dofs(V: fem.FunctionSpace, cells: IntArray, index_map: Any) -> fem.FunctionSpace:
+def with_dofs(V: fem.FunctionSpace, cells: Int32Array, index_map: Any) -> fem.FunctionSpace:
     """The element of one space at work on the dofs of another, to assemble over cells only.
 
     Which entities the dofs belong to is still what V says.
@@ -128,9 +132,7 @@ def with_dofs(V: fem.FunctionSpace, cells: IntArray, index_map: Any) -> fem.Func
     return fem.FunctionSpace(V.mesh, V.ufl_element(), space)
 
 
-def compile_expression(
-    expression: Any, points: npt.NDArray[np.float64], mesh: Mesh
-) -> fem.Expression:
+def compile_expression(expression: Any, points: FloatArray, mesh: Mesh) -> fem.Expression:
     """Compile an expression for meshes of the same kind as one mesh.
 
     Newer versions insist that it depends on x, even if all that is left of it is a number.
@@ -159,7 +161,7 @@ class FacetExpression:
         mesh: The mesh that the expression was written for.
     """
 
-    def __init__(self, expression: Any, points: npt.NDArray[np.float64], mesh: Mesh):
+    def __init__(self, expression: Any, points: FloatArray, mesh: Mesh):
         """Compile the expression."""
         self._values = compile_expression(expression, points, mesh)
         x = ufl.SpatialCoordinate(mesh)
@@ -168,7 +170,7 @@ class FacetExpression:
         self._hats = np.column_stack([1.0 - points.sum(axis=1), points])
         self._corners = np.array(basix.topology(mesh.basix_cell())[-2])
 
-    def at(self, mesh: Mesh, entities: IntArray) -> npt.NDArray[np.float64]:
+    def at(self, mesh: Mesh, entities: Int32Array) -> FloatArray:
         """Evaluate on boundary facets of a mesh of the same kind.
 
         Args:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
-import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
+from .arrays import Int32Array
 from .diffusion import Diffusion
 from .errors import InputError, NotConverged
 from .fem.physics import Physics
@@ -84,7 +83,7 @@ def solve_levels(
     if levels > 1:
         check_refinable(domain.mesh)
 
-    def step(solution: Solution) -> tuple[Domain, npt.NDArray[np.int32]] | None:
+    def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
         return refine(solution.domain) if solution.level.number + 1 < levels else None
 
     yield from solve_sequence(problem, domain, step, element, monitor, nested)
@@ -93,7 +92,7 @@ def solve_levels(
 def solve_sequence(
     problem: Problem,
     domain: Domain,
-    step: Callable[[Solution], tuple[Domain, npt.NDArray[np.int32]] | None],
+    step: Callable[[Solution], tuple[Domain, Int32Array] | None],
     element: str = "CR",
     monitor: LevelMonitor | None = None,
     nested: bool = True,
@@ -120,7 +119,7 @@ def solve_sequence(
 def solve_physics(
     physics: Physics,
     domain: Domain,
-    step: Callable[[Solution], tuple[Domain, npt.NDArray[np.int32]] | None],
+    step: Callable[[Solution], tuple[Domain, Int32Array] | None],
     monitor: LevelMonitor | None = None,
     nested: bool = True,
 ) -> Iterator[Solution]:

@@ -7,15 +7,13 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
+from ..arrays import FloatArray, Int32Array
 from ..errors import InputError
 from ..fem.conditions import KINDS
 from ..mesh.domain import PARTS, Domain, part_name
 from .expressions import Expression
-
-Array = npt.NDArray[np.float64]
 
 USED_ON: dict[str, int | None] = {
     "data.coefficient": None,
@@ -67,7 +65,7 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     )
 
 
-def _points(domain: Domain, part: int | None, digits: int) -> Array:
+def _points(domain: Domain, part: int | None, digits: int) -> FloatArray:
     """Vertices and midpoints of the cells, or of the facets of one part, shape (n, 3).
 
     Rounded to so many digits after the point, because a mesh generator gets so many right: at
@@ -85,7 +83,7 @@ def _points(domain: Domain, part: int | None, digits: int) -> Array:
     return np.round(points, digits) + 0.0
 
 
-def _vertices(domain: Domain, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+def _vertices(domain: Domain, facets: Int32Array) -> Int32Array:
     """Geometry nodes of the facets' vertices, each once."""
     mesh = domain.mesh
     if len(facets) == 0:

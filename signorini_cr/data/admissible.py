@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx.mesh import Mesh, compute_midpoints, entities_to_geometry
 from mpi4py import MPI
 
+from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError
 from ..fem.cells import Cells, Side, corner_points
@@ -28,8 +28,6 @@ from .pointwise import EPS, evaluate
 if TYPE_CHECKING:
     from .moments import Trace
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 Complaint = tuple[tuple[float, ...], str]
 """Where, and what is wrong there."""
 
@@ -143,7 +141,7 @@ class _Values:
         self.tied = bool(ufl.algorithms.extract_coefficients(expression))
 
     def at(
-        self, points: FloatArray, cells: IntArray, error: float
+        self, points: FloatArray, cells: Int32Array, error: float
     ) -> tuple[FloatArray, FloatArray] | None:
         """Values and tolerances for their rounding, shapes of the points but for the last axis."""
         shape = points.shape[:-1]
@@ -165,8 +163,8 @@ class _Facets:
     """
 
     x: FloatArray
-    cells: IntArray
-    nodes: npt.NDArray[np.int64]
+    cells: Int32Array
+    nodes: Int64Array
 
     @classmethod
     def of(cls, domain: Domain, part: int) -> _Facets:
@@ -183,7 +181,7 @@ class _Facets:
         )
 
     @property
-    def paths(self) -> tuple[FloatArray, FloatArray, IntArray]:
+    def paths(self) -> tuple[FloatArray, FloatArray, Int32Array]:
         """Segments that every facet is looked at along: their ends and cells."""
         if self.x.shape[1] == 2:
             return self.x[:, 0], self.x[:, 1], self.cells
@@ -222,7 +220,7 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     scale = TOLERANCE * largest
     complaints = _between(u_D, fixed, scale, key) if u_D.tied else []
 
-    segment: npt.NDArray[np.intp] = np.repeat(np.arange(len(start)), pieces)
+    segment: IndexArray = np.repeat(np.arange(len(start)), pieces)
     length = np.linalg.norm(way, axis=1)
     longest = max(comm.allgather(float(length.max(initial=0.0)))) / pieces
     shortest = SHORTEST * error

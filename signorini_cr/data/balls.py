@@ -11,9 +11,9 @@ from functools import cache, cached_property
 from itertools import pairwise, product
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from ..arrays import FloatArray
+
 Rows = tuple[int, ...]
 """Places of coefficients in `indices`, in ascending order."""
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx.mesh import compute_midpoints
 from mpi4py import MPI
 
+from ..arrays import BoolArray, FloatArray, Int32Array
 from ..compat import cell_nodes
 from ..fem.conditions import Condition
 from ..fem.problem import Forms, number
@@ -18,7 +18,6 @@ from ..mesh.domain import Domain
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
 from .pointwise import evaluate
 
-FloatArray = npt.NDArray[np.float64]
 Found = tuple[FloatArray, FloatArray]
 """Values at points, and what rounding may have done to them."""
 
@@ -116,7 +115,7 @@ class _Solution:
         words = f"data.{key} is {{:.6g}}, but it asks for {{:.6g}}"
         return self._first(wrong, x, words, given, wanted)
 
-    def _facets(self, part: int) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
+    def _facets(self, part: int) -> tuple[FloatArray, Int32Array, FloatArray]:
         """Midpoints of facets, their cells and outward normals."""
         entities = facet_entities(self.mesh, self.domain.facets(part))
         corners, _ = facet_measures(self.mesh, self.domain.facets(part))
@@ -128,7 +127,7 @@ class _Solution:
         normal *= np.sign((normal * (middle - inside)).sum(axis=1))[:, None]
         return middle, cells, normal / np.linalg.norm(normal, axis=1)[:, None]
 
-    def _values(self, e: Any, x: FloatArray, cells: npt.NDArray[np.int32]) -> Found:
+    def _values(self, e: Any, x: FloatArray, cells: Int32Array) -> Found:
         """An expression at points; what can't be told is nan."""
         found = evaluate(e, x, self.precision, cells)
         if found is None:
@@ -136,7 +135,7 @@ class _Solution:
             return np.full(shape, np.nan), np.full(shape, np.nan)
         return found[0], SAFETY * found[1]
 
-    def _flux(self, x: FloatArray, cells: npt.NDArray[np.int32], n: FloatArray) -> Found:
+    def _flux(self, x: FloatArray, cells: Int32Array, n: FloatArray) -> Found:
         if self.slope is None:
             return np.zeros(len(x)), np.zeros(len(x))
         values, errors = self._values(self.slope, x, cells)
@@ -149,9 +148,7 @@ class _Solution:
         largest = float(values[np.isfinite(values)].max(initial=0.0))
         return float(self.mesh.comm.allreduce(largest, op=MPI.MAX))
 
-    def _first(
-        self, wrong: npt.NDArray[np.bool_], x: FloatArray, words: str, *found: Found
-    ) -> str | None:
+    def _first(self, wrong: BoolArray, x: FloatArray, words: str, *found: Found) -> str | None:
         complaints: list[Complaint] = []
         for i in np.flatnonzero(wrong):
             where = place(x[i], self.mesh)

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
 from .. import compat
+from ..arrays import FloatArray, Int32Array
 from ..fem.cells import Cells
 from ..fem.conditions import Condition
 from ..fem.physics import Imposed, OnMesh
@@ -19,9 +19,6 @@ from ..fem.space import facet_corners, facet_entities, function_space, vertex_va
 from ..mesh.domain import Domain
 from .loads import Edge, Load, chi
 from .moments import Compiled, OnFacets
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 
 
 class DiffusionOnMesh:
@@ -93,7 +90,7 @@ class DiffusionOnMesh:
         """a_h(1, ·) by dof, this rank's cells' share; None where it vanishes."""
         return None if self.forms.of_one is None else self._assembled(self.forms.of_one)
 
-    def conforming(self, cells: IntArray, index_map: Any) -> tuple[fem.Form, float]:
+    def conforming(self, cells: Int32Array, index_map: Any) -> tuple[fem.Form, float]:
         """Return a form whose matrix, times a number, is the P1 operator on this mesh.
 
         The function of CR that belongs to the facet opposite vertex i has −d times the gradient of
@@ -107,7 +104,7 @@ class DiffusionOnMesh:
         W = compat.with_dofs(function_space(mesh, "P1"), cells, index_map)
         return forms.a_p1.on(self.domain, [W, W]), 1.0
 
-    def at_vertices(self, u: fem.Function, facets: IntArray) -> FloatArray:
+    def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
         """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
         mesh = self.domain.mesh
         cells, local = facet_entities(mesh, facets).T

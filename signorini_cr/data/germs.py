@@ -15,16 +15,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from ufl import classes
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from .jets import SERIES, Boxes, Enclosure, Range, Unknown, mul, out, power_series, square_of
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.intp]
 
 SECTORS = 16
 """Sectors that the directions from a point into a triangle are divided into."""
@@ -345,7 +341,7 @@ def _is_positive(e: Any) -> bool:
 
 def first_inside(
     expression: Any, corners: FloatArray
-) -> tuple[FloatArray, IntArray, FloatArray] | None:
+) -> tuple[FloatArray, IndexArray, FloatArray] | None:
     """Find a point at which the expression may be singular and that is no vertex.
 
     Args:
@@ -411,7 +407,9 @@ def _candidates(expression: Any, corners: FloatArray) -> list[FloatArray]:
     return list(points[~np.broadcast_to(finite, len(points))])
 
 
-def _sectors(offset: FloatArray, tip: IntArray, exact: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _sectors(
+    offset: FloatArray, tip: IndexArray, exact: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """Bounds of the unit vectors that point from a point into simplices.
 
     Args:

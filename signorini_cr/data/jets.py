@@ -15,7 +15,6 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from ufl import classes
@@ -24,11 +23,10 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.algorithms.expand_indices import expand_indices
 
 from .. import compat
+from ..arrays import BoolArray, FloatArray, IndexArray
 from .balls import EPS, LOOSE, NONE, ORDER, Balls, Factor, Rows, indices, middle, union
 from .pointwise import FUNCTIONS
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 Range = tuple[FloatArray, FloatArray]
 """Lower and upper bounds."""
 Truth = tuple[BoolArray, BoolArray]
@@ -61,10 +59,10 @@ class Boxes:
     high: FloatArray
     along: FloatArray | None = None
     corners: FloatArray | None = None
-    cells: npt.NDArray[np.intp] | None = None
+    cells: IndexArray | None = None
     normal: FloatArray | None = None
     mesh: Any = None
-    slanted: npt.NDArray[np.intp] | None = None
+    slanted: IndexArray | None = None
     edges: FloatArray | None = None
 
     @property
@@ -75,7 +73,7 @@ class Boxes:
         cells = None if self.cells is None else self.cells[self.slanted]
         return Boxes(low, high, self.edges, cells=cells, mesh=self.mesh)
 
-    def whole(self, which: npt.NDArray[np.intp]) -> Boxes:
+    def whole(self, which: IndexArray) -> Boxes:
         """Some of them, of which all points are meant."""
 
         def some(array: Any) -> Any:

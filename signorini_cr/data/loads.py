@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..arrays import FloatArray, IndexArray
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare
 from ..fem.space import facet_quadrature
 from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
 from .ranges import Cut, Pieces, cut, errors_on, refine
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
 
 
 class Load:
@@ -222,7 +219,7 @@ class Segments:
     cells: Cells
     facets: Side
     side: Side
-    place: IntArray
+    place: IndexArray
     hats: FloatArray
     weights: FloatArray
     measure: FloatArray
@@ -306,7 +303,7 @@ class Segments:
         area = np.bincount(self.place, self.measure, minlength=n)
         return self.values - (self.through / area)[self.place]
 
-    def _by_cell(self, norms: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _by_cell(self, norms: FloatArray) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg, and the sum of c_F ‖·‖_F over their facets."""
         at, place = np.unique(self.facets.cells, return_inverse=True)
         sizes = np.bincount(
@@ -324,7 +321,7 @@ class Segments:
         found = np.bincount(self.place, amounts, minlength=len(self.through))
         return found.astype(np.float64)
 
-    def oscillation(self, carried: bool) -> tuple[IntArray, FloatArray]:
+    def oscillation(self, carried: bool) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each.
 
         Args:
@@ -335,7 +332,7 @@ class Segments:
             squares = squares - self._over_facets(self.measure) * self.slope**2 / 3.0
         return self._by_cell(np.sqrt(np.maximum(squares, 0.0)))
 
-    def beyond(self) -> tuple[IntArray, FloatArray]:
+    def beyond(self) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""
         return self._by_cell(self.rough)
 

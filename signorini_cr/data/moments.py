@@ -13,13 +13,13 @@ from math import factorial
 
 import basix
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from .. import compat
+from ..arrays import FloatArray, Int32Array
 from ..fem.cells import Cells, Side
 from ..fem.conditions import Condition
 from ..fem.physics import Imposed
@@ -28,10 +28,6 @@ from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
 from .jets import Boxes, Enclosure, values
 from .ranges import Cut, Deviation, Range, cut, range_of
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
-
 
 LOAD_DEGREE, KAPPA_DEGREE = 4, 8
 """What the certificate's rules integrate exactly: two quadratics, and for q and s quadratic, y and
@@ -301,7 +297,7 @@ class Trace:
         """How far it is from polynomials."""
         return Deviation(self._expression)
 
-    def at(self, mesh: Mesh, entities: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def at(self, mesh: Mesh, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values at the vertices, the midpoint and the quadrature points of facets.
 
         Args:
@@ -335,8 +331,8 @@ class OnFacets:
 
     condition: Condition
     trace: Trace
-    facets: IntArray
-    entities: IntArray
+    facets: Int32Array
+    entities: Int32Array
     ends: FloatArray
     middle: FloatArray
     inside: FloatArray

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from ufl import classes
@@ -20,7 +19,8 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.corealg.traversal import unique_post_traversal
 
-FloatArray = npt.NDArray[np.float64]
+from ..arrays import FloatArray, Int32Array
+
 Value: TypeAlias = tuple[Any, Any]
 """A number and the bound of its error; of a condition, the truth and 0."""
 
@@ -35,7 +35,7 @@ def evaluate(
     expression: ufl.core.expr.Expr,
     points: FloatArray,
     uncertainty: float = 0.0,
-    cells: npt.NDArray[np.int32] | None = None,
+    cells: Int32Array | None = None,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Evaluate an expression and bound the error of its values.
 
@@ -71,9 +71,7 @@ def evaluate(
 class _Reader:
     """The points and what is known of them."""
 
-    def __init__(
-        self, points: FloatArray, uncertainty: float, cells: npt.NDArray[np.int32] | None
-    ) -> None:
+    def __init__(self, points: FloatArray, uncertainty: float, cells: Int32Array | None) -> None:
         self.points, self.uncertainty, self.cells = points, uncertainty, cells
 
     def read(self, expression: Any) -> Any:

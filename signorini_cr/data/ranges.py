@@ -12,10 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from mpi4py import MPI
 
+from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array
 from ..compat import cell_nodes
 from ..fem.cells import Cells, Side, blocks, corner_points
 from .balls import indices
@@ -31,9 +31,6 @@ from .jets import (
     lowered,
     values,
 )
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
 
 Errors = Callable[[Boxes, FloatArray], FloatArray]
 """What is to be known of data on boxes and simplices of given half extents; shape (rows, n)."""
@@ -238,7 +235,7 @@ class Frame:
         normal: Outward normals, shape (gdim, facets).
     """
 
-    cells: IntArray
+    cells: IndexArray
     along: FloatArray
     normal: FloatArray
 
@@ -269,7 +266,7 @@ class Pieces:
             side (1), shape (2, n): slabs of triangles lie between two parallels of that side.
     """
 
-    parent: IntArray
+    parent: IndexArray
     corners: FloatArray
     hats: FloatArray
     part: FloatArray
@@ -291,7 +288,7 @@ class Pieces:
         return cls(np.arange(n), corners, hats, np.ones(n), Frame.of(cells, side))
 
     @classmethod
-    def of_cells(cls, cells: Cells, which: IntArray | None = None) -> Pieces:
+    def of_cells(cls, cells: Cells, which: IndexArray | None = None) -> Pieces:
         """The cells themselves."""
         mesh = cells.domain.mesh
         which = np.arange(cells.number) if which is None else which
@@ -300,7 +297,7 @@ class Pieces:
         hats = np.repeat(np.eye(len(corners))[:, :, None], len(which), axis=2)
         return cls(which, corners, hats, np.ones(len(which)))
 
-    def __getitem__(self, which: npt.NDArray[np.bool_] | IntArray | slice) -> Pieces:
+    def __getitem__(self, which: BoolArray | IndexArray | slice) -> Pieces:
         """Some of them."""
         return Pieces(
             self.parent[which],
@@ -348,11 +345,11 @@ class Pieces:
             found.append(new[np.flatnonzero(part > 1e-15)])
         return sum(found[1:], found[0])
 
-    def quarters(self) -> tuple[Pieces, IntArray]:
+    def quarters(self) -> tuple[Pieces, IndexArray]:
         """Four of each, and from which."""
         return self.halves().halves(), np.tile(np.arange(len(self.part)), 4)
 
-    def slabs(self, axis: int) -> tuple[Pieces, IntArray]:
+    def slabs(self, axis: int) -> tuple[Pieces, IndexArray]:
         """Triangles cut across an axis, at the middle vertex and in between; from which."""
         at, x = np.arange(len(self.part)), self.corners[:, axis]
         low, middle, high = np.argsort(x, axis=0)
@@ -376,7 +373,7 @@ class Pieces:
                 origin.append(there)
         return sum(pieces[1:], pieces[0]), np.concatenate(origin)
 
-    def thinner(self) -> tuple[Pieces, IntArray]:
+    def thinner(self) -> tuple[Pieces, IndexArray]:
         """Both halves of each slab; from which."""
         start, end = self.span
         middle, halves = 0.5 * (start + end), []
@@ -385,7 +382,7 @@ class Pieces:
             halves.append(replace(self, part=part, span=np.stack([a, b])))
         return halves[0] + halves[1], np.tile(np.arange(len(self.part)), 2)
 
-    def triangles(self) -> tuple[Pieces, IntArray]:
+    def triangles(self) -> tuple[Pieces, IndexArray]:
         """Slabs as triangles; all, and from which."""
         thin = ~self.whole
         if not thin.any():
@@ -402,7 +399,7 @@ class Pieces:
         return made[0] + made[1] + made[2], np.concatenate(origin)
 
     @property
-    def whole(self) -> npt.NDArray[np.bool_]:
+    def whole(self) -> BoolArray:
         """Which are simplices and no slabs, shape (n,)."""
         return np.asarray((self.span[0] == 0.0) & (self.span[1] == 1.0))
 
@@ -421,7 +418,7 @@ class Pieces:
         scale[list(axes)] = 0.5
         return replace(self, corners=middle + scale * (self.corners - middle))
 
-    def cut(self, ways: IntArray) -> tuple[Pieces, IntArray, IntArray]:
+    def cut(self, ways: IndexArray) -> tuple[Pieces, IndexArray, IndexArray]:
         """Cut each in its way: into four, or across an axis; also from which, and the way.
 
         Args:
@@ -476,7 +473,7 @@ class Pieces:
         self,
         low: FloatArray,
         high: FloatArray,
-        parent: IntArray,
+        parent: IndexArray,
         cells: Cells,
         corners: FloatArray | None,
     ) -> Boxes:
@@ -486,7 +483,7 @@ class Pieces:
         along, normal = frame.along[..., parent], frame.normal[:, parent]
         return Boxes(low, high, along, corners, frame.cells[parent], normal, mesh)
 
-    def _slanted(self, low: FloatArray, high: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _slanted(self, low: FloatArray, high: FloatArray) -> tuple[IndexArray, FloatArray]:
         """Triangles whose boxes are much larger than they are, and two edges; see `Boxes`."""
         (a, b), (c, d) = self.corners[1:] - self.corners[0]
         large = (high - low).prod(axis=0) > SLANTED * np.abs(a * d - b * c)
@@ -521,7 +518,7 @@ class Cut:
     errors_inside: FloatArray
 
     @property
-    def of(self) -> tuple[IntArray, IntArray]:
+    def of(self) -> tuple[IndexArray, IndexArray]:
         """The cells that are cut, and where in the list each piece's cell is."""
         which, place = np.unique(self.pieces.parent, return_inverse=True)
         return which, place
@@ -620,7 +617,7 @@ def refine(
         pieces = pieces[~lost] + finer
     first: tuple[float, float] = (0.0, np.inf)
     usual, idle = room, 0
-    ways: IntArray = np.full(len(pieces.part), UNKNOWN)
+    ways: IndexArray = np.full(len(pieces.part), UNKNOWN)
     for _ in range(ROUNDS):
         share = pieces.part * _shares(weights[:, pieces.parent], inside)
         bounded = share[np.isfinite(share)]
@@ -663,13 +660,13 @@ def refine(
 
 def _split(
     pieces: Pieces,
-    ways: IntArray,
+    ways: IndexArray,
     share: FloatArray,
     errors_of: FloatArray,
-    deep: npt.NDArray[np.bool_],
+    deep: BoolArray,
     errors: Callable[[Pieces], FloatArray],
     weights: FloatArray,
-) -> tuple[Pieces, FloatArray, IntArray]:
+) -> tuple[Pieces, FloatArray, IndexArray]:
     """Cut each piece in the way that has proved good; or find that way by smaller pieces; local.
 
     Args:
@@ -752,7 +749,7 @@ def errors_on(pieces: Pieces, errors: Errors, cells: Cells, decide: bool = True)
     return found
 
 
-def _between(x: FloatArray, start: IntArray, end: IntArray, where: FloatArray) -> FloatArray:
+def _between(x: FloatArray, start: IndexArray, end: IndexArray, where: FloatArray) -> FloatArray:
     """Points on sides of simplices that start and end at some vertices, shape (·, n)."""
     at = np.arange(len(where))
     first = x[start, :, at].T
@@ -765,7 +762,7 @@ def _shares(weights: FloatArray, errors: FloatArray) -> FloatArray:
     return np.asarray(share)
 
 
-def _worst(share: FloatArray, threshold: float, room: int, comm: MPI.Comm) -> npt.NDArray[np.bool_]:
+def _worst(share: FloatArray, threshold: float, room: int, comm: MPI.Comm) -> BoolArray:
     """Those above a threshold, which is raised until there is room for them; collective."""
     top = comm.allreduce(float(share.max(initial=0.0, where=np.isfinite(share))), op=MPI.MAX)
     least = threshold
@@ -807,7 +804,7 @@ def _extents(cells: Cells) -> Range:
     return low, high
 
 
-def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, FloatArray, IntArray]:
+def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, FloatArray, IndexArray]:
     """Boxes on grids that depend on nothing but the cells' own extents.
 
     Returns:
@@ -825,9 +822,9 @@ def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, Float
     return Boxes(start - half, start + size[:, one] + half), half, numbers
 
 
-def _numbers(rows: list[npt.NDArray[np.int64]]) -> IntArray:
+def _numbers(rows: list[Int64Array]) -> IndexArray:
     """Number the different columns of some rows."""
-    key: IntArray = np.zeros(len(rows[0]), dtype=np.intp)
+    key: IndexArray = np.zeros(len(rows[0]), dtype=np.intp)
     if not len(key):
         return key
     span = 1

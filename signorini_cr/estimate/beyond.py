@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from .. import compat
+from ..arrays import FloatArray, IndexArray
 from ..fem.cells import Cells
 from .shapes import bump_slopes
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +27,7 @@ class Beyond:
     heights: FloatArray
     rise: FloatArray | None
 
-    def through(
-        self, cells: Cells, where: slice | npt.NDArray[np.intp], hat: FloatArray
-    ) -> FloatArray:
+    def through(self, cells: Cells, where: slice | IndexArray, hat: FloatArray) -> FloatArray:
         """The numbers Q_i = 2|T| (curl ω + τ)·∇λ_i at a point of each cell, shape (3, n).
 
         Args:

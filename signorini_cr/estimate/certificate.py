@@ -13,11 +13,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
 from .. import compat
+from ..arrays import FloatArray
 from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from ..vi.level import Level
     from ..vi.solved import Solved
 
-FloatArray = npt.NDArray[np.float64]
 
 SHARES = ("flux", "companion", "contact", "load", "neumann", "boundary", "solver")
 """Where a bound comes from: the keys of `Certificate.parts`."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
 from ..data.moments import OnFacets
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
@@ -26,9 +26,7 @@ from .lifting import Cubic, Lift, affine, lift
 from .nearest import Slopes, nearest
 from .shapes import bump_slopes, local_thirds, third_slopes
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-Lifted = tuple[npt.NDArray[np.intp], FloatArray, FloatArray]
+Lifted = tuple[IndexArray, FloatArray, FloatArray]
 
 JUMP = "u_D jumps where boundary facets meet: no function of finite energy has such values"
 BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
@@ -70,9 +68,7 @@ class Companion:
     cusps: Cusps | None = None
     thirds: FloatArray | None = None
 
-    def slopes(
-        self, cells: Cells, where: slice | npt.NDArray[np.intp]
-    ) -> Callable[[FloatArray], FloatArray]:
+    def slopes(self, cells: Cells, where: slice | IndexArray) -> Callable[[FloatArray], FloatArray]:
         """∇(v − u_h) without cusps, as γ_i with ∇(v − u_h) = Σ γ_i ∇λ_i, as a function.
 
         Args:
@@ -225,7 +221,7 @@ def _at_vertices(
     u_D: FloatArray,
     contact: Side,
     obstacle: FloatArray,
-    touching: npt.NDArray[np.bool_],
+    touching: BoolArray,
 ) -> FloatArray:
     """Means of u_h's values at the vertices, weighted by κ, raised to α on Γ1, u_D on Γ0."""
     index_map = cells.domain.mesh.topology.index_map(0)

@@ -11,17 +11,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
+from ..arrays import FloatArray
 from ..data.moments import OnFacets
 from ..fem.cells import Cells, blocks, dot_rows, pick
 from .companion import Companion
 from .flux import Flux
 from .lifting import Cubic
 from .shapes import best_heights, local_thirds, quadrature, third_slopes
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companion:

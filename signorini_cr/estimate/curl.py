@@ -11,8 +11,8 @@ has the mathematics.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatArray
 from ..data.loads import Load, Segments
 from ..fem.cells import Cells, blocks, measures, pick
 from .beyond import Beyond
@@ -21,8 +21,6 @@ from .flux import Flux, field_squares
 from .nearest import Slopes, nearest
 from .shapes import quadrature
 from .sums import Sums
-
-FloatArray = npt.NDArray[np.float64]
 
 THIN = 25.0
 """h_T²/|T| of cells from which on they are thin: 2.3 if all sides are equal, 4 for half a square,

@@ -16,17 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from .. import compat
+from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array
 from ..data.loads import Load
 from ..fem.cells import Cells, pick, poincare, sum_rows
 from .flux import Flux
 from .sums import Sums
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.intp]
 
 EXPONENTS = (0.5, 0.25)
 """s. Both with t = τ⁴ make polynomials of τ, of degree 15 or less with their weights."""
@@ -52,10 +48,10 @@ class Cusps:
         heights: Their coefficients, shape (functions, n).
     """
 
-    at: IntArray
-    apex: IntArray
+    at: IndexArray
+    apex: IndexArray
     kappa: FloatArray
-    names: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+    names: tuple[Int64Array, Int64Array]
     weights: FloatArray
     hats: FloatArray
     slopes: FloatArray

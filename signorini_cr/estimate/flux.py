@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import Edge, Load
 from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
@@ -21,9 +21,6 @@ from .beyond import Beyond
 
 if TYPE_CHECKING:
     from ..vi.level import Level
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
 
 
 @dataclass(eq=False)
@@ -40,7 +37,7 @@ class Flux:
 
     excess: FloatArray
     contact: FloatArray
-    touching: npt.NDArray[np.bool_]
+    touching: BoolArray
     left: FloatArray
     beyond: Beyond | None = None
 
@@ -265,9 +262,7 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     return fluxes
 
 
-def field_squares(
-    cells: Cells, fluxes: FloatArray, part: slice | npt.NDArray[np.intp]
-) -> FloatArray:
+def field_squares(cells: Cells, fluxes: FloatArray, part: slice | IndexArray) -> FloatArray:
     """‖p‖²_T of the field with the given fluxes out of the cell, shape (cells in the part,).
 
     p = (s (x − x_T) − Σ a_i X_i) / (d |T|) with s the sum of the fluxes and a_i = flux_i − s/(d+1).

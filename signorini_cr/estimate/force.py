@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
@@ -21,8 +20,6 @@ from ..jit import compiled
 from ..options import AMG
 from ..vi.solved import Solved
 from .certificate import Certificate
-
-FloatArray = npt.NDArray[np.float64]
 
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
 VARIES = "the coefficient varies within cells"

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatArray, IndexArray
 from ..data.loads import Load, Segments
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
@@ -22,8 +22,6 @@ from .companion import Companion, bump_squares, on_facet
 from .flux import Flux, field_squares
 from .shapes import local_thirds, quadrature
 from .sums import Sums
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def integrate(
@@ -156,7 +154,7 @@ def integrate_edge(
         sums.across[at] += sizes**2 / low + far
         sums.middle[at] += sizes**2 / low + near
         return 0.0
-    of_f: npt.NDArray[np.float64] = np.zeros(len(at))
+    of_f: FloatArray = np.zeros(len(at))
     if load.variance is not None:
         square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
         of_f = poincare(d) * np.sqrt(square)
@@ -199,7 +197,7 @@ def _swollen(squares: FloatArray, more: FloatArray) -> FloatArray:
 def _twist(
     cells: Cells,
     kappa: Coefficient,
-    where: slice | npt.NDArray[np.intp],
+    where: slice | IndexArray,
     P: FloatArray,
     W: FloatArray,
 ) -> FloatArray:
@@ -307,7 +305,7 @@ def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> F
 def _at_points(
     cells: Cells,
     mean: FloatArray,
-    where: slice | npt.NDArray[np.intp],
+    where: slice | IndexArray,
     flux: Flux,
     v: Companion,
     w: FloatArray,

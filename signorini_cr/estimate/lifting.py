@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
 from ..data.jets import Enclosure, Jet, Unknown
 from ..data.moments import Trace
 from ..data.ranges import Pieces, refine
 from ..fem.cells import Cells, Side, corner_points
-
-FloatArray = npt.NDArray[np.float64]
 
 ROUGH = "{} jumps on a boundary facet, or its derivative is not known to be bounded there"
 NO_RANGE = "{} holds an operator that has no enclosure: {}"
@@ -52,19 +50,19 @@ class Cubic:
     height: FloatArray
     third: FloatArray
 
-    def at(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
+    def at(self, which: IndexArray, s: FloatArray) -> FloatArray:
         """Values at s on some facets."""
         a, b = self.ends[:, which]
         bend = 4.0 * self.height[which] + (1.0 - 2.0 * s) * self.third[which]
         return a + s * (b - a) + s * (1.0 - s) * bend
 
-    def slope(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
+    def slope(self, which: IndexArray, s: FloatArray) -> FloatArray:
         """Derivative in s."""
         a, b = self.ends[:, which]
         bend = 4.0 * (1.0 - 2.0 * s) * self.height[which]
         return b - a + bend + (1.0 - 6.0 * s * (1.0 - s)) * self.third[which]
 
-    def bend(self, which: npt.NDArray[np.intp], s: FloatArray) -> FloatArray:
+    def bend(self, which: IndexArray, s: FloatArray) -> FloatArray:
         """Half the second derivative in s."""
         return (6.0 * s - 3.0) * self.third[which] - 4.0 * self.height[which]
 
@@ -234,7 +232,7 @@ def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
 
 def _jump_at_ends(
     trace: Trace, whole: Pieces, base: Cubic, cells: Cells, jump: float, obstacle: bool
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """Where δ does not vanish at a facet's end: the data's limit there is not the value there."""
     found = np.zeros(len(whole.parent), dtype=bool)
     for end in (0, 1):

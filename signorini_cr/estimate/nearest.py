@@ -9,21 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
 from petsc4py import PETSc
 
+from ..arrays import BoolArray, FloatArray
 from ..fem.cells import Cells, blocks, dot_rows, pick, sum_rows
 from ..fem.space import ghosted_vector, shared_maximum
 from ..garbage import release
 from ..jit import compiled
 from ..options import AMG
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 SHARE = 1e-10
 """Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on

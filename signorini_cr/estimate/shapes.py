@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import basix
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import Cells
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
 
 STEPS = 200
 """Of conjugate gradients, at most."""
@@ -36,7 +33,7 @@ def third_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArra
     return gamma
 
 
-def local_thirds(cells: Cells, thirds: FloatArray, where: slice | IntArray) -> FloatArray:
+def local_thirds(cells: Cells, thirds: FloatArray, where: slice | IndexArray) -> FloatArray:
     """Heights of the c_i of each cell from those of the facets, shape (3, n)."""
     return np.asarray(cells.ways[:, where] * thirds[cells.facets[:, where]])
 
@@ -47,9 +44,7 @@ def quadrature() -> tuple[FloatArray, FloatArray]:
     return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
 
 
-def best_heights(
-    cells: Cells, matrix: FloatArray, pull: FloatArray, free: npt.NDArray[np.bool_]
-) -> FloatArray:
+def best_heights(cells: Cells, matrix: FloatArray, pull: FloatArray, free: BoolArray) -> FloatArray:
     """Heights that minimise a quadratic functional, by conjugate gradients; collective.
 
     Args:

@@ -12,15 +12,12 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem, la
 
 from .. import compat
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import DIRICHLET, Domain
 from .space import facet_entities, shared_sum
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
 
 BLOCK = 1 << 13
 """Cells that are worked on at a time: as many as the processor's cache holds."""
@@ -34,7 +31,7 @@ def blocks(cells: int) -> Iterator[slice]:
     return (slice(a, min(a + BLOCK, cells)) for a in range(0, cells, BLOCK))
 
 
-def pick(values: FloatArray, where: slice | IntArray) -> FloatArray:
+def pick(values: FloatArray, where: slice | IndexArray) -> FloatArray:
     """Values on some cells of an array over all of them, or the one value that holds on all."""
     return values if values.ndim == 0 else values[where]
 
@@ -74,13 +71,13 @@ class Side:
         ends: The facet's vertices, in the order of the cell's closure, shape (d, n).
     """
 
-    cells: IntArray
-    local: IntArray
-    dofs: IntArray
-    ends: IntArray
+    cells: IndexArray
+    local: IndexArray
+    dofs: IndexArray
+    ends: IndexArray
 
     @property
-    def entities(self) -> npt.NDArray[np.int32]:
+    def entities(self) -> Int32Array:
         """Pairs (cell, local facet), as Expressions want them."""
         return np.column_stack([self.cells, self.local]).astype(np.int32)
 
@@ -166,7 +163,7 @@ class Cells:
         return sides
 
     @cached_property
-    def exterior(self) -> npt.NDArray[np.bool_]:
+    def exterior(self) -> BoolArray:
         """Which facet dofs lie on the boundary, ghosts included."""
         mark = la.vector(self.V.dofmap.index_map, dtype=np.float64)
         for side in self.sides.values():
@@ -175,7 +172,7 @@ class Cells:
         return mark.array > 0
 
     @cached_property
-    def layers(self) -> list[tuple[IntArray, npt.NDArray[np.bool_]]]:
+    def layers(self) -> list[tuple[IndexArray, BoolArray]]:
         """Cells by the number of facets between them and Γ0, nearest first.
 
         Each layer has its cells, shape (n,), and which of their local facets lead back towards Γ0,
@@ -236,7 +233,7 @@ class Cells:
         return shared_sum(self.comm, index_map, values)
 
     @cached_property
-    def between(self) -> IntArray:
+    def between(self) -> IndexArray:
         """Facet dofs that other ranks see as well, shape (n,)."""
         index_map = self.V.dofmap.index_map
         mark = np.zeros(index_map.size_local + index_map.num_ghosts)
@@ -247,7 +244,7 @@ class Cells:
     def _mailbox(self) -> la.Vector:
         return la.vector(self.V.dofmap.index_map, dtype=np.float64)
 
-    def from_others(self, where: IntArray, values: FloatArray) -> FloatArray:
+    def from_others(self, where: IndexArray, values: FloatArray) -> FloatArray:
         """Sums of what the other ranks have, in the order of ``between``; collective.
 
         Args:
@@ -276,7 +273,7 @@ class Cells:
         """Sum over all ranks."""
         return self.comm.allreduce(np.array(values, dtype=np.float64))
 
-    def apply(self, c: FloatArray, part: slice | IntArray) -> FloatArray:
+    def apply(self, c: FloatArray, part: slice | IndexArray) -> FloatArray:
         """|T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
         out = np.zeros_like(c)
         for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
@@ -322,7 +319,7 @@ def measures(cells: Cells, side: Side) -> FloatArray:
     return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, cells.tdim))
 
 
-def _rows(table: npt.NDArray[np.int32]) -> IntArray:
+def _rows(table: Int32Array) -> IndexArray:
     """The transpose of a table of indices, row by row in memory."""
     return np.ascontiguousarray(table.T, dtype=np.intp)
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from ufl.core.expr import Expr
 
+from ..arrays import Int32Array
 from ..mesh.domain import PARTS, Domain
 
 
@@ -147,7 +147,7 @@ class Contact(Condition):
         return self.value
 
 
-def facets_of(domain: Domain, conditions: Sequence[Condition]) -> npt.NDArray[np.int32]:
+def facets_of(domain: Domain, conditions: Sequence[Condition]) -> Int32Array:
     """Local indices of the owned facets under some conditions, ascending, shape (n,)."""
     facets = [domain.facets(condition.number) for condition in conditions]
     return np.sort(np.concatenate([np.empty(0, dtype=np.int32), *facets]))

@@ -13,14 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
+from ..arrays import FloatArray, Int32Array
 from ..mesh.domain import Domain
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +32,8 @@ class Imposed:
     """
 
     key: str
-    facets: IntArray
-    components: IntArray
+    facets: Int32Array
+    components: Int32Array
     means: FloatArray
     ends: FloatArray
 
@@ -71,7 +67,7 @@ class OnMesh(Protocol):
     def of_constants(self) -> FloatArray | None:
         """a_h(1, ·) by unknown, this rank's cells' share; None where it vanishes."""
 
-    def conforming(self, cells: IntArray, index_map: Any) -> tuple[fem.Form, float]:
+    def conforming(self, cells: Int32Array, index_map: Any) -> tuple[fem.Form, float]:
         """Return a form whose matrix, times a number, is the P1 operator on this mesh.
 
         Args:
@@ -79,7 +75,7 @@ class OnMesh(Protocol):
             index_map: How the ranks share these nodes.
         """
 
-    def at_vertices(self, u: fem.Function, facets: IntArray) -> FloatArray:
+    def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
         """Values of what is bounded at the vertices of contact facets, shape (n, d)."""
 
     def energy(self, u: fem.Function) -> float:

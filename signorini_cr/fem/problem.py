@@ -17,12 +17,12 @@ from typing import Any, TypeAlias
 
 import basix.ufl
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from ufl.core.expr import Expr
 
+from ..arrays import Int32Array
 from ..errors import InputError
 from ..jit import compiled
 from ..mesh.domain import Domain
@@ -128,7 +128,7 @@ class Kernel:
         functions: Sequence[fem.Function] = (),
     ) -> fem.Form:
         """Bind to a mesh, argument spaces and one function per stand-in."""
-        subdomains: dict[Any, list[tuple[int, npt.NDArray[np.int32]]]] = {}
+        subdomains: dict[Any, list[tuple[int, Int32Array]]] = {}
         if self._sides:
             subdomains[fem.IntegralType.exterior_facet] = [
                 (part, facet_entities(domain.mesh, domain.facets(part)).ravel())

@@ -11,17 +11,14 @@ from typing import Any
 import basix
 import basix.ufl
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes
 from ..errors import InputError
-
-Int32Array = npt.NDArray[np.int32]
-FloatArray = npt.NDArray[np.float64]
 
 ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
 
@@ -63,7 +60,7 @@ def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
     )
 
 
-def facet_corners(mesh: Mesh) -> npt.NDArray[np.intp]:
+def facet_corners(mesh: Mesh) -> IndexArray:
     """The vertices of a cell's facets by local number, shape (d + 1, d)."""
     return np.array(basix.topology(mesh.basix_cell())[-2])
 

@@ -6,15 +6,13 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx.mesh import Mesh
 
+from ..arrays import FloatArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from .space import facet_entities
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-
 
 def along_boundary(
-    mesh: Mesh, facets: npt.NDArray[np.int32], fields: dict[str, npt.NDArray]
+    mesh: Mesh, facets: Int32Array, fields: dict[str, npt.NDArray]
 ) -> tuple[dict[str, npt.NDArray] | None, FloatArray]:
     """Sort the contact facets along the boundary and find the transition points; collective.
 
@@ -45,7 +43,7 @@ def along_boundary(
     return table, mesh.comm.bcast(transitions, root=0)
 
 
-def _clockwise(mesh: Mesh, facets: npt.NDArray[np.int32], vertices: FloatArray) -> npt.NDArray:
+def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDArray:
     """Whether Ω lies to the right when a facet is walked from its first vertex to its second."""
     cells, local = facet_entities(mesh, facets).T
     apex = mesh.geometry.x[cell_nodes(mesh)[cells, local]]
@@ -89,7 +87,7 @@ def _ordered(rows: dict[str, npt.NDArray]) -> tuple[dict[str, npt.NDArray], Floa
     return {name: column[order] for name, column in table.items()}, points[along]
 
 
-def _predecessors(ends: FloatArray) -> IntArray:
+def _predecessors(ends: FloatArray) -> Int64Array:
     """For each facet the one that ends where it begins, itself where there is none."""
     own = np.arange(len(ends))
     _, vertex = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
@@ -99,7 +97,7 @@ def _predecessors(ends: FloatArray) -> IntArray:
     return np.where(arriving[tail] >= 0, arriving[tail], own)
 
 
-def _cut(before: IntArray, rank: IntArray) -> IntArray:
+def _cut(before: Int64Array, rank: Int64Array) -> Int64Array:
     """Give closed curves, which have no first facet, one: that of lowest rank."""
     lowest, jump = rank, before
     for _ in range(_doublings(before)):
@@ -108,7 +106,9 @@ def _cut(before: IntArray, rank: IntArray) -> IntArray:
     return np.where(closed & (lowest == rank), np.arange(len(before)), before)
 
 
-def _way_from_first(before: IntArray, length: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+def _way_from_first(
+    before: Int64Array, length: FloatArray
+) -> tuple[Int64Array, Int64Array, FloatArray]:
     """The first facet of each one's curve, steps from there, and the distance of the midpoints."""
     is_first = before == np.arange(len(before))
     distance = np.where(is_first, 0.0, 0.5 * (length + length[before]))
@@ -118,14 +118,14 @@ def _way_from_first(before: IntArray, length: FloatArray) -> tuple[IntArray, Int
     return jump, steps, distance
 
 
-def _doublings(before: IntArray) -> int:
+def _doublings(before: Int64Array) -> int:
     """How often a stride has to be doubled to pass through all facets."""
     return max(len(before), 1).bit_length()
 
 
 def _transitions(
-    before: IntArray, ends: FloatArray, gaps: FloatArray, rows: dict[str, npt.NDArray]
-) -> tuple[FloatArray, IntArray]:
+    before: Int64Array, ends: FloatArray, gaps: FloatArray, rows: dict[str, npt.NDArray]
+) -> tuple[FloatArray, Int64Array]:
     """Find where just one of two neighbours is active, and the facet behind each such place.
 
     The transition lies inside the free facet if its trace changes sign there, else at the vertex

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import basix.ufl
 import numpy as np
-import numpy.typing as npt
 from dolfinx import la
 from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
@@ -28,6 +27,7 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
+from ..arrays import FloatArray, Int32Array
 from ..compat import coordinate_map
 from ..errors import InputError, on_root, raise_together
 from . import gmshmesh
@@ -60,7 +60,7 @@ class Domain:
         here = f" on rank {self.mesh.comm.rank}" if self.mesh.comm.size > 1 else ""
         return f"<Domain: {cells} cells; facets{here}: {facets}>"
 
-    def facets(self, part: int) -> npt.NDArray[np.int32]:
+    def facets(self, part: int) -> Int32Array:
         """Local indices of the facets of one part that this rank owns.
 
         Args:
@@ -70,7 +70,7 @@ class Domain:
         return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
 
     @cached_property
-    def all_facets(self) -> dict[int, npt.NDArray[np.int32]]:
+    def all_facets(self) -> dict[int, Int32Array]:
         """Local indices of the facets of each part, ghosts included, ascending; collective."""
         mark = la.vector(self.mesh.topology.index_map(self.mesh.topology.dim - 1))
         for part in PARTS.values():
@@ -178,7 +178,7 @@ def _count(mesh: Mesh, dim: int) -> int:
     return index_map.size_local + index_map.num_ghosts
 
 
-def _exterior(mesh: Mesh) -> npt.NDArray[np.int32]:
+def _exterior(mesh: Mesh) -> Int32Array:
     tdim = mesh.topology.dim
     mesh.topology.create_connectivity(tdim - 1, tdim)
     mesh.topology.create_connectivity(tdim, tdim - 1)
@@ -215,7 +215,7 @@ class Polygon:
         InputError: An outline crosses itself or another one, or a label is not known.
     """
 
-    vertices: npt.NDArray[np.float64]
+    vertices: FloatArray
     boundary: tuple[str, ...]
     holes: tuple[Polygon, ...] = ()
 

@@ -7,14 +7,12 @@ so that they are the same whatever the number of ranks.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
 from ..errors import InputError
 from .domain import PARTS, Domain, Polygon, _distribute
 from .gmshmesh import Triangulation
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def structured(
@@ -99,7 +97,7 @@ def _require_kept(polygon: Polygon, middle: float, half: float) -> None:
         raise InputError("shift would move a vertex of the polygon: give a rectangle")
 
 
-def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int32]]:
+def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, Int32Array]:
     """Starts and ends of all edges, shapes (n, 2), and the numbers of their parts."""
     loops = [polygon, *polygon.holes]
     starts = np.concatenate([loop.vertices for loop in loops])
@@ -108,28 +106,28 @@ def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int
     return starts, ends, np.array([PARTS[name] for name in names], dtype=np.int32)
 
 
-def _contains(starts: FloatArray, ends: FloatArray, points: FloatArray) -> npt.NDArray[np.bool_]:
+def _contains(starts: FloatArray, ends: FloatArray, points: FloatArray) -> BoolArray:
     """Which points lie inside: a level ray to the right meets the edges oddly often."""
     spans = (starts[:, 1] > points[:, None, 1]) != (ends[:, 1] > points[:, None, 1])
     beyond = np.maximum(starts[:, 0], ends[:, 0]) > points[:, None, 0]
-    inside: npt.NDArray[np.bool_] = np.count_nonzero(spans & beyond, axis=1) % 2 == 1
+    inside: BoolArray = np.count_nonzero(spans & beyond, axis=1) % 2 == 1
     return inside
 
 
-def _boundary(triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def _boundary(triangles: Int64Array) -> Int64Array:
     """Ends of the facets of one triangle only, shape (facets, 2)."""
     facets = np.sort(triangles[:, [[1, 2], [0, 2], [0, 1]]].reshape(-1, 2), axis=1)
     unique, count = np.unique(facets, axis=0, return_counts=True)
-    single: npt.NDArray[np.int64] = unique[count == 1]
+    single: Int64Array = unique[count == 1]
     return single
 
 
-def _edge_of(starts: FloatArray, ends: FloatArray, points: FloatArray) -> npt.NDArray[np.int64]:
+def _edge_of(starts: FloatArray, ends: FloatArray, points: FloatArray) -> Int64Array:
     """The edge that each point lies on, or is nearest to."""
     along = ends - starts
     offset = points[:, None] - starts
     share = np.clip((offset * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
-    nearest: npt.NDArray[np.int64] = np.argmin(
+    nearest: Int64Array = np.argmin(
         np.linalg.norm(offset - share[..., None] * along, axis=2), axis=1
     )
     return nearest
@@ -137,7 +135,7 @@ def _edge_of(starts: FloatArray, ends: FloatArray, points: FloatArray) -> npt.ND
 
 def _moves(
     points: FloatArray,
-    facets: npt.NDArray[np.int64],
+    facets: Int64Array,
     along: FloatArray,
     polygon: Polygon,
     n: int,

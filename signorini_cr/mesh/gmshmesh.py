@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError
 from . import mshfile
 from .mshfile import KINDS, MshFile
@@ -52,10 +52,10 @@ class Triangulation(NamedTuple):
         labels: Index of each facet's label, shape (facets,).
     """
 
-    points: npt.NDArray[np.float64]
-    triangles: npt.NDArray[np.int64]
-    facets: npt.NDArray[np.int64]
-    labels: npt.NDArray[np.int32]
+    points: FloatArray
+    triangles: Int64Array
+    facets: Int64Array
+    labels: Int32Array
 
 
 def _keep_sigpipe() -> None:
@@ -98,9 +98,7 @@ def _session() -> Iterator[Any]:
                 gmsh.option.setNumber(name, value)
 
 
-def triangulate(
-    loops: Sequence[npt.NDArray[np.float64]], labels: npt.NDArray[np.int32], size: float
-) -> Triangulation:
+def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) -> Triangulation:
     """Triangulate a polygon with holes; its vertices become mesh vertices.
 
     Edges are cut into equal facets. Only an edge beside one with much shorter facets is graded
@@ -152,9 +150,7 @@ def triangulate(
         )
 
 
-def _sizes(
-    loops: Sequence[npt.NDArray[np.float64]], facets: Sequence[npt.NDArray[np.float64]]
-) -> list[npt.NDArray[np.float64]]:
+def _sizes(loops: Sequence[FloatArray], facets: Sequence[FloatArray]) -> list[FloatArray]:
     """Facet length at every vertex: the shorter of its edges', growing slowly.
 
     Args:
@@ -177,8 +173,8 @@ def read(path: Path, parts: dict[str, int]) -> Triangulation:
     file = mshfile.load(path)
     _check_cells(file, path)
     names = [(tag, file.names.get((1, tag), "")) for tag in file.groups(1)]
-    found: dict[str, list[npt.NDArray[np.int64]]] = {name: [] for name in parts}
-    others: dict[str, list[npt.NDArray[np.int64]]] = {}
+    found: dict[str, list[Int64Array]] = {name: [] for name in parts}
+    others: dict[str, list[Int64Array]] = {}
     for tag, name in names:
         key = name.strip().lower()
         group = found[key] if key in parts else others.setdefault(name or f"{tag}", [])
@@ -200,9 +196,9 @@ def read(path: Path, parts: dict[str, int]) -> Triangulation:
 
 
 def _check_names(
-    triangles: npt.NDArray[np.int64],
-    labelled: npt.NDArray[np.int64],
-    others: dict[str, list[npt.NDArray[np.int64]]],
+    triangles: Int64Array,
+    labelled: Int64Array,
+    others: dict[str, list[Int64Array]],
     path: Path,
     allowed: Sequence[str],
 ) -> None:
@@ -221,7 +217,7 @@ def _check_names(
     if not curves:
         return
 
-    def keys(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def keys(ends: Int64Array) -> Int64Array:
         return ends.min(axis=-1) * (int(triangles.max()) + 1) + ends.max(axis=-1)
 
     sides, cells = np.unique(keys(triangles[:, [[1, 2], [0, 2], [0, 1]]]), return_counts=True)
@@ -278,7 +274,7 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
         x, y = raw.points[raw.triangles[flat[0], 0]]
         raise InputError(f"{path}: the triangle at ({x:g}, {y:g}) has no area")
 
-    def key(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def key(ends: Int64Array) -> Int64Array:
         return ends.min(axis=-1) * count + ends.max(axis=-1)
 
     def facet(number: int) -> str:
@@ -324,18 +320,18 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
         )
 
 
-def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> npt.NDArray[np.int64]:
+def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> Int64Array:
     """Node tags of the elements of one type, shape (elements, dim + 1)."""
     tags = gmsh.model.mesh.getElementsByType(kind, entity)[1]
     return tags.astype(np.int64).reshape(-1, dim + 1)
 
 
 def _compact(
-    tags: npt.NDArray[np.int64],
-    points: npt.NDArray[np.float64],
-    triangles: npt.NDArray[np.int64],
-    facets: npt.NDArray[np.int64],
-    labels: npt.NDArray[np.int32],
+    tags: Int64Array,
+    points: FloatArray,
+    triangles: Int64Array,
+    facets: Int64Array,
+    labels: Int32Array,
 ) -> Triangulation:
     """Renumber gmsh's node tags from 0, leaving out the nodes of no triangle and of no facet."""
     used = np.unique(np.concatenate([triangles.ravel(), facets.ravel()]))
@@ -361,6 +357,6 @@ def _widen_inwards(gmsh: Any, curves: list[int], surface: int, size: float) -> N
     gmsh.option.setNumber("Mesh.Algorithm", 5)  # Delaunay: Frontal-Delaunay can give up early here
 
 
-def _area(loop: npt.NDArray[np.float64]) -> float:
+def _area(loop: FloatArray) -> float:
     x, y = (loop - loop[0]).T
     return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2

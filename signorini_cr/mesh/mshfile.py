@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, NoReturn, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import FloatArray, Int64Array
 from ..errors import InputError
 from .polygon import FARTHEST
 
@@ -52,7 +53,7 @@ class Block(NamedTuple):
 
     kind: int
     groups: frozenset[int]
-    nodes: npt.NDArray[np.int64]
+    nodes: Int64Array
 
 
 class MshFile(NamedTuple):
@@ -65,8 +66,8 @@ class MshFile(NamedTuple):
         names: Name of each physical group that has one, by dimension and tag.
     """
 
-    tags: npt.NDArray[np.int64]
-    points: npt.NDArray[np.float64]
+    tags: Int64Array
+    points: FloatArray
     blocks: list[Block]
     names: dict[tuple[int, int], str]
 
@@ -75,7 +76,7 @@ class MshFile(NamedTuple):
         named = {tag for d, tag in self.names if d == dim}
         return sorted(named.union(*(b.groups for b in self.blocks if KINDS[b.kind][1] == dim)))
 
-    def elements(self, kind: int, group: int | None = None) -> npt.NDArray[np.int64]:
+    def elements(self, kind: int, group: int | None = None) -> Int64Array:
         """Node tags of all elements of a type, or of those in one physical group."""
         found = [b.nodes for b in self.blocks if b.kind == kind and group in (None, *b.groups)]
         return np.concatenate([np.empty((0, KINDS[kind][2]), dtype=np.int64), *found])
@@ -258,8 +259,8 @@ class _Reader:
         self.binary, self.order, self.version = False, "<", 0
         self.names: dict[tuple[int, int], str] = {}
         self.groups: dict[tuple[int, int], frozenset[int]] | None = None  # of entities, 4.1
-        self.tags: npt.NDArray[np.int64] | None = None
-        self.points: npt.NDArray[np.float64] = np.empty((0, 3))
+        self.tags: Int64Array | None = None
+        self.points: FloatArray = np.empty((0, 3))
         self.blocks: list[Block] | None = None
 
     def read(self) -> MshFile:

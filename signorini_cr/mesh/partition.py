@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import cpp
 
+from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 
-def bisect(points: npt.NDArray[np.float64], parts: int) -> npt.NDArray[np.int32]:
+
+def bisect(points: FloatArray, parts: int) -> Int32Array:
     """Cut a set of points in two across its longer side, and the halves again.
 
     The parts differ by a point or two in size, and are the same on every machine.
@@ -23,7 +24,7 @@ def bisect(points: npt.NDArray[np.float64], parts: int) -> npt.NDArray[np.int32]
         The part of every point, shape (n,).
     """
     part = np.zeros(len(points), dtype=np.int32)
-    todo: list[tuple[npt.NDArray[np.intp], int, int]] = [(np.arange(len(points)), 0, parts)]
+    todo: list[tuple[IndexArray, int, int]] = [(np.arange(len(points)), 0, parts)]
     while todo:
         these, first, number = todo.pop()
         if number == 1 or not len(these):
@@ -37,7 +38,7 @@ def bisect(points: npt.NDArray[np.float64], parts: int) -> npt.NDArray[np.int32]
     return part
 
 
-def by_position(points: npt.NDArray[np.float64], cells: npt.NDArray[np.int64]) -> Callable:
+def by_position(points: FloatArray, cells: Int64Array) -> Callable:
     """A partitioner for DOLFINx's `create_mesh`, which makes no ghost cells.
 
     It is better than the graph partitioners at what small meshes need: every rank gets cells as

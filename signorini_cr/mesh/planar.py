@@ -15,8 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from ..arrays import BoolArray, FloatArray, Int64Array
 
 _NEAR = 1e-12
 """Distance from a line, in parts of the lengths at hand, that counts as none."""
@@ -29,7 +28,11 @@ _AT_A_TIME = 1_000_000
 
 
 def overlap(
-    points: FloatArray, triangles: IntArray, sides: IntArray, count: IntArray, piece: IntArray
+    points: FloatArray,
+    triangles: Int64Array,
+    sides: Int64Array,
+    count: Int64Array,
+    piece: Int64Array,
 ) -> str | None:
     """Say where triangles overlap or do not meet side to side, if they do.
 
@@ -70,7 +73,7 @@ def _angles(corners: FloatArray) -> FloatArray:
     return np.arctan2(np.abs(cross), (u * v).sum(axis=-1))
 
 
-def _crowded(points: FloatArray, ccw: IntArray, vertex: int) -> bool:
+def _crowded(points: FloatArray, ccw: Int64Array, vertex: int) -> bool:
     """Whether two triangles that have a vertex in common overlap around it."""
     cell, corner = np.nonzero(ccw == vertex)
     first, last = points[ccw[cell, (corner + 1) % 3]], points[ccw[cell, (corner + 2) % 3]]
@@ -86,7 +89,7 @@ def _crowded(points: FloatArray, ccw: IntArray, vertex: int) -> bool:
     return False
 
 
-def _crossing(points: FloatArray, sides: IntArray) -> str | None:
+def _crossing(points: FloatArray, sides: Int64Array) -> str | None:
     """Say which two sides of the boundary cross, touch or run along each other, if any do."""
     for i, j in _close(points[sides] @ _DIRECTION):
         one, two = points[sides[i]], points[sides[j]]  # shape (pairs, 2 ends, 2)
@@ -105,7 +108,7 @@ def _crossing(points: FloatArray, sides: IntArray) -> str | None:
     return None
 
 
-def _close(along: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+def _close(along: FloatArray) -> Iterator[tuple[Int64Array, Int64Array]]:
     """Pairs of sides of which neither lies before the other.
 
     Args:
@@ -135,14 +138,14 @@ def _turn(side: FloatArray, x: FloatArray) -> FloatArray:
     return np.where(np.abs(left - right) > _NEAR * scale, np.sign(left - right), 0.0)
 
 
-def _cross(one: FloatArray, two: FloatArray) -> npt.NDArray[np.bool_]:
+def _cross(one: FloatArray, two: FloatArray) -> BoolArray:
     """Whether two sides have a point inside both in common, and no more."""
     return (_turn(one, two[:, 0]) * _turn(one, two[:, 1]) < 0) & (
         _turn(two, one[:, 0]) * _turn(two, one[:, 1]) < 0
     )
 
 
-def _touched(side: FloatArray, other: FloatArray) -> npt.NDArray[np.bool_]:
+def _touched(side: FloatArray, other: FloatArray) -> BoolArray:
     """Whether an end of the other lies inside the side."""
     u = side[:, 1] - side[:, 0]
     length = np.hypot(*u.T)
@@ -155,14 +158,18 @@ def _touched(side: FloatArray, other: FloatArray) -> npt.NDArray[np.bool_]:
     return found
 
 
-def _run_along(one: FloatArray, two: FloatArray) -> npt.NDArray[np.bool_]:
+def _run_along(one: FloatArray, two: FloatArray) -> BoolArray:
     """Whether two sides are the same and have the mesh on the same hand."""
     length = np.hypot(*(one[:, 1] - one[:, 0]).T)
     return (np.hypot(*(one - two).transpose(2, 0, 1)) <= _NEAR * length[:, None]).all(axis=1)
 
 
 def _nested(
-    points: FloatArray, triangles: IntArray, piece: IntArray, sides: IntArray, owner: IntArray
+    points: FloatArray,
+    triangles: Int64Array,
+    piece: Int64Array,
+    sides: Int64Array,
+    owner: Int64Array,
 ) -> str | None:
     """Say which piece of the mesh lies on another one, if any does."""
     pieces = np.unique(piece)
@@ -186,7 +193,7 @@ def _side(ends: FloatArray) -> str:
     return f"from {_point(ends[0])} to {_point(ends[1])}"
 
 
-def pieces(sides: npt.NDArray[np.integer], edges: int) -> npt.NDArray[np.int64]:
+def pieces(sides: npt.NDArray[np.integer], edges: int) -> Int64Array:
     """Number of the piece of every cell: the lowest cell it is connected with.
 
     Args:

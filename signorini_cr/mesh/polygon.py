@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import FloatArray
 from ..errors import InputError
 
 FARTHEST = 1e100
 """Largest coordinate: areas, and products of them, stay finite."""
 
 
-def coordinates(vertices: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def coordinates(vertices: npt.ArrayLike) -> FloatArray:
     """Vertices as a read-only array, shape (n, 2), if they are that and finite."""
     try:
         points = np.array(vertices, dtype=np.float64)
@@ -36,7 +37,7 @@ def coordinates(vertices: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return points
 
 
-def _point(x: npt.NDArray[np.float64]) -> str:
+def _point(x: FloatArray) -> str:
     return f"({x[0]:g}, {x[1]:g})"
 
 
@@ -51,7 +52,7 @@ def check_labels(labels: Sequence[str], edges: int, allowed: Sequence[str]) -> N
             raise InputError(f"edge {i} is labelled {label!r}: allowed are {', '.join(allowed)}")
 
 
-def check_loops(loops: Sequence[npt.NDArray[np.float64]]) -> None:
+def check_loops(loops: Sequence[FloatArray]) -> None:
     """Insist on simple loops, apart from each other, the first around all the others.
 
     Edges touch if they come closer than 1e-12 of the polygon's extent.
@@ -103,15 +104,13 @@ def _where(ring: int) -> str:
     return f" of hole {ring - 1}" if ring else ""
 
 
-def _side(
-    a: npt.NDArray[np.float64], b: npt.NDArray[np.float64], x: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def _side(a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
     """Sign of the area of the triangles a, b, x."""
     u, v = b - a, x - a
     return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
 
-def _inside(x: npt.NDArray[np.float64], loop: npt.NDArray[np.float64]) -> bool:
+def _inside(x: FloatArray, loop: FloatArray) -> bool:
     """Whether a point, not on the loop, lies inside: a ray to the right crosses it oddly often."""
     a, b = loop, np.roll(loop, -1, axis=0)
     spans = (a[:, 1] > x[1]) != (b[:, 1] > x[1])

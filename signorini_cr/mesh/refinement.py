@@ -15,13 +15,12 @@ from dolfinx.mesh import CellType, Mesh, RefinementOption, meshtags
 from dolfinx.mesh import refine as refine_edges
 
 from .. import compat
+from ..arrays import Int32Array
 from ..errors import InputError
 from .domain import Domain
 
-IntArray = npt.NDArray[np.int32]
 
-
-def refine(domain: Domain) -> tuple[Domain, IntArray]:
+def refine(domain: Domain) -> tuple[Domain, Int32Array]:
     r"""Cut every triangle into four similar ones; collective.
 
     Child k < 3 of a cell keeps its vertex k, child 3 lies in the middle; m_i is the midpoint of
@@ -71,7 +70,7 @@ def refine(domain: Domain) -> tuple[Domain, IntArray]:
     return Domain(fine, _child_tags(domain, fine, facets)), parent
 
 
-def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, IntArray]:
+def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, Int32Array]:
     """Halve the sides of the marked triangles, and what else conformity takes; collective.
 
     Sides are halved by bisecting longest edges first, which keeps the angles bounded from below
@@ -129,9 +128,9 @@ def _third(k: int, j: int) -> int:
     return 3 - k - j if k != j else k
 
 
-def _table(links: Any) -> IntArray:
+def _table(links: Any) -> Int32Array:
     """A connectivity with equally many links for each entity, as a table."""
-    array: IntArray = links.array
+    array: Int32Array = links.array
     return array.reshape(links.num_nodes, -1) if links.num_nodes else array.reshape(0, 3)
 
 
@@ -165,12 +164,12 @@ class _Vertices(NamedTuple):
     """
 
     index_map: Any
-    corner: IntArray
-    middle: IntArray
+    corner: Int32Array
+    middle: Int32Array
     x: npt.NDArray[np.floating]
 
 
-def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertices:
+def _number_vertices(mesh: Mesh, corners: Int32Array, facets: Int32Array) -> _Vertices:
     """Number the fine vertices; each stays with the rank of its coarse vertex or facet.
 
     They are numbered as the cells meet them, so that neighbours have numbers that lie close
@@ -214,7 +213,7 @@ def _number_vertices(mesh: Mesh, corners: IntArray, facets: IntArray) -> _Vertic
 
 
 def _coordinates(
-    mesh: Mesh, corners: IntArray, corner: IntArray, middle: IntArray, count: int
+    mesh: Mesh, corners: Int32Array, corner: Int32Array, middle: Int32Array, count: int
 ) -> npt.NDArray[np.floating]:
     """Where the fine vertices are.
 
@@ -235,7 +234,7 @@ def _coordinates(
     return x[:-1]
 
 
-def _first_places(table: IntArray, count: int) -> IntArray:
+def _first_places(table: Int32Array, count: int) -> Int32Array:
     """Where each of the numbers below ``count`` first stands in a table.
 
     Those of entities that no cell of this rank meets follow behind the table, one by one.
@@ -246,7 +245,7 @@ def _first_places(table: IntArray, count: int) -> IntArray:
     return first
 
 
-def _ghosts_in(index_map: Any, entities: IntArray) -> IntArray:
+def _ghosts_in(index_map: Any, entities: Int32Array) -> Int32Array:
     """Which of the ghost entities belong to cells of this rank: all, unless it has ghost cells."""
     seen = np.zeros(index_map.num_ghosts, dtype=bool)
     seen[entities[entities >= index_map.size_local] - index_map.size_local] = True
@@ -256,10 +255,10 @@ def _ghosts_in(index_map: Any, entities: IntArray) -> IntArray:
 def _give_facets(
     topology: Any,
     coarse: Mesh,
-    corners: IntArray,
-    facets: IntArray,
+    corners: Int32Array,
+    facets: Int32Array,
     vertices: _Vertices,
-    m: IntArray,
+    m: Int32Array,
 ) -> None:
     """Hand over the fine facets: the halves 2 f and 2 f + 1 of facet f, then three in each cell.
 
@@ -320,13 +319,13 @@ def _give_facets(
     )
 
 
-def _ascending(a: IntArray, b: IntArray, pairs: IntArray) -> None:
+def _ascending(a: Int32Array, b: Int32Array, pairs: Int32Array) -> None:
     """Write pairs of numbers, the smaller one first."""
     np.minimum(a, b, out=pairs[:, 0])
     np.maximum(a, b, out=pairs[:, 1])
 
 
-def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: IntArray) -> Mesh:
+def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: Int32Array) -> Mesh:
     """Put a mesh together whose nodes are numbered like its vertices."""
     index_map = vertices.index_map
     number = np.concatenate([np.arange(*index_map.local_range, dtype=np.int64), index_map.ghosts])
@@ -338,7 +337,7 @@ def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: IntArray) 
     return Mesh(mesh, ufl.Mesh(coarse.ufl_domain().ufl_coordinate_element()))
 
 
-def _child_tags(domain: Domain, fine: Mesh, facets: IntArray) -> Any:
+def _child_tags(domain: Domain, fine: Mesh, facets: Int32Array) -> Any:
     """The boundary parts on the fine mesh: facet j of a cell is shared out to two of its children.
 
     Args:

@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import Int32Array
 from ..garbage import release
 from ..options import (
     ALONE_PREFIX,
@@ -27,8 +27,6 @@ from ..options import (
     defaults,
     read,
 )
-
-IntArray = npt.NDArray[np.int32]
 
 DIRECT = 2000
 """Bottom spaces of up to this many dofs are factorised, on every rank; AMG has the others."""
@@ -66,10 +64,10 @@ class Bottom:
         self._matrix, self._prefix = matrix, ALONE_PREFIX if alone else BOTTOM_PREFIX
         self._type, self._options = _choice(matrix, dimension, alone)
         self._pc: PETSc.PC | None = None
-        self._constrained: IntArray | None = None
+        self._constrained: Int32Array | None = None
         self._stale = True
 
-    def constrain(self, dofs: IntArray) -> None:
+    def constrain(self, dofs: Int32Array) -> None:
         """Note which owned dofs are constrained from now on; collective."""
         known = self._constrained is not None and np.array_equal(dofs, self._constrained)
         comm = self._matrix.getComm().tompi4py()

@@ -17,15 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..garbage import release
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 
 
 def rows_of(
     A: PETSc.Mat, numbers: npt.NDArray[np.integer]
-) -> tuple[IntArray, IntArray, FloatArray]:
+) -> tuple[Int32Array, Int32Array, FloatArray]:
     """Some rows of A, which may be those of other ranks; collective.
 
     PETSc has submatrices on several ranks, too, but they take a time that grows with A.
@@ -40,7 +38,7 @@ def rows_of(
     rows = PETSc.IS().createGeneral(numbers.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
     columns = PETSc.IS().createStride(A.getSize()[1], 0, 1, PETSc.COMM_SELF)
     (matrix,) = A.createSubMatrices(rows, columns)
-    csr: tuple[IntArray, IntArray, FloatArray] = matrix.getValuesCSR()
+    csr: tuple[Int32Array, Int32Array, FloatArray] = matrix.getValuesCSR()
     release(rows, columns, matrix)
     return csr
 
@@ -60,7 +58,7 @@ class ConstrainedMatrix:
         diagonal: Their diagonal entries of A, shape (n,).
     """
 
-    def __init__(self, A: PETSc.Mat, dofs: IntArray):
+    def __init__(self, A: PETSc.Mat, dofs: Int32Array):
         """Note the rows and columns of all dofs that may ever be constrained; collective."""
         self.matrix, self.dofs = A, dofs
         numbers = numbers_of(A, dofs)
@@ -87,7 +85,7 @@ class ConstrainedMatrix:
         A.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
 
     @contextmanager
-    def constrained(self, dofs: IntArray) -> Iterator[IntArray]:
+    def constrained(self, dofs: Int32Array) -> Iterator[Int32Array]:
         """Have the identity in the rows and columns of some dofs for a block; collective at entry.
 
         Args:
@@ -133,23 +131,23 @@ class ConstrainedMatrix:
         """Free everything but the matrix."""
         release(self._rows, self._product, self._at_columns, self._to_columns)
 
-    def _marks(self, numbers: IntArray) -> npt.NDArray[np.bool_]:
+    def _marks(self, numbers: Int32Array) -> BoolArray:
         """Which owned dofs any rank names by their global numbers; collective."""
         marks = self.matrix.createVecRight()
         add = PETSc.InsertMode.ADD_VALUES
         marks.setValues(numbers.astype(PETSc.IntType, copy=False), np.ones(len(numbers)), add)
         marks.assemble()
-        found: npt.NDArray[np.bool_] = marks.array_r > 0.0
+        found: BoolArray = marks.array_r > 0.0
         release(marks)
         return found
 
-    def _seen(self, marks: PETSc.Vec) -> npt.NDArray[np.bool_]:
+    def _seen(self, marks: PETSc.Vec) -> BoolArray:
         """The marks of the dofs whose columns this rank has entries in; collective."""
         self._to_columns.scatter(marks, self._at_columns)
-        seen: npt.NDArray[np.bool_] = self._at_columns.array_r > 0.0
+        seen: BoolArray = self._at_columns.array_r > 0.0
         return seen
 
-    def _write(self, which: npt.NDArray[np.intp], values: FloatArray) -> None:
+    def _write(self, which: IndexArray, values: FloatArray) -> None:
         """Write entries of own rows, which concerns no other rank as the pattern stays."""
         start = np.arange(len(which) + 1, dtype=PETSc.IntType)
         local = PETSc.Mat.Option.NO_OFF_PROC_ENTRIES

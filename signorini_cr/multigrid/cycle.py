@@ -28,18 +28,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import Int32Array
 from ..garbage import release
 from .bottom import Bottom, is_small
 from .constrained import ConstrainedMatrix, numbers_of
 from .parents import Layout
 from .smoothing import GaussSeidel
 from .transfer import Transfer
-
-IntArray = npt.NDArray[np.int32]
 
 PATIENCE = 40
 """CG steps on one mesh after which the chain is given up in a linear system that takes many.
@@ -75,7 +73,7 @@ class Grid:
         self,
         operator: ConstrainedMatrix,
         dofs: Layout,
-        dirichlet: IntArray,
+        dirichlet: Int32Array,
         transfer: Transfer | None = None,
         sweeps: int = SWEEPS,
         alone: bool = False,
@@ -104,7 +102,7 @@ class Grid:
         return self.operator.matrix
 
     @contextmanager
-    def constrained(self, dofs: IntArray) -> Iterator[IntArray]:
+    def constrained(self, dofs: Int32Array) -> Iterator[Int32Array]:
         """Leave dofs out for a block; collective at entry.
 
         Args:
@@ -125,7 +123,7 @@ class Grid:
             finally:
                 self.held = self.dirichlet
 
-    def rounding(self, x: PETSc.Vec, constrained: IntArray) -> float:
+    def rounding(self, x: PETSc.Vec, constrained: Int32Array) -> float:
         """Norm of the diagonal times x over the free dofs: what the residual's digits are lost in.
 
         Args:
@@ -157,7 +155,7 @@ class TwoGrids:
         self._residual = matrix.createVecRight()
         self._b_coarse, self._x_coarse = transfer.coarse_vector(), transfer.coarse_vector()
 
-    def constrain(self, dofs: IntArray) -> None:
+    def constrain(self, dofs: Int32Array) -> None:
         """Note which owned dofs are constrained from now on."""
         self._smoother.constrain(dofs)
 
@@ -234,7 +232,7 @@ class Multigrid:
         self.grids, self.given_up = [self._replacement], True
 
     @contextmanager
-    def constrained(self, dofs: IntArray, deep: bool = True) -> Iterator[None]:
+    def constrained(self, dofs: Int32Array, deep: bool = True) -> Iterator[None]:
         """Leave dofs out of the finest space for a block, and what needs them out of the others.
 
         All matrices are whole again after the block, whatever happens in it; collective at entry.

@@ -20,12 +20,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from petsc4py import PETSc
 
+from ..arrays import Int32Array
 from ..fem.physics import OnMesh, Physics
 from ..garbage import hold, release, sweep
 from ..mesh.domain import Domain
@@ -42,8 +41,6 @@ from .cycle import (
 from .parents import Layout, Parents
 from .pattern import empty_matrix
 from .transfer import Transfer, inclusion, prolongation
-
-IntArray = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +87,7 @@ class Hierarchy:
         self._operators: list[ConstrainedMatrix] = []  # that belong to the chain alone
         self._given_up = False
 
-    def add(self, domain: Domain, parent_cell: IntArray) -> None:
+    def add(self, domain: Domain, parent_cell: Int32Array) -> None:
         """Add a mesh.
 
         Args:
@@ -102,7 +99,7 @@ class Hierarchy:
         self.meshes = (*self.meshes, NestedMesh(finest.physics, domain, parents))
 
     @contextmanager
-    def multigrid(self, operator: ConstrainedMatrix, dirichlet: IntArray) -> Iterator[Multigrid]:
+    def multigrid(self, operator: ConstrainedMatrix, dirichlet: Int32Array) -> Iterator[Multigrid]:
         """Lend the cycle that starts with the discrete space on the finest mesh; collective.
 
         Args:
@@ -135,7 +132,7 @@ class Hierarchy:
         self._free_operators()
         self._chain = []
 
-    def _discrete_space(self, operator: ConstrainedMatrix, dirichlet: IntArray) -> Grid:
+    def _discrete_space(self, operator: ConstrainedMatrix, dirichlet: Int32Array) -> Grid:
         """Prepare the discrete space, and the chain below it if there is to be one."""
         mesh = self.meshes[-1]
         dofs = Layout.of_space(mesh.V)
@@ -187,7 +184,7 @@ def _free(grid: Grid) -> None:
 
 
 @defaults(MATRICES, prefix="")
-def conforming(mesh: NestedMesh) -> tuple[ConstrainedMatrix, Layout, IntArray]:
+def conforming(mesh: NestedMesh) -> tuple[ConstrainedMatrix, Layout, Int32Array]:
     """P1 beside CR on a mesh: its matrix, its dofs, and those of them on Γ0; collective."""
     data = mesh.data
     p1 = Layout.of_p1(mesh.domain.mesh, data.V.dofmap.index_map_bs)

@@ -13,17 +13,14 @@ from typing import Any
 
 import basix
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from .. import compat
+from ..arrays import FloatArray, Int32Array
 from ..fem.physics import Imposed
 from ..fem.space import facet_corners, facet_entities, function_space, shared_sum
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
 """No edge or median of a cell is at right angles to it, unless on purpose."""
@@ -46,7 +43,7 @@ class Layout:
     """
 
     mesh: Mesh
-    cells: IntArray
+    cells: Int32Array
     index_map: Any
     cr: bool
     block: int = 1
@@ -75,7 +72,7 @@ class Layout:
         nodes: int = self.index_map.size_local + self.index_map.num_ghosts
         return self.block * nodes
 
-    def numbers(self, dofs: IntArray) -> IntArray:
+    def numbers(self, dofs: Int32Array) -> Int32Array:
         """Global numbers of local dofs."""
         if self.mesh.comm.size == 1:
             return dofs
@@ -83,19 +80,19 @@ class Layout:
         numbers = self.index_map.local_to_global(nodes).astype(PETSc.IntType) * self.block
         return (numbers + component).reshape(dofs.shape)
 
-    def ends(self, facets: IntArray) -> IntArray:
+    def ends(self, facets: Int32Array) -> Int32Array:
         """The nodes of P1 at the vertices of exterior facets, shape (n, d)."""
         cells, local = facet_entities(self.mesh, facets).T
-        ends: IntArray = self.cells[cells[:, None], facet_corners(self.mesh)[local]]
+        ends: Int32Array = self.cells[cells[:, None], facet_corners(self.mesh)[local]]
         return ends
 
-    def owned_at(self, imposed: Sequence[Imposed]) -> IntArray:
+    def owned_at(self, imposed: Sequence[Imposed]) -> Int32Array:
         """The owned dofs of P1 at whose vertices any rank has something imposed, ascending."""
         dofs = [self.block * self.ends(i.facets)[:, :, None] + i.components for i in imposed]
         none = np.empty(0, dtype=np.int32)
         return self.owned_among(np.concatenate([none, *(each.ravel() for each in dofs)]))
 
-    def owned_among(self, dofs: IntArray) -> IntArray:
+    def owned_among(self, dofs: Int32Array) -> Int32Array:
         """The owned dofs among those that any rank names, local numbers, ascending."""
         named = np.zeros(self.local)
         named[dofs] = 1.0
@@ -114,7 +111,7 @@ class Parents:
         cell: For each local fine cell the local coarse cell that holds it.
     """
 
-    def __init__(self, coarse: Mesh, fine: Mesh, cell: IntArray):
+    def __init__(self, coarse: Mesh, fine: Mesh, cell: Int32Array):
         """Relate two nested meshes."""
         self.cell = cell
         self._coarse, self._fine = coarse, fine

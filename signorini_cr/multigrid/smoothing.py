@@ -8,15 +8,13 @@ each sweep; only few rows have entries of other ranks, and they alone are correc
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import IndexArray, Int32Array
 from ..garbage import release
 from .constrained import numbers_of, rows_of
 from .parents import Layout
-
-IntArray = npt.NDArray[np.int32]
 
 OVER_RELAXATION = 1.3
 """ω where nothing is against it."""
@@ -55,14 +53,14 @@ class GaussSeidel:
             return
         self._rows, self._between, radius = _entries_between_ranks(matrix, dofs)
         self.relaxation = min(OVER_RELAXATION, 0.99 * 2.0 / (1.0 + radius))
-        self._constrained: npt.NDArray[np.intp] = np.empty(0, dtype=np.intp)
+        self._constrained: IndexArray = np.empty(0, dtype=np.intp)
         self._share = self._between.createVecLeft()
         self._local = matrix.getDiagonalBlock()
         whole = matrix.createVecRight()
         self._b, self._x = self._local.createVecLeft(), whole.createLocalVector()
         release(whole)
 
-    def constrain(self, dofs: IntArray) -> None:
+    def constrain(self, dofs: Int32Array) -> None:
         """Note the owned dofs whose rows and columns are the identity's now, and x = 0 there."""
         if not self._alone:
             self._constrained = np.flatnonzero(np.isin(self._rows, dofs))
@@ -97,7 +95,7 @@ class GaussSeidel:
             x.restoreLocalVector(self._x)
 
 
-def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, PETSc.Mat, float]:
+def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[Int32Array, PETSc.Mat, float]:
     """The entries of owned rows in columns of other ranks.
 
     Returns:

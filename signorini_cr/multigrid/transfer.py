@@ -18,10 +18,11 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import FloatArray, Int32Array
 from ..fem.space import ghosted, shared_sum
 from ..garbage import release
 from .constrained import rows_of
-from .parents import FloatArray, IntArray, Layout, Parents
+from .parents import Layout, Parents
 
 
 class Transfer:
@@ -35,8 +36,8 @@ class Transfer:
         self,
         coarse: Layout,
         fine: Layout,
-        lengths: IntArray | int,
-        dofs: IntArray,
+        lengths: Int32Array | int,
+        dofs: Int32Array,
         values: FloatArray,
     ):
         """Take the entries as they are, one row after the other.
@@ -83,7 +84,7 @@ class Transfer:
         b.restoreLocalVector(self._own, readonly=True)
         b_coarse.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
 
-    def coarse_support(self, dofs: IntArray) -> IntArray:
+    def coarse_support(self, dofs: Int32Array) -> Int32Array:
         """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
         _, columns, values = rows_of(self._rows, dofs)
         return self._coarse.owned_among(columns[values != 0.0])
@@ -102,8 +103,8 @@ class Transfer:
 
 
 def _for_each_unknown(
-    fine: Layout, lengths: IntArray | int, nodes: IntArray, values: FloatArray
-) -> tuple[IntArray, IntArray, FloatArray]:
+    fine: Layout, lengths: Int32Array | int, nodes: Int32Array, values: FloatArray
+) -> tuple[Int32Array, Int32Array, FloatArray]:
     """Repeat the rows of nodes for each of their unknowns, and number columns by unknowns."""
     block, rows = fine.block, fine.index_map.size_local
     lengths = np.full(rows, lengths) if isinstance(lengths, int) else lengths

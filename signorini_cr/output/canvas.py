@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatArray
 from .files import disk_errors
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Where = str | os.PathLike[str]
-FloatArray = npt.NDArray[np.float64]
 
 # Told apart by colour-blind eyes and in grey
 BLUE, RED, YELLOW, GREY = "#004488", "#BB5566", "#DDAA33", "#777777"

@@ -12,10 +12,10 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx.mesh import Mesh, entities_to_geometry
 from mpi4py import MPI
 
+from ..arrays import FloatArray
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
 from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain
@@ -38,7 +38,6 @@ from .raster import raster
 if TYPE_CHECKING:
     from ..solution import Solution
 
-FloatArray = npt.NDArray[np.float64]
 Where = str | os.PathLike[str]
 
 STYLES: dict[int, dict[str, Any]] = {

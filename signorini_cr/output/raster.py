@@ -5,15 +5,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
+from ..arrays import FloatArray, Int64Array
 from ..compat import cell_nodes
 from ..fem.space import vertex_values
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int_]
 AT_ONCE = 2**20
 """Pairs of a pixel and a cell near it that are looked at in one go."""
 
@@ -92,7 +90,7 @@ def _paint(image: FloatArray, x: FloatArray, y: FloatArray, values: FloatArray) 
         np.maximum.at(image.reshape(-1), pixel, value)
 
 
-def _between(x: FloatArray) -> tuple[IntArray, IntArray]:
+def _between(x: FloatArray) -> tuple[Int64Array, Int64Array]:
     """The first whole number between the least and the greatest of each column, and how many."""
     first = np.ceil(x.min(axis=0) - 1e-9).astype(int)
     return first, np.maximum(np.floor(x.max(axis=0) + 1e-9).astype(int) - first + 1, 0)

@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from .. import compat
+from ..arrays import FloatArray, Int32Array
 from ..fem.problem import Data, Forms, as_expression
 from ..fem.space import facet_entities, facet_quadrature, vertex_values
 from ..solution import Solution
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def rates(h: Sequence[float], errors: Sequence[float]) -> FloatArray:
@@ -95,9 +93,7 @@ def cell_gradients(u: fem.Function) -> tuple[FloatArray, FloatArray]:
     return np.linalg.solve(edges, rises)[..., 0], volumes
 
 
-def facet_values(
-    mesh: Mesh, data: Data, facets: npt.NDArray[np.int32], points: FloatArray
-) -> FloatArray:
+def facet_values(mesh: Mesh, data: Data, facets: Int32Array, points: FloatArray) -> FloatArray:
     """Evaluate data at the same points of each facet; collective.
 
     Args:

@@ -24,6 +24,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
+from ..arrays import Int32Array
 from ..fem.problem import Data, as_expression
 from ..fem.space import facet_quadrature, facet_to_dof, function_space
 from ..jit import compiled
@@ -31,8 +32,6 @@ from ..mesh.domain import CONTACT, DIRICHLET, Domain
 from ..solution import Solution
 from .exact import Example
 from .norms import facet_values
-
-FloatArray = npt.NDArray[np.float64]
 
 BOUND, MIXED, FREE = 0, 1, 2
 """The sets (2.2): facets inside Γ1⁰, where u = α; those in both; those inside Γ1⁺, where u > α."""
@@ -228,7 +227,7 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
 _DIRICHLET, _NEUMANN, _INTERIOR = 3, 4, 5
 
 
-def _sides(domain: Domain, sets: npt.NDArray[np.int8]) -> dict[int, npt.NDArray[np.int32]]:
+def _sides(domain: Domain, sets: npt.NDArray[np.int8]) -> dict[int, Int32Array]:
     """The sides of the owned cells by kind: BOUND, MIXED, FREE, Γ0, Γg, or both sides inside.
 
     DOLFINx takes any list of sides for a one-sided integral, interior facets' as well; thus no

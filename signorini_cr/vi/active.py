@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-IntArray = npt.NDArray[np.int32]
-FloatArray = npt.NDArray[np.float64]
+from ..arrays import BoolArray, FloatArray, Int32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,15 +19,15 @@ class ActiveSet:
         mask: Which of them are active, shape (n,).
     """
 
-    bounded: IntArray
-    mask: npt.NDArray[np.bool_]
+    bounded: Int32Array
+    mask: BoolArray
 
     def __post_init__(self) -> None:
         """Close the mask for writing."""
         self.mask.setflags(write=False)
 
     @classmethod
-    def of(cls, bounded: IntArray, gap: FloatArray | float, force: FloatArray) -> ActiveSet:
+    def of(cls, bounded: Int32Array, gap: FloatArray | float, force: FloatArray) -> ActiveSet:
         """Apply the criterion of the reduced-space method: u_i ≤ α_i and (A u − b)_i > 0.
 
         Args:
@@ -39,7 +38,9 @@ class ActiveSet:
         return cls(bounded, (gap <= 0.0) & (force > 0.0))
 
     @classmethod
-    def without(cls, bounded: IntArray, inactive: npt.NDArray[np.integer], size: int) -> ActiveSet:
+    def without(
+        cls, bounded: Int32Array, inactive: npt.NDArray[np.integer], size: int
+    ) -> ActiveSet:
         """Take over what PETSc has decided.
 
         Args:
@@ -52,6 +53,6 @@ class ActiveSet:
         return cls(bounded, outside[bounded])
 
     @property
-    def dofs(self) -> IntArray:
+    def dofs(self) -> Int32Array:
         """The active dofs, local numbers, ascending."""
         return self.bounded[self.mask]

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
+from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.physics import OnMesh
 from ..fem.space import facet_measures
 from ..fem.walk import along_boundary
@@ -22,8 +23,6 @@ from .active import ActiveSet
 from .solver import Iterations
 from .stopping import NOISE
 from .system import System
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -74,13 +73,13 @@ class Contact:
     """
 
     comm: MPI.Comm
-    facets: npt.NDArray[np.int32]
+    facets: Int32Array
     vertices: FloatArray
     measure: FloatArray
     obstacle: FloatArray
     u: FloatArray
     pressure: FloatArray
-    active: npt.NDArray[np.bool_]
+    active: BoolArray
     gap_at_vertices: FloatArray
     active_set: ActiveSet
     force: float
@@ -139,7 +138,7 @@ def contact_facts(
         return layout.shared_sum(everywhere)[dofs]
 
     state = on_facets(np.where(at_dofs.active.mask, 1.0, -1.0))
-    is_active: npt.NDArray[np.bool_] = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
+    is_active: BoolArray = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
     obstacle, local = system.obstacle_at_vertices, data.at_vertices(u, facets)
     fields: dict[str, npt.NDArray] = {
         "vertices": vertices,

@@ -16,12 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from .. import compat
+from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.space import (
     facet_corners,
     facet_entities,
@@ -35,9 +35,6 @@ from .active import ActiveSet
 from .level import Level
 from .solved import Solved
 from .system import System
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 
 ENOUGH = 0.5
 """Part of the parent's force from which on the residual is left as the prolongation has it."""
@@ -96,7 +93,7 @@ def _put_on_bounds(start: fem.Function, system: System, active: ActiveSet) -> No
 
 
 def _make_forces(
-    start: fem.Function, vector: PETSc.Vec, system: System, facets: IntArray, force: FloatArray
+    start: fem.Function, vector: PETSc.Vec, system: System, facets: Int32Array, force: FloatArray
 ) -> None:
     """Make forces the residual of active facets where it is far from them; collective.
 
@@ -136,12 +133,12 @@ class _Inherited:
         at_front: Whether contact begins or ends at one of the parent's vertices, shape (n,).
     """
 
-    active: npt.NDArray[np.bool_]
+    active: BoolArray
     force: FloatArray
-    at_front: npt.NDArray[np.bool_]
+    at_front: BoolArray
 
     @classmethod
-    def of(cls, coarse: Solved, level: Level, facets: IntArray) -> _Inherited:
+    def of(cls, coarse: Solved, level: Level, facets: Int32Array) -> _Inherited:
         """Ask the parents of some fine contact facets; collective."""
         mesh, V = coarse.domain.mesh, coarse.u.function_space
         assert level.parents is not None
@@ -165,7 +162,7 @@ class _Inherited:
         return cls(active, force, _front(coarse)[ends].any(axis=1))
 
 
-def _front(solution: Solved) -> npt.NDArray[np.bool_]:
+def _front(solution: Solved) -> BoolArray:
     """Whether contact begins or ends at a vertex, for all local ones; collective."""
     contact, p1 = solution.contact, Layout.of_p1(solution.domain.mesh)
     ends = p1.ends(contact.facets)

@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
 from .. import compat
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import raise_together
 from ..fem.space import shared_maximum
 from ..garbage import release
@@ -40,10 +40,10 @@ class Loose:
     """
 
     count: int
-    piece: npt.NDArray[np.intp]
+    piece: IndexArray
 
     @classmethod
-    def of(cls, V: fem.FunctionSpace, dirichlet: npt.NDArray[np.int32]) -> Loose:
+    def of(cls, V: fem.FunctionSpace, dirichlet: Int32Array) -> Loose:
         """Find them; collective.
 
         Args:
@@ -128,15 +128,15 @@ class Loose:
                 x[there] = np.where(lower > PETSc.NINFINITY, lower, bottom[piece] - below)[there]
 
 
-def _cell_dofs(V: fem.FunctionSpace) -> npt.NDArray[np.int32]:
+def _cell_dofs(V: fem.FunctionSpace) -> Int32Array:
     """Dofs of the owned cells that hang together, a row for each of a node's unknowns."""
     topology, block = V.mesh.topology, V.dofmap.index_map_bs
     nodes = V.dofmap.list[: topology.index_map(topology.dim).size_local, None]
-    dofs: npt.NDArray[np.int32] = block * nodes + np.arange(block, dtype=np.int32)[:, None]
+    dofs: Int32Array = block * nodes + np.arange(block, dtype=np.int32)[:, None]
     return dofs.reshape(-1, nodes.shape[-1])
 
 
-def _labels(V: fem.FunctionSpace) -> npt.NDArray[np.float64]:
+def _labels(V: fem.FunctionSpace) -> FloatArray:
     """For each local dof the largest number of all dofs that it is connected with; collective."""
     dofs, layout = _cell_dofs(V), Layout.of_space(V)
     piece = pieces(dofs, layout.local)

@@ -17,16 +17,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from petsc4py import PETSc
 
+from ..arrays import FloatArray
 from ..garbage import release
 from ..multigrid.cycle import PATIENCE, SLOW, Grid, Multigrid
 from ..options import PREFIX, REDUCED, defaults, read
 from .active import ActiveSet
 from .stopping import FORCES, LOST, NOISE, Stiffness
-
-FloatArray = npt.NDArray[np.float64]
 
 LINEAR_SHARE = 0.9
 """What the linear solver leaves at the end, in parts of what the residual may be."""

@@ -16,10 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import FloatArray
 from ..errors import InputError, NotConverged, fail_together
 from ..garbage import release
 from ..multigrid.cycle import Multigrid
@@ -47,7 +47,6 @@ GAIN = 0.5
 DIVERGED_NAN, DIVERGED_ROUNDING = -4, -5
 """PETSc's number for what is not finite, whose name depends on the version, and for "no gain"."""
 
-FloatArray = npt.NDArray[np.float64]
 
 Monitor = Callable[[int, float, int, int], None]
 """Called after each step, on the ranks that have one: step, residual norm, active dofs, linear

@@ -23,15 +23,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..garbage import release
 from ..multigrid.cycle import Grid
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int32]
 
 DECADES = 2.0
 """Dofs whose diagonal entries are within so many powers of ten make a class."""
@@ -94,7 +91,7 @@ class Stiffness:
             self._differences, self._weights = _differences(grid.matrix)
         release(diagonal)
 
-    def _classes(self, diagonal: FloatArray) -> npt.NDArray[np.intp]:
+    def _classes(self, diagonal: FloatArray) -> IndexArray:
         decades = np.log10(diagonal / self._smallest) / DECADES
         return np.maximum(decades, 0.0).astype(np.intp)
 
@@ -103,7 +100,7 @@ class Stiffness:
         sums = np.bincount(self.bounded, values, minlength=self.number)
         return sums.astype(np.float64, copy=False)
 
-    def magnitude(self, x: PETSc.Vec, which: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+    def magnitude(self, x: PETSc.Vec, which: BoolArray | None = None) -> FloatArray:
         """Sum up |A| |x| over the bounded dofs of each class, shape (classes,); collective.
 
         Args:
@@ -128,7 +125,7 @@ class Stiffness:
         r.array[:] += self._row_sums * x.array_r - b.array_r
         release(flows)
 
-    def imbalance(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec, active: IntArray) -> float:
+    def imbalance(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec, active: Int32Array) -> float:
         """Compute the largest ‖r‖ / ‖flows‖ of all classes, 0 for what is lost in rounding.
 
         Args:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import InputError, raise_together
 from ..fem.physics import Imposed, OnMesh
 from ..fem.space import ghosted_vector, shared_maximum, unknowns
@@ -22,8 +22,6 @@ from ..multigrid.constrained import ConstrainedMatrix
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import MATRICES, defaults
-
-FloatArray = npt.NDArray[np.float64]
 
 ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
@@ -110,7 +108,7 @@ class System:
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
         self.residual_scale = self._scale(bounded)
 
-    def _scale(self, bounded: npt.NDArray[np.bool_]) -> float:
+    def _scale(self, bounded: BoolArray) -> float:
         """Measure the trivial start's residual.
 
         Args:
@@ -138,7 +136,7 @@ class System:
         return ConstrainedMatrix(self.A, self.bounded)
 
     @property
-    def owned_dirichlet(self) -> npt.NDArray[np.int32]:
+    def owned_dirichlet(self) -> Int32Array:
         """The owned ones of the dofs on Γ0."""
         return self.dirichlet[self.dirichlet < self.A.getLocalSize()[0]]
 
@@ -154,7 +152,7 @@ class System:
             release(vectors.b, vectors.lower, vectors.x, vectors.residual)
 
     @property
-    def held(self) -> npt.NDArray[np.int32]:
+    def held(self) -> Int32Array:
         """Local dofs on Γ0, or on which a_h(1, ·) does not vanish; collective."""
         of_constants = self._data.of_constants()
         if of_constants is None:
@@ -210,9 +208,7 @@ class System:
         return norm
 
 
-def _imposed(
-    imposed: Sequence[Imposed], V: fem.FunctionSpace
-) -> tuple[npt.NDArray[np.bool_], fem.Function]:
+def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:
     """Data on the boundary as the element takes them: CR facet means, P1 values at vertices.
 
     Returns:
