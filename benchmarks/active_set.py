@@ -38,7 +38,7 @@ def forces(solution: Solution) -> npt.NDArray[np.float64]:
     system = solution.level.system
     dofs, diagonal = system.bounded, system.A.getDiagonal().array_r
     gap = solution.u.x.array[dofs] - system.lower[dofs]
-    return (solution.residual.x.array[dofs] - diagonal[dofs] * gap) / system.load
+    return (solution.residual.x.array[dofs] - diagonal[dofs] * gap) / system.residual_scale
 
 
 def wrong(solution: Solution, exact: Solution) -> str:
@@ -55,7 +55,7 @@ def row(name: str, dofs: float, repeats: int) -> list[str]:
     own = finest(name, dofs)
     with defaults(DIRECT):
         cold = finest(name, dofs, nested=False)
-        with defaults({"snes_atol": 1e-13 * own.level.system.load}):
+        with defaults({"snes_atol": 1e-13 * own.level.system.residual_scale}):
             exact = finest(name, dofs, nested=False)
     three, both = (own, cold, exact), (own, cold)
     return [

@@ -20,10 +20,12 @@ from harness import command_line, in_turns, keep_memory, tabulate
 from petsc4py import PETSc
 
 from signorini_cr import exact, solve
-from signorini_cr.fem.problem import Forms, Problem
+from signorini_cr.diffusion import Diffusion
+from signorini_cr.fem.problem import Problem
 from signorini_cr.fem.space import ghosted_vector
 from signorini_cr.mesh.domain import Domain
-from signorini_cr.vi.assembly import Level
+from signorini_cr.multigrid.hierarchy import Hierarchy, NestedMesh
+from signorini_cr.vi.level import Level
 
 HEAD = (
     "mesh",
@@ -40,26 +42,25 @@ HEAD = (
 
 def two_levels(level: Level, b: PETSc.Vec) -> tuple[float, int]:
     """Time and steps of the program's method, set-up included."""
-    for name in ("grid", "conforming"):
-        level.__dict__.pop(name, None)
-    A, x, steps = level.system.A, b.duplicate(), 0
+    system, x, steps = level.system, b.duplicate(), 0
 
     def action() -> None:
         nonlocal steps
-        grid = level.grid
-        grid.fix(level.system.dirichlet[:0])
-        ksp = PETSc.KSP().create(A.getComm())
-        ksp.setOperators(grid.matrix)
-        ksp.setType("cg")
-        ksp.setTolerances(rtol=1e-8)
-        ksp.getPC().setType("python")
-        ksp.getPC().setPythonContext(grid)
-        ksp.solve(b, x)
-        steps = ksp.getIterationNumber()
-        ksp.destroy()
+        hierarchy = Hierarchy(level.physics, level.domain)
+        with hierarchy.multigrid(system.operator, system.owned_dirichlet) as cycle:
+            ksp = PETSc.KSP().create(system.A.getComm())
+            ksp.setOperators(system.A)
+            ksp.setType("cg")
+            ksp.setTolerances(rtol=1e-8)
+            ksp.getPC().setType("python")
+            ksp.getPC().setPythonContext(cycle)
+            with cycle.constrained(system.bounded[:0]):
+                ksp.solve(b, x)
+            steps = ksp.getIterationNumber()
+            ksp.destroy()
+        hierarchy.free()
 
     seconds = timed(action)
-    level.grid.free()
     x.destroy()
     return seconds, steps
 
@@ -73,7 +74,7 @@ def inequality(problem: Problem, domain: Domain) -> tuple[float, str]:
 
 def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:
     """One line of the table."""
-    level = Level(Forms(problem, domain.mesh, "CR"), domain)
+    level = Level((NestedMesh(Diffusion(problem, domain.mesh, "CR"), domain),))
     b = ghosted_vector(level.V, level.system.b.x.array)
     actions = {
         "theirs": lambda: linear_solve(level.system.A, b),

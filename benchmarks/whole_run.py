@@ -109,7 +109,7 @@ def run(meshes: int, folder: str, began: float) -> None:
         from signorini_cr.fem import problem
         from signorini_cr.mesh import gmshmesh
         from signorini_cr.output import report as output
-        from signorini_cr.vi import assembly
+        from signorini_cr.vi import system
     for owner, attribute, name in (
         (builtins, "__import__", PACKAGES),
         (problemfile, "load", FILE),
@@ -117,7 +117,7 @@ def run(meshes: int, folder: str, began: float) -> None:
         (problemfile.ProblemFile, "mesh", MESH),
         (gmshmesh, "triangulate", MESH),
         (levels, "refine", REFINEMENT),
-        (assembly.System, "__init__", ASSEMBLY),
+        (system.System, "__init__", ASSEMBLY),
         (levels, "_solve", VI),
         (solution, "certify", CERTIFICATES),
         (problem.Forms, "errors", ERRORS),

@@ -111,20 +111,20 @@ def with_dofs(V: fem.FunctionSpace, cells: IntArray, index_map: Any) -> fem.Func
 
     Args:
         V: The space with the element.
-        cells: Dofs of every local cell, as many as the element has, shape (cells, n).
+        cells: Nodes of every local cell, as many as the element has, shape (cells, n).
         index_map: Their distribution over the ranks.
     """
-    own = V._cpp_object
+    own, block = V._cpp_object, V.dofmap.index_map_bs
     links = cpp.graph.AdjacencyList_int32(np.ascontiguousarray(cells))
     parts = (
         V.mesh._cpp_object,
         own.element,
-        cpp.fem.DofMap(own.dofmap.dof_layout, index_map, 1, links, 1),
+        cpp.fem.DofMap(own.dofmap.dof_layout, index_map, block, links, block),
     )
     try:
         space = cpp.fem.FunctionSpace_float64(*parts)
     except TypeError:  # 0.9 wants the shape of a value, too
-        space = cpp.fem.FunctionSpace_float64(*parts, ())
+        space = cpp.fem.FunctionSpace_float64(*parts, V.ufl_element().reference_value_shape)
     return fem.FunctionSpace(V.mesh, V.ufl_element(), space)
 
 

@@ -47,15 +47,27 @@ def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:
             result = function(*args)
         except Exception as caught:
             error = caught
+    fail_together(comm, error)
+    return comm.bcast(result, root=0)
+
+
+def fail_together(comm: MPI.Comm, error: Exception | None) -> None:
+    """Raise on all ranks what has gone wrong on any, so that no rank is left waiting.
+
+    Args:
+        comm: The ranks that take part; all must call.
+        error: What this rank has caught, None if nothing; it is raised here as it is. The others
+            raise an InputError or a RuntimeError with the words of the lowest such rank.
+    """
+    first = comm.allreduce(comm.size if error is None else comm.rank, op=MPI.MIN)
+    if first == comm.size:
+        return
     # An exception need not survive pickling: send its kind and its words
     sent = None if error is None else (isinstance(error, InputError), _words(error))
-    verdict, result = comm.bcast((sent, result), root=0)
-    if verdict is not None:
-        if error is not None:
-            raise error
-        is_input, words = verdict
-        raise InputError(words) if is_input else RuntimeError(f"rank 0 failed: {words}")
-    return result
+    is_input, words = comm.bcast(sent, root=first)
+    if error is not None:
+        raise error
+    raise InputError(words) if is_input else RuntimeError(f"rank {first} failed: {words}")
 
 
 def raise_together(comm: MPI.Comm, complaint: str | None) -> None:

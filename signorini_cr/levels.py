@@ -9,19 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from .data.admissible import check_data
-from .errors import InputError
-from .fem.problem import Forms, Problem
-from .fem.space import ghosted_vector
-from .garbage import release
+from .diffusion import Diffusion
+from .errors import InputError, NotConverged
+from .fem.physics import Physics
+from .fem.problem import Problem
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
+from .multigrid.hierarchy import Hierarchy
 from .solution import Solution
-from .vi.assembly import Level
 from .vi.contact import contact_facts
+from .vi.level import Level
 from .vi.nested import nested_start
 from .vi.solver import solve_vi
-from .vi.stopping import NOISE
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
 """Called with level, step, residual norm, active dofs and linear iterations so far, which are the
@@ -50,9 +49,8 @@ def solve(
         NotConverged: The solver stopped short, with PETSc's name for the reason; or the contact
             forces, or the equations of a part, are lost in rounding.
     """
-    forms = Forms(problem, domain.mesh, element)
-    check_data(forms, domain)
-    return _solve(Level(forms, domain), None, monitor)
+    (solution,) = solve_sequence(problem, domain, lambda _: None, element, monitor)
+    return solution
 
 
 def solve_levels(
@@ -114,80 +112,83 @@ def solve_sequence(
     Yields:
         The solutions, coarsest first.
     """
-    forms = Forms(problem, domain.mesh, element)
-    check_data(forms, domain)
-    level = Level(forms, domain)
-    solution = _solve(level, None, monitor)
+    yield from solve_physics(
+        Diffusion(problem, domain.mesh, element), domain, step, monitor, nested
+    )
+
+
+def solve_physics(
+    physics: Physics,
+    domain: Domain,
+    step: Callable[[Solution], tuple[Domain, npt.NDArray[np.int32]] | None],
+    monitor: LevelMonitor | None = None,
+    nested: bool = True,
+) -> Iterator[Solution]:
+    """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`."""
+    physics.check(domain)
+    hierarchy, seconds = Hierarchy(physics, domain), {"mesh": 0.0}
+    level, coarser, before = Level(hierarchy.meshes), None, None
     while True:
+        solution = _solve(level, hierarchy, (coarser, before), monitor, seconds)
         yield solution
         began = time.perf_counter()
         refined = step(solution)
         if refined is None:
-            return
+            break
         level.tidy()
-        level = Level(level.forms, refined[0], level.number + 1, level, refined[1])
+        hierarchy.add(*refined)
+        level = Level(hierarchy.meshes, held=level.loose is None)
+        if nested:
+            coarser, before = solution, None if coarser is None else coarser.u
         seconds = {"mesh": time.perf_counter() - began}
-        solution = _solve(level, solution if nested else None, monitor, seconds)
+    hierarchy.free()
 
 
 def _solve(
     level: Level,
-    coarser: Solution | None,
+    hierarchy: Hierarchy,
+    below: tuple[Solution | None, fem.Function | None],
     monitor: LevelMonitor | None,
-    seconds: dict[str, float] | None = None,
+    seconds: dict[str, float],
 ) -> Solution:
-    seconds = {"mesh": 0.0} if seconds is None else seconds
+    """Assemble and solve on the finest mesh, and say what has come of it; collective.
+
+    Args:
+        level: That mesh.
+        hierarchy: All meshes.
+        below: The solution on the mesh below, and the one that it was started from; None for a
+            start from zero.
+        monitor: Called after each step of the solver.
+        seconds: Wall time of the phases so far; others are added.
+    """
     clock = time.perf_counter()
     system = level.system
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
-    if level.loose is not None:
-        level.loose.check(level.system)
     u, residual = system.start(), fem.Function(level.V)
-    arrays = system.b.x.array, system.lower, u.x.array, residual.x.array
-    vectors = [ghosted_vector(level.V, array) for array in arrays]
-    if coarser is not None:
-        nested_start(coarser, level, u)
+    if level.loose is not None:
+        level.loose.check(system)
+    if below[0] is not None:
+        nested_start(below[0], level, u, below[1])
     if level.loose is not None:
         level.loose.hold(system, u)
-    operator, bounded = level.grid.operator, system.bounded
+    told = None if monitor is None else lambda *facts: monitor(level.number, *facts)
     try:
-        iterations = solve_vi(
-            level.grid,
-            *vectors,
-            load=system.load,
-            monitor=None if monitor is None else lambda *facts: monitor(level.number, *facts),
-            level=level.number,
-            row_sums=system.row_sums,
-        )
-        entries = system.A.getDiagonal()
-        diagonal = entries.array_r.copy()
-        release(entries)
-        terms = operator.magnitude(vectors[2]) + np.abs(system.b.x.array[bounded])
-    finally:
-        if level.forms.element != "P1":
-            level.grid.free()  # the next level needs P1 alone
-            del level.grid
-        release(*vectors)
+        with (
+            hierarchy.multigrid(system.operator, system.owned_dirichlet) as cycle,
+            system.vectors(u, residual) as vectors,
+        ):
+            iterations = solve_vi(
+                cycle, vectors, system.residual_scale, monitor=told, row_sums=system.row_sums
+            )
+    except NotConverged as failure:
+        raise NotConverged(failure.reason, level.number) from None
     for function in (u, residual):
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
-    contact = contact_facts(
-        level.domain,
-        u,
-        residual,
-        diagonal=diagonal,
-        lower=system.lower,
-        obstacle_at_vertices=system.obstacle_at_vertices,
-        load=system.load,
-        rounding=NOISE * terms,
-        iterations=iterations,
-    )
-    owned = level.V.dofmap.index_map.size_local
-    comm = level.domain.mesh.comm
-    form = level.forms.a_of_w.on(level.domain, (), [u])
-    energy = comm.allreduce(
-        0.5 * fem.assemble_scalar(form) - system.chi.x.array[:owned] @ u.x.array[:owned]
+    contact = contact_facts(level.data, system, u, residual, iterations)
+    owned = system.A.getLocalSize()[0]
+    energy = level.domain.mesh.comm.allreduce(
+        0.5 * level.data.energy(u) - system.chi.x.array[:owned] @ u.x.array[:owned]
     )
     seconds["estimate"] = time.perf_counter() - clock
-    before = None if coarser is None else coarser.u
-    return Solution(level, u, residual, contact, float(energy), iterations, seconds, before)
+    return Solution(level, u, residual, contact, float(energy), iterations, seconds)

@@ -13,11 +13,72 @@ from .memory import ran_out_of_memory
 PREFIX = "signorini_"
 """Prefix of the PETSc options that reach the solver, as in ``-signorini_snes_atol 1e-12``."""
 
-NO_INODES = {"mat_no_inode": None}
-"""PETSc joins neighbouring rows of the same pattern, which takes time to look for; few have it."""
+REDUCED_PREFIX = PREFIX + "reduced_"
+"""That of SNES's own linear solver, a shell around the one that ``-signorini_ksp_`` is about."""
+
+BOTTOM_PREFIX = PREFIX + "bottom_"
+"""That of what solves the space at the bottom of the multigrid cycle."""
+
+ALONE_PREFIX = PREFIX + "alone_"
+"""That of what takes the cycle's place where it has been given up."""
+
+HAS_MUMPS = PETSc.Sys.hasExternalPackage("mumps")
 
 AMG = PETSc.PC.Type.HYPRE if PETSc.Sys.hasExternalPackage("hypre") else PETSc.PC.Type.GAMG
 """Algebraic multigrid: hypre's BoomerAMG, or PETSc's own where it was built without hypre."""
+
+# What follows are PETSc's settings, one dictionary a solver; what users set comes before them.
+# Computed figures, as tolerances are, stand where they are computed.
+
+MATRICES = {"mat_no_inode": None}
+"""PETSc joins neighbouring rows of the same pattern, which takes time to look for; few have it."""
+
+NEWTON: dict[str, object] = {
+    "snes_type": PETSc.SNES.Type.VINEWTONRSLS,
+    # full steps are the primal-dual active set method: PETSc's usual line search tests a norm
+    # that may rightly rise
+    "snes_linesearch_type": "basic",
+    # a contact dof counts as active within this of its bound; PETSc's is absolute and would
+    # freeze data of small magnitude
+    "snes_vi_zero_tolerance": 0.0,
+    # relative to the start, and a warm start needs the absolute one
+    "snes_rtol": 0.0,
+    "snes_max_it": 100,
+}
+"""The active set method. SNES hands its linear systems to a solver in Python."""
+
+REDUCED: dict[str, object] = {
+    "ksp_type": PETSc.KSP.Type.CG,
+    "ksp_rtol": 0.0,
+    "ksp_max_it": 1000,
+    "pc_type": PETSc.PC.Type.PYTHON,
+}
+"""The linear systems; the preconditioner in Python is the multigrid cycle."""
+
+BOOMERAMG: dict[str, object] = {
+    # Gauss-Seidel forward on the way down and backward on the way up: as symmetric as PETSc's
+    # default, which goes both ways each time, and a third cheaper
+    "pc_hypre_boomeramg_relax_type_down": "SOR/Jacobi",
+    "pc_hypre_boomeramg_relax_type_up": "backward-SOR/Jacobi",
+    # in one pass through all rows, not in one for those of coarse points and one for the others:
+    # as many CG steps, and a third cheaper once more
+    "pc_hypre_boomeramg_no_CF": True,
+}
+"""Algebraic multigrid at the bottom of the cycle, or in its place."""
+
+LARGE_FACTORS: dict[str, object] = {
+    "pc_factor_mat_solver_type": "mumps",
+    # minimum degree takes least time for matrices of plane meshes, on two ranks as well
+    "mat_mumps_icntl_7": 0,
+}
+"""Factors in the place of the cycle."""
+
+SMALL_FACTORS: dict[str, object] = {
+    # PETSc's smallest pivot is absolute and would refuse coefficients of small magnitude
+    "pc_factor_zeropivot": 1e-300,
+    "redundant_pc_factor_zeropivot": 1e-300,
+}
+"""Factors at the bottom of the cycle, on every rank."""
 
 
 def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:

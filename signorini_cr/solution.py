@@ -9,11 +9,11 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from .estimate.certificate import Certificate, certify
+from .estimate.certificate import Certificate
 from .fem.problem import Problem
 from .mesh.domain import Domain
-from .vi.assembly import Level
 from .vi.contact import Contact
+from .vi.level import Level
 from .vi.solver import Iterations
 
 
@@ -29,7 +29,6 @@ class Solution:
         energy: J(u_h) = ½ a_h(u_h, u_h) − χ(u_h).
         iterations: Newton steps and linear iterations.
         seconds: Wall time of the phases mesh, assemble, solve, estimate.
-        before: The solution on the mesh below that it was started from, if it was.
     """
 
     level: Level
@@ -39,7 +38,16 @@ class Solution:
     energy: float
     iterations: Iterations
     seconds: dict[str, float] = field(default_factory=dict)
-    before: fem.Function | None = None
+
+    def __repr__(self) -> str:
+        """A line; of the certificate only if it has been made, as making it is collective."""
+        contact, known = self.contact, self.__dict__.get("certificate")
+        line = (
+            f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
+            f"{contact.number} facets in contact, force {contact.force:.6g}"
+        )
+        bound = known and known.bound_h1
+        return line + (">" if bound is None else f", error at most {bound:.3g}>")
 
     @property
     def domain(self) -> Domain:
@@ -49,12 +57,12 @@ class Solution:
     @property
     def problem(self) -> Problem:
         """The data."""
-        return self.level.forms.problem
+        return self.level.physics.problem
 
     @property
     def element(self) -> str:
         """The element's name: "CR" or "P1"."""
-        return self.level.forms.element
+        return self.level.physics.element
 
     @property
     def cells(self) -> int:
@@ -65,7 +73,8 @@ class Solution:
     @property
     def dofs(self) -> int:
         """Number of degrees of freedom, over all ranks."""
-        return self.u.function_space.dofmap.index_map.size_global
+        dofmap = self.u.function_space.dofmap
+        return dofmap.index_map.size_global * dofmap.index_map_bs
 
     @cached_property
     def h(self) -> float:
@@ -81,10 +90,14 @@ class Solution:
 
         Computed when first asked for, collectively.
         """
-        forms = self.level.forms
-        return None if forms.exact is None else forms.errors(self.domain, self.u)
+        physics = self.level.physics
+        return None if physics.exact is None else physics.errors(self.domain, self.u)
 
     @cached_property
     def certificate(self) -> Certificate:
         """What is certain about the error; made when first asked for, collectively."""
-        return certify(self)
+        try:
+            certificate: Certificate = self.level.physics.certify(self)
+            return certificate
+        finally:
+            self.level.tidy()

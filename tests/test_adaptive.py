@@ -137,5 +137,5 @@ def test_cells_that_rounding_would_spoil_end_the_sequence():
         for solution in solve_adaptive(problem, square.mesh(0.5), max_dofs=20_000, fraction=0.1):
             solutions.append(solution)
     assert caught.value.level == len(solutions) > 10
-    h = solution.domain.mesh.h(2, np.arange(solution.level.cells.number, dtype=np.int32))
+    h = solution.domain.mesh.h(2, np.arange(solution.level.data.cells.number, dtype=np.int32))
     assert 1e-12 < WORLD.allreduce(float(h.min()), op=MPI.MIN) < 1e-10

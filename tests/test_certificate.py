@@ -21,12 +21,13 @@ from petsc4py import PETSc
 from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.ranges import range_of
+from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.estimate.force import force_bounds
 from signorini_cr.fem.cells import Cells
-from signorini_cr.fem.problem import Forms
-from signorini_cr.vi.assembly import Level
+from signorini_cr.multigrid.hierarchy import NestedMesh
+from signorini_cr.vi.level import Level
 
 WORLD = MPI.COMM_WORLD
 GOAL = 1.45
@@ -318,7 +319,7 @@ def test_residual_functional_is_bounded():
     V = fem.functionspace(mesh, ("Lagrange", 1))
     fixed = fem.locate_dofs_topological(V, 1, level.domain.tags.find(2))
     rng = np.random.default_rng(3)
-    alone = SimpleNamespace(domain=level.domain, V=level.V, coarser=None, parent_cell=None)
+    alone = SimpleNamespace(meshes=level.meshes[-1:])
     x = mesh.geometry.x[cell_nodes(mesh)[: cells.number]].mean(axis=1)
     for left in (cells.volume * np.sin(3 * x[:, 0]), rng.standard_normal(cells.number)):
         bounds = [unbalanced(which, cells, left, np.array(1.0)) for which in (level, alone)]
@@ -330,6 +331,38 @@ def test_residual_functional_is_bounded():
             work = abs(WORLD.allreduce(left @ means))
             norm = np.sqrt(integral(ufl.inner(ufl.grad(e), ufl.grad(e)), mesh))
             assert all(work <= bound * norm for bound in bounds)
+
+
+def test_what_is_carried_away_does_not_depend_on_the_ranks():
+    """On squares most cells have several ways to Γ0, and none of them is the first."""
+    bounds = []
+    for comm in (WORLD, MPI.COMM_SELF):
+        domain = exact.S1_NEUMANN.structured(6, comm)
+        level = solve(exact.S1_NEUMANN.problem, domain).level
+        cells, mesh = Cells(level.domain, level.V), domain.mesh
+        x = mesh.geometry.x[cell_nodes(mesh)[: cells.number]].mean(axis=1)
+        left = cells.volume * np.exp(-3 * x[:, 0])
+        bounds.append([unbalanced(level, cells, left, np.array(1.0), s) for s in (0.0, np.inf)])
+    assert np.allclose(*bounds, rtol=1e-10, atol=0)
+    # the second is that of the walk alone
+    assert bounds[0][0] < 0.8 * bounds[0][1]
+
+
+def test_load_with_infinitely_many_kinks():
+    """The figure of docs/certificate.md; the same on any ranks, as far as the solver gets."""
+    options = PETSc.Options("signorini_")
+    options["snes_atol"], options["ksp_rtol"] = 1e-14, 1e-12
+    try:
+        solution = solve(exact.I.problem, exact.I.structured(8))
+        certificate = solution.certificate
+        assert certificate.bound_h1 / solution.errors[0] == pytest.approx(1.156, abs=0.01)
+        if WORLD.size > 1:
+            alone = solve(exact.I.problem, exact.I.structured(8, MPI.COMM_SELF)).certificate
+            assert certificate.bound_h1 == pytest.approx(alone.bound_h1, rel=1e-10)
+            assert certificate.energy == pytest.approx(alone.energy, rel=1e-10)
+    finally:
+        for name in ("snes_atol", "ksp_rtol"):
+            options.delValue(name)
 
 
 # ---- P1
@@ -435,7 +468,7 @@ def test_three_dimensions():
     problem = Problem(
         exact=lambda x: (1 - x[0] ** 2) * (1 - x[1] ** 2) * (1 - x[2] ** 2), dirichlet=0.0
     )
-    level = Level(Forms(problem, mesh), domain)
+    level = Level((NestedMesh(Diffusion(problem, mesh), domain),))
     u = fem.Function(level.V)
     dense = level.system.A[:, :]  # nothing is in contact
     u.x.array[:] = np.linalg.solve(dense, level.system.b.x.array)

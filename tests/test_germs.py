@@ -5,8 +5,12 @@ import pytest
 import ufl
 from mpi4py import MPI
 
+from signorini_cr import exact
 from signorini_cr.data.germs import allowance, first_inside
-from signorini_cr.data.jets import lowered
+from signorini_cr.data.jets import Enclosure, lowered
+from signorini_cr.data.ranges import Deviation, Pieces, errors_on, refine
+from signorini_cr.fem.cells import Cells
+from signorini_cr.fem.space import function_space
 from signorini_cr.mesh.domain import Polygon
 
 pytestmark = pytest.mark.serial
@@ -96,3 +100,24 @@ def test_points_inside_are_found():
     assert np.allclose(hats[:, 0] @ corners[:, :, 0], POINT)
     apart = np.array([POINT, (0.9, -0.4), (0.2, 0.7)])[:, :, None]
     assert first_inside(expression, apart) is None
+
+
+def test_slivers_at_a_singular_point_are_not_cut_into_slabs():
+    """A vertex that is near a singular point leaves a sliver, which has a bound as a triangle."""
+    domain = exact.S1.structured(1, MPI.COMM_SELF)
+    cells = Cells(domain, function_space(domain.mesh, "CR"))
+    x = ufl.SpatialCoordinate(domain.mesh)
+    deviation = Deviation(x[0] ** 4 * (x[0] ** 2 + x[1] ** 2) ** -0.25)
+    corners = np.array([[1.6e-3, 3.4e-3], [0.0, 0.0], [-2.75e-12, 0.0]])[:, :, None]
+    sliver = Pieces(np.zeros(1, dtype=int), corners, np.eye(3)[:, :, None], np.ones(1))
+
+    def errors(boxes, half):
+        rough, missed = deviation(Enclosure(boxes), half, hats=np.full((3, 1), 1 / 3))
+        return np.stack([missed, rough**2])
+
+    weights = np.array([[1e3], [0.0]]) / errors_on(sliver, errors, cells)
+    pieces, found = refine(
+        sliver, lambda p: errors_on(p, errors, cells), weights, 300, cells, deviation.apart
+    )
+    assert np.isfinite(found).all()
+    assert len(pieces.part) < 20

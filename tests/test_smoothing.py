@@ -6,19 +6,20 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact
-from signorini_cr.fem.problem import Forms
-from signorini_cr.multigrid.masking import rows_of
+from signorini_cr.diffusion import Diffusion
+from signorini_cr.multigrid.constrained import rows_of
+from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.smoothing import OVER_RELAXATION, GaussSeidel
 from signorini_cr.multigrid.transfer import inclusion
-from signorini_cr.vi.assembly import Level
+from signorini_cr.vi.level import Level
 
 # Corners of five degrees: large entries, many of them positive
 FLAT = Polygon([[0, 0], [5, 0], [5, 0.4]], ["contact", "dirichlet", "neumann"])
 
 
 def system(domain, element):
-    level = Level(Forms(Problem(), domain.mesh, element), domain)
+    level = Level((NestedMesh(Diffusion(Problem(), domain.mesh, element), domain),))
     return level.system, Layout.of_space(level.V)
 
 
@@ -58,10 +59,11 @@ def test_rows_of_any_rank_in_any_order():
 @pytest.mark.parametrize("sweeps", [1, 3])
 def test_sweeps_are_petscs(element, sweeps):
     domain = exact.S1.mesh(0.1)
-    level = Level(Forms(Problem(), domain.mesh, "P1" if element == "P1" else "CR"), domain)
-    A, dofs = level.system.A, Layout.of_space(level.V)
+    mesh = NestedMesh(Diffusion(Problem(), domain.mesh, "P1" if element == "P1" else "CR"), domain)
+    A, dofs = Level((mesh,)).system.A, Layout.of_space(mesh.V)
     if element == "P1 beside CR":
-        A, dofs = level.conforming[0].matrix, level.conforming[1]
+        operator, dofs, _ = conforming(mesh)
+        A = operator.matrix
     if element == "product":
         p1 = Layout.of_p1(dofs.mesh)
         A, dofs = A.ptap(inclusion(p1, dofs).matrix()), p1

@@ -7,7 +7,7 @@ from dolfinx.fem import Function
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import InputError, NotConverged, Polygon, Problem, solve, solve_levels
+from signorini_cr import InputError, NotConverged, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.fem.space import closure_dofs, function_space
 from signorini_cr.mesh.domain import CONTACT
 
@@ -244,7 +244,7 @@ def test_a_tolerance_of_zero_ends_in_rounding(options):
 
 def test_a_smaller_tolerance_costs_no_newton_steps(options):
     usual = solve(PROBLEM, SQUARE.mesh(0.05))
-    options("snes_atol", 1e-12 * usual.level.system.load)
+    options("snes_atol", 1e-12 * usual.level.system.residual_scale)
     exact = solve(PROBLEM, SQUARE.mesh(0.05))
     assert exact.contact.kkt.residual <= 1e-12
     assert exact.iterations.newton == usual.iterations.newton
@@ -262,7 +262,7 @@ def test_monitor_sees_every_step():
     solution = solve(PROBLEM, SQUARE.mesh(0.05), monitor=lambda *facts: seen.append(facts))
     steps = [fact[1] for fact in seen]
     assert steps == list(range(solution.iterations.newton + 1))
-    assert seen[-1][2] <= 1e-8 * solution.level.system.load
+    assert seen[-1][2] <= 1e-8 * solution.level.system.residual_scale
     assert seen[-1][3] == solution.contact.number_active
     assert seen[-1][4] == solution.iterations.linear
     assert all(MPI.COMM_WORLD.bcast(fact) == fact for fact in seen)
@@ -295,3 +295,19 @@ def test_levels_start_where_the_one_below_ended():
     assert np.all(np.diff(energies) > 0)
     assert energies[-1] == pytest.approx(-0.461754, rel=2e-3)
     assert [solution.level.number for solution in solutions] == [0, 1, 2, 3]
+
+
+def test_what_python_shows_is_a_line() -> None:
+    """And takes no part in what is collective: on one rank alone it does not hang."""
+    example = exact.S1
+    domain = example.structured(8)
+    solution = solve(example.problem, domain)
+    shown = [repr(each) for each in (solution, solution.contact, domain, example.problem)]
+    assert shown[0].startswith("<Solution: CR, 408 dofs, 8 of 16 facets in contact, force ")
+    assert shown[1].startswith("<Contact: 8 of 16 facets, length 1, force ")
+    assert shown[2].startswith("<Domain: 256 cells; facets")
+    assert shown[3] == "Problem(f=_s1_load, dirichlet=0.0, exact=<lambda>)"
+    certificate = solution.certificate
+    assert repr(solution).endswith(f", error at most {certificate.bound_h1:.3g}>")
+    assert repr(certificate).startswith("<Certificate: error at most ")
+    assert all(len(line) < 100 for line in (*shown, repr(solution), repr(certificate)))

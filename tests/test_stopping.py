@@ -297,7 +297,7 @@ def test_units_make_no_difference(size, stiff, shift):
 def test_who_loosens_the_tolerance_gets_it(options):
     """Forces are then known as roughly as the rest, and the report says so."""
     usual = solutions(halves(1.0), 3)[-1]
-    options("snes_atol", 1e-2 * usual.level.system.load)
+    options("snes_atol", 1e-2 * usual.level.system.residual_scale)
     rough = solutions(halves(1.0), 3)[-1]
     assert rough.iterations.linear < usual.iterations.linear
     assert usual.contact.kkt.residual < 1e-8 < rough.contact.kkt.residual < 1e-1

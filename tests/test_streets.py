@@ -16,7 +16,7 @@ FLOORS = (
     ("multigrid",),
     ("vi",),
     ("estimate",),
-    ("solution", "levels", "adaptive"),
+    ("solution", "diffusion", "levels", "adaptive"),
     ("verification",),
     ("output",),
     ("app",),

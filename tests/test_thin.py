@@ -14,9 +14,9 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from signorini_cr import Polygon, Problem, compat, exact, solve, solve_levels
-from signorini_cr.multigrid import cycle as multigrid
+from signorini_cr.multigrid import bottom
 from signorini_cr.options import AMG
-from signorini_cr.vi.assembly import Level
+from signorini_cr.vi.level import Level
 
 comm = MPI.COMM_WORLD
 
@@ -193,7 +193,7 @@ def test_boomeramg_where_cells_are_aligned(element):
     for solution in solve_levels(problem, domain, 5, element):
         steps.append(solution.iterations.linear)
         whole = solution.level.system.A.copy()
-        whole.axpy(-1.0, Level(solution.level.forms, solution.domain).system.A)
+        whole.axpy(-1.0, Level(solution.level.meshes).system.A)
         assert whole.norm() == 0.0
     assert max(steps) <= 60 and steps[-1] <= 15
     words = "BoomerAMG, as multigrid took 40 CG steps on a coarser mesh"
@@ -203,8 +203,8 @@ def test_boomeramg_where_cells_are_aligned(element):
 
 
 def test_without_mumps(monkeypatch):
-    monkeypatch.setattr(multigrid, "HAS_MUMPS", False)
-    monkeypatch.setattr(multigrid, "DIRECT", 100)
+    monkeypatch.setattr(bottom, "HAS_MUMPS", False)
+    monkeypatch.setattr(bottom, "DIRECT", 100)
     case = CASES["squashed at 30°"]
     for solution in solve_levels(case.problem, case.domain(), 3):
         assert solution.iterations.linear <= 60

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
 from ..errors import InputError
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain, part_name
+from ..fem.conditions import KINDS
+from ..mesh.domain import PARTS, Domain, part_name
 from .expressions import Expression
 
 Array = npt.NDArray[np.float64]
@@ -19,9 +20,7 @@ Array = npt.NDArray[np.float64]
 USED_ON: dict[str, int | None] = {
     "data.coefficient": None,
     "data.f": None,
-    "data.g": NEUMANN,
-    "data.obstacle": CONTACT,
-    "data.dirichlet": DIRICHLET,
+    **{f"data.{kind.key}": PARTS[kind.part] for kind in KINDS},
     "exact.u": None,
 }
 """Where each expression is used: a part of the boundary, or None for the whole domain."""

@@ -37,14 +37,9 @@ from .keys import (
     string,
     whole,
 )
+from .reference import SECTIONS, allowed
 
-KEYS = {
-    "domain": ("vertices", "boundary", "size", "holes", "mesh"),
-    "data": ("f", "g", "obstacle", "dirichlet", "coefficient"),
-    "exact": ("u",),
-    "refine": ("mode", "levels", "tolerance", "max_dofs"),
-}
-SECTIONS = ("domain", "define", "data", "exact", "refine")
+KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 MAX_DOFS = 1_000_000
 ENOUGH = 1000
@@ -132,7 +127,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     path = Path(path)
     try:
         table = parse_toml(on_root(comm, read_text, path))
-        insist_known(table, "", ("title", *SECTIONS), KEYS)
+        insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
         title = get(table, "", "title", string, path.stem)
         sections = {name: _section(table, name) for name in SECTIONS}
         if "domain" not in table:

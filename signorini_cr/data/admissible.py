@@ -22,7 +22,7 @@ from ..errors import InputError
 from ..fem.cells import Cells, Side, corner_points
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities
-from ..mesh.domain import CONTACT, DIRICHLET, Domain
+from ..mesh.domain import Domain
 from .pointwise import EPS, evaluate
 
 if TYPE_CHECKING:
@@ -72,11 +72,11 @@ def check_data(forms: Forms, domain: Domain) -> None:
     """
     comm = domain.mesh.comm
     _raise_first(comm, _bad_coefficient(forms, domain))
-    u_D = _Values(forms.dirichlet, domain)
-    fixed = _Facets.of(domain, DIRICHLET)
-    _raise_first(comm, _jump(u_D, fixed, forms.source))
-    contact = _Facets.of(domain, CONTACT)
-    _raise_first(comm, _crossing(u_D, fixed, _Values(forms.obstacle, domain), contact))
+    (dirichlet,), (contact,) = forms.fixed, forms.bounded
+    u_D, fixed = _Values(dirichlet.fixed, domain), _Facets.of(domain, dirichlet.number)
+    _raise_first(comm, _jump(u_D, fixed, dirichlet.source))
+    alpha, bounded = _Values(contact.lower, domain), _Facets.of(domain, contact.number)
+    _raise_first(comm, _crossing(u_D, fixed, alpha, bounded))
 
 
 def differs(cells: Cells, side: Side, gap: FloatArray, scale: float, *data: Trace) -> bool:
@@ -92,10 +92,10 @@ def differs(cells: Cells, side: Side, gap: FloatArray, scale: float, *data: Trac
     Returns:
         Whether they do on this rank.
     """
-    precision = Precision.of(cells.domain.mesh).vertices
     vertex, facet = np.nonzero(gap > TOLERANCE * scale)
-    if not len(facet):
+    if not cells.comm.allreduce(len(facet)):
         return False
+    precision = Precision.of(cells.domain.mesh).vertices
     x = corner_points(cells, side)[1][vertex, facet]
     points = np.zeros((len(x), 3))
     points[:, : x.shape[1]] = x

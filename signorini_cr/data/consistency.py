@@ -11,9 +11,10 @@ from dolfinx.mesh import compute_midpoints
 from mpi4py import MPI
 
 from ..compat import cell_nodes
+from ..fem.conditions import Condition
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, facet_measures
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from ..mesh.domain import Domain
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
 from .pointwise import evaluate
 
@@ -36,14 +37,20 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
         A sentence each, the same on all ranks.
     """
     found = []
-    given = forms.problem.g is not None and number(forms.g) != 0.0
-    if given and domain.mesh.comm.allreduce(len(domain.facets(NEUMANN))) == 0:
-        found.append("data.g: it acts nowhere, for no facet is neumann")
+    for condition in forms.natural:
+        given = _is_given(forms, condition) and number(condition.value) != 0.0
+        if given and domain.mesh.comm.allreduce(len(domain.facets(condition.number))) == 0:
+            found.append(f"{condition.source}: it acts nowhere, for no facet is {condition.part}")
     if forms.exact is not None:
         said = _Solution(forms, domain).complaint()
         if said is not None:
             found.append(f"exact.u: {said}: it is not the solution, and errors say how far from it")
     return found
+
+
+def _is_given(forms: Forms, condition: Condition) -> bool:
+    """Tell whether a condition's data are the user's own."""
+    return getattr(forms.problem, condition.key) is not None
 
 
 class _Solution:
@@ -59,8 +66,9 @@ class _Solution:
 
     def complaint(self) -> str | None:
         """The first of the conditions on Γ1, in Ω, on Γ0 and on Γg that u violates; collective."""
-        x, cells, n = self._facets(CONTACT)
-        u, alpha = self._values(self.u, x, cells), self._values(self.forms.obstacle, x, cells)
+        (contact,) = self.forms.bounded
+        x, cells, n = self._facets(contact.number)
+        u, alpha = self._values(self.u, x, cells), self._values(contact.lower, x, cells)
         pressure = self._flux(x, cells, n)
         gap = _difference(u, alpha)
         height, force = self._size(u, alpha), self._size(pressure)
@@ -83,18 +91,23 @@ class _Solution:
             tdim = self.mesh.topology.dim
             cells = np.arange(self.mesh.topology.index_map(tdim).size_local, dtype=np.int32)
             x = compute_midpoints(self.mesh, tdim, cells)
-            f = ufl.as_ufl(0.0) if self.slope is None else -ufl.div(self.slope)
+            f = ufl.as_ufl(0.0) if self.forms.asked is None else self.forms.asked
             said = self._same(
                 "f", x, self._values(self.forms.f, x, cells), self._values(f, x, cells)
             )
-        if problem.dirichlet is not None and not said:
-            x, cells, _ = self._facets(DIRICHLET)
-            given = self._values(self.forms.dirichlet, x, cells)
-            said = self._same("dirichlet", x, given, self._values(self.u, x, cells))
-        if problem.g is not None and not said:
-            x, cells, n = self._facets(NEUMANN)
-            given = self._values(self.forms.g, x, cells)
-            said = self._same("g", x, given, self._flux(x, cells, n))
+        for condition in self.forms.conditions:
+            if said or not _is_given(self.forms, condition):
+                continue
+            x, cells, n = self._facets(condition.number)
+            if condition.fixed is not None:
+                given = self._values(condition.fixed, x, cells)
+                said = self._same(condition.key, x, given, self._values(self.u, x, cells))
+            elif condition.flux is not None:
+                given, wanted = self._values(condition.flux, x, cells), self._flux(x, cells, n)
+                added = condition.a(self.u, ufl.as_ufl(1.0))
+                if added is not None:
+                    wanted = _difference(wanted, self._values(-added, x, cells))
+                said = self._same(condition.key, x, given, wanted)
         return said
 
     def _same(self, key: str, x: FloatArray, given: Found, wanted: Found) -> str | None:

@@ -332,9 +332,15 @@ def allowance(
 def may_be_singular(expression: Any) -> bool:
     """Whether there is an operator in the expression that can take something finite to infinity."""
     return any(
-        isinstance(e, classes.Division | classes.Power | classes.Ln)
+        isinstance(e, classes.Division | classes.Ln)
+        or (isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1]))
         for e in ufl.corealg.traversal.unique_pre_traversal(expression)
     )
+
+
+def _is_positive(e: Any) -> bool:
+    """Whether it is a positive number, whatever values constants may get."""
+    return isinstance(e, classes.ScalarValue) and float(e) > 0
 
 
 def first_inside(

@@ -10,9 +10,8 @@ and the coefficients of lower order still hold.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,46 +24,19 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.algorithms.expand_indices import expand_indices
 
 from .. import compat
+from .balls import EPS, LOOSE, NONE, ORDER, Balls, Factor, Rows, indices, middle, union
+from .pointwise import FUNCTIONS
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 Range = tuple[FloatArray, FloatArray]
 """Lower and upper bounds."""
-Ball = tuple[FloatArray, FloatArray] | None
-"""Middles and radii; None for exactly 0."""
 Truth = tuple[BoolArray, BoolArray]
 """Where a condition can hold, and where it can fail."""
-
-ORDER = 3
-"""The highest order of a jet."""
-_EPS = 4e-16
-"""Relative error of +, −, ·, / and √, with room."""
-_LOOSE = 4e-15
-"""The same of other functions, and of sums of a few products."""
 
 
 class Unknown(Exception):
     """An expression whose range is not known here."""
-
-
-@cache
-def indices(variables: int, order: int = ORDER) -> tuple[tuple[int, ...], ...]:
-    """The multi-indices of Taylor coefficients, by order, the value's first."""
-    found = [k for k in product(range(order + 1), repeat=variables) if sum(k) <= order]
-    return tuple(sorted(found, key=lambda k: (sum(k), [-i for i in k])))
-
-
-@cache
-def _pairs(variables: int, order: int) -> tuple[tuple[int, int, int], ...]:
-    """(k, i, j) where index k is the sum of i and j, none of which is the value's."""
-    table = {index: place for place, index in enumerate(indices(variables, order))}
-    sums = (
-        (table.get(tuple(p + q for p, q in zip(a, b, strict=True))), i, j)
-        for a, i in table.items()
-        for b, j in table.items()
-        if i and j
-    )
-    return tuple((k, i, j) for k, i, j in sums if k is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +74,15 @@ class Boxes:
         low, high = self.low[:, self.slanted], self.high[:, self.slanted]
         cells = None if self.cells is None else self.cells[self.slanted]
         return Boxes(low, high, self.edges, cells=cells, mesh=self.mesh)
+
+    def whole(self, which: npt.NDArray[np.intp]) -> Boxes:
+        """Some of them, of which all points are meant."""
+
+        def some(array: Any) -> Any:
+            return None if array is None else array[..., which]
+
+        along, cells, normal = some(self.along), some(self.cells), some(self.normal)
+        return Boxes(some(self.low), some(self.high), along, None, cells, normal, self.mesh)
 
     @property
     def variables(self) -> int:
@@ -142,17 +123,23 @@ class Jet:
     Attributes:
         low: Lower bounds of the value, shape (n,) or ().
         high: Upper bounds of it.
-        rest: Taylor coefficients in the order of `indices`, from the first on.
+        rest: Taylor coefficients from the first order on.
     """
 
     low: FloatArray
     high: FloatArray
-    rest: tuple[Ball, ...]
+    rest: Balls = NONE
 
     @cached_property
-    def all(self) -> tuple[Ball, ...]:
-        """All coefficients as middles and radii."""
-        return (_ball((self.low, self.high)), *self.rest)
+    def factor(self) -> Factor:
+        """All coefficients, prepared for products."""
+        return Factor.of(self.low, self.high, self.rest)
+
+    @property
+    def number(self) -> float | None:
+        """The number that it is, or None."""
+        known = self.low.ndim == 0 and self.low == self.high and not self.rest.rows
+        return float(self.low) if known else None
 
 
 def lowered(expression: Any) -> Any:
@@ -173,22 +160,41 @@ def is_local(expression: Any) -> bool:
 
 
 def has_conditions(expression: Any) -> bool:
-    """Whether the expression may jump by a choice between two others."""
+    """Whether the expression may jump: by a choice between two others, or as an angle."""
     return any(
-        isinstance(e, classes.Conditional)
+        isinstance(e, classes.Conditional | classes.Atan2)
         for e in ufl.corealg.traversal.unique_pre_traversal(expression)
     )
 
 
-def strips_of(expression: Any) -> int:
-    """How many conditions an enclosure may decide up to strips, at most."""
-    nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
-    return sum(
-        isinstance(inner, _COMPARISONS)
-        for e in nodes
-        if isinstance(e, classes.Conditional)
-        for inner in ufl.corealg.traversal.pre_traversal(e.ufl_operands[0])
-    )
+def values(expression: Any, points: Boxes) -> FloatArray:
+    """Values of a lowered expression, not enclosed, at points that are given as boxes, shape (n,).
+
+    Where the formula has none, as the root of what rounding has made negative, the middle of the
+    enclosure; NaN where that has no end.
+
+    Raises:
+        Unknown: The expression holds an operator that is not known here.
+    """
+    at = Enclosure(points, order=0)
+    known: dict[Any, Any] = {}
+
+    def value(e: Any) -> Any:
+        if e not in known:
+            function = FUNCTIONS.get(type(e))
+            if function is None:
+                jet = at(e)
+                known[e] = 0.5 * (jet.low + jet.high)
+            else:
+                known[e] = function(*(value(operand) for operand in e.ufl_operands))
+        return known[e]
+
+    with np.errstate(all="ignore"):
+        found = np.asarray(value(expression))
+        if not np.isfinite(found).all():
+            jet = at(expression)
+            found = np.where(np.isfinite(found), found, 0.5 * (jet.low + jet.high))
+    return np.broadcast_to(found, points.low.shape[1:])
 
 
 class Enclosure:
@@ -199,14 +205,13 @@ class Enclosure:
         order: Up to which order.
 
     Attributes:
-        strips: How many conditions were decided up to strips along the boundary.
+        strips: How many conditions were decided up to strips along the boundary, shape (n,).
     """
 
     def __init__(self, boxes: Boxes, order: int = ORDER):
         """Begin with nothing known."""
-        self.boxes, self.order, self.strips = boxes, order, 0
-        self.size = len(indices(boxes.variables, order)) - 1
-        self._pairs = _pairs(boxes.variables, order)
+        self.boxes, self.order = boxes, order
+        self.strips = np.zeros(boxes.low.shape[1:], dtype=np.intp)
         self._known: dict[Any, Jet] = {}
 
     def __call__(self, e: Any) -> Jet:
@@ -238,6 +243,8 @@ class Enclosure:
             return self._conditional(e)
         if isinstance(e, classes.Power):
             return self._power(*e.ufl_operands)
+        if isinstance(e, classes.Sqrt):
+            return self._number_power(e, 1.0)
         if isinstance(e, classes.Atan2):
             return self._atan2(*(self(operand) for operand in e.ufl_operands))
         operands: Any = getattr(e, "ufl_operands", ())
@@ -252,12 +259,15 @@ class Enclosure:
     # ---- what expressions begin with
 
     def _constant(self, value: float) -> Jet:
-        return Jet(np.array(value), np.array(value), (None,) * self.size)
+        return Jet(np.array(value), np.array(value))
 
     def _linear(self, low: FloatArray, high: FloatArray, slopes: FloatArray) -> Jet:
-        """A value with constant first derivatives, shape (variables, n)."""
-        first = [(slope, _LOOSE * np.abs(slope)) if np.any(slope) else None for slope in slopes]
-        return Jet(low, high, (*first, *[None] * self.size)[: self.size])
+        """A value with constant first derivatives, shape (variables, n) or (variables, 1)."""
+        if not self.order:
+            return Jet(low, high)
+        there = np.flatnonzero(slopes.any(axis=1))
+        mid = slopes[there]
+        return Jet(low, high, Balls(tuple(int(k) + 1 for k in there), mid, LOOSE * np.abs(mid)))
 
     def _component(self, vector: Any, index: Any) -> Jet:
         i = index[0]
@@ -267,10 +277,10 @@ class Enclosure:
             box, i = self.boxes, int(i)
             if box.along is not None:
                 return self._linear(box.low[i], box.high[i], box.along[:, i])
-            return self._linear(box.low[i], box.high[i], np.eye(len(box.low))[i])
+            return self._linear(box.low[i], box.high[i], np.eye(len(box.low))[:, [i]])
         if isinstance(vector, classes.FacetNormal) and self.boxes.normal is not None:
             n = self.boxes.normal[int(i)]
-            return self._linear(*out((n, n), _LOOSE), np.zeros((0, len(n))))
+            return Jet(*out((n, n), LOOSE))
         if isinstance(vector, fem.Constant):
             return self._constant(float(np.asarray(vector.value)[int(i)]))
         raise Unknown(type(vector).__name__)
@@ -291,7 +301,7 @@ class Enclosure:
         values = function.x.array[V.dofmap.list[box.cells]]
         ends = values.min(axis=1), values.max(axis=1)
         if values.shape[1] == 1:
-            return self._linear(*ends, np.zeros((0, len(values))))
+            return Jet(*ends)
         X = box.mesh.geometry.x[compat.cell_nodes(box.mesh)[box.cells]][:, :, : len(box.low)]
         rise = (values[:, 1:] - values[:, :1])[:, :, None]
         slope = np.linalg.solve(X[:, 1:] - X[:, :1], rise)[:, :, 0].T
@@ -300,63 +310,66 @@ class Enclosure:
             for s, a, b, p in zip(slope, box.low, box.high, X[:, 0].T, strict=True)
         ]
         low, high = (values[:, 0] + sum(r[k] for r in reach) for k in (0, 1))
-        room = 10 * _LOOSE * (np.abs(values).max(axis=1) + np.ptp(values, axis=1))
+        room = 10 * LOOSE * (np.abs(values).max(axis=1) + np.ptp(values, axis=1))
         low, high = np.maximum(low - room, ends[0]), np.minimum(high + room, ends[1])
         if box.along is not None:
             slope = np.einsum("vgn,gn->vn", box.along, slope)
         jet = self._linear(low, high, slope)
         # the middle of the range is not the value in the middle: not affine for `_difference`
-        after = (_NOTHING,) * (self.size - len(slope))
-        return Jet(low, high, (*jet.rest[: len(slope)], *after)) if self.size else jet
+        return replace(jet, rest=Balls(self._every, *jet.rest.on(self._every)))
 
     # ---- arithmetic
 
     def _sum(self, a: Jet, b: Jet) -> Jet:
-        low, high = out((a.low + b.low, a.high + b.high))
-        return Jet(low, high, tuple(map(_add, a.rest, b.rest)))
+        return Jet(*out((a.low + b.low, a.high + b.high)), a.rest + b.rest)
 
     def _product(self, a: Jet, b: Jet) -> Jet:
-        low, high = square_of(a.low, a.high) if a is b else mul((a.low, a.high), (b.low, b.high))
-        x, y = _Factor(a.all), _Factor(b.all)
-        rest = [_Total() for _ in range(self.size)]
-        for k in range(1, self.size + 1):
-            rest[k - 1].product(x, 0, y, k)
-            rest[k - 1].product(x, k, y, 0)
-        for k, i, j in self._pairs:
-            rest[k - 1].product(x, i, y, j)
-        return Jet(low, high, tuple(total.ball for total in rest))
+        if a.number is not None or b.number is not None:
+            a, b = (a, b) if a.number is not None else (b, a)
+            factor = float(a.low)
+            if factor == 0.0:
+                return a
+            return Jet(*_scaled(factor, (b.low, b.high)), b.rest.scaled(factor))
+        range_ = square_of(a.low, a.high) if a is b else mul((a.low, a.high), (b.low, b.high))
+        if not self.order:
+            return Jet(*range_)
+        return Jet(*range_, a.factor.times(b.factor, self.boxes.variables, self.order))
 
     def _quotient(self, a: Jet, b: Jet) -> Jet:
         return self._product(a, self._compose(b, power_series(-1.0)))
 
     def _compose(self, a: Jet, series: Callable[[Range], Sequence[Range]]) -> Jet:
-        """φ(a), given the ranges of φ, φ', φ''/2 and φ'''/6 over a's range."""
+        """φ(a), given the ranges of the Taylor coefficients φ_k over a's range.
+
+        With δ for a less its value that is φ_0 + δ (φ_1 + δ (φ_2 + δ φ_3)).
+        """
         terms = series((a.low, a.high))
-        rest = [_Total() for _ in range(self.size)]
-        outer, inner = _Factor([_ball(term) for term in terms]), _Factor(a.all)
-        power = inner
-        for order in range(1, self.order + 1):
-            for k in range(1, self.size + 1):
-                rest[k - 1].product(outer, order, power, k)
-            if order < self.order:
-                higher = [_Total() for _ in range(self.size + 1)]
-                for k, i, j in self._pairs:
-                    higher[k].product(power, i, inner, j)
-                power = _Factor([total.ball for total in higher])
-        low, high = terms[0]
-        return Jet(low, high, tuple(total.ball for total in rest))
+        if not self.order or not a.rest.rows:
+            return Jet(*terms[0])
+        step, found = a.factor.without_value, Jet(*terms[self.order])
+        for k in range(self.order - 1, -1, -1):
+            rest = NONE
+            if found.number != 0.0:
+                rest = step.times(found.factor, self.boxes.variables, self.order - k)
+            found = Jet(*terms[k], rest)
+        return found
+
+    def _number_power(self, base: Any, p: float) -> Jet:
+        """A power of roots, or of roots of these, is one of what is under them."""
+        while isinstance(base, classes.Sqrt):
+            base, p = base.ufl_operands[0], 0.5 * p
+        return self._compose(self(base), power_series(p))
 
     def _power(self, base: Any, exponent: Any) -> Jet:
         p = self(exponent)
-        fixed = p.low.ndim == 0 and p.low == p.high and not any(p.rest)
-        if fixed:
-            return self._compose(self(base), power_series(float(p.low)))
+        if p.number is not None:
+            return self._number_power(base, p.number)
         u = self(base)
         whole = self._compose(self._product(p, self._compose(u, _ln)), _exp)
         # At a base of 0, where the logarithm has no range
         a, b = np.maximum(u.low, 0.0), np.maximum(u.high, 0.0)
         ends = np.broadcast_arrays(*(x**q for x in (a, b) for q in (p.low, p.high)))
-        low, high = out((np.minimum.reduce(ends), np.maximum.reduce(ends)), _LOOSE)
+        low, high = out((np.minimum.reduce(ends), np.maximum.reduce(ends)), LOOSE)
         one = (a <= 1) & (b >= 1)
         low, high = (
             np.where(one, np.minimum(low, 1.0), low),
@@ -364,10 +377,10 @@ class Enclosure:
         )
         crosses = (p.low < 0) & (p.high > 0) & (a == 0)
         bad = crosses | (u.low < 0)
-        return Jet(
-            np.where(bad, -np.inf, np.maximum(whole.low, low)),
-            np.where(bad, np.inf, np.minimum(whole.high, high)),
-            whole.rest,
+        return replace(
+            whole,
+            low=np.where(bad, -np.inf, np.maximum(whole.low, low)),
+            high=np.where(bad, np.inf, np.minimum(whole.high, high)),
         )
 
     def _atan2(self, a: Jet, b: Jet) -> Jet:
@@ -377,16 +390,57 @@ class Enclosure:
             for x in (b.low + 0.0, b.high + 0.0):
                 angle = np.where((x == 0) & (y == 0), np.nan, np.arctan2(y, x))
                 low, high = np.fmin(low, angle), np.fmax(high, angle)
-        low, high = out((low, high), _LOOSE)
+        low, high = out((low, high), LOOSE)
         full = ((a.low < 0) & (a.high >= 0) & (b.low < 0)) | ~np.isfinite(low + high)
-        one = self._compose(self._quotient(a, b), _atan)
-        other = self._compose(self._quotient(b, a), _atan)
-        rest = [_meet(p, _minus(q)) for p, q in zip(one.rest, other.rest, strict=True)]
-        if full.any():
-            for k, ball in enumerate(rest):
-                mid, rad = ball or _NOTHING
-                rest[k] = np.where(full, 0.0, mid), np.where(full, np.inf, rad)
-        return Jet(np.where(full, -4.0, low), np.where(full, 4.0, high), tuple(rest))
+        if self.boxes.corners is not None and full.any():
+            low, high, full = self._beside_cut(a, b, (low, high), full)
+        rest = self._of_logarithm(a, b, (low, high))
+        rows = self._every if full.any() else rest.rows
+        mid, rad = rest.on(rows)
+        mid, rad = np.where(full, 0.0, mid), np.where(full, np.inf, rad)
+        return Jet(np.where(full, -4.0, low), np.where(full, 4.0, high), Balls(rows, mid, rad))
+
+    def _of_logarithm(self, a: Jet, b: Jet, angle: Range) -> Balls:
+        """Taylor coefficients of the angle of z = b + ia, which is the logarithm's imaginary part.
+
+        With δ for z less its value that is δ (1/z − δ (1/(2z²) − δ/(3z³))).
+        """
+        x, y = b.factor.without_value, a.factor.without_value
+        of_a, of_b = square_of(a.low, a.high), square_of(b.low, b.high)
+        square = out((of_a[0] + of_b[0], of_a[1] + of_b[1]))
+        real = imaginary = NONE
+        for k in range(self.order, 0, -1):
+            size = _scaled((-1.0) ** (k - 1) / k, _raised(square, -0.5 * k))
+            turn = _scaled(float(-k), angle)
+            c, s = _wave(turn, np.cos, 0.0), _wave(turn, np.sin, 0.5 * np.pi)
+            u, v = Jet(*mul(size, c), real).factor, Jet(*mul(size, s), imaginary).factor
+            xu, yv, xv, yu = (
+                p.times(q, self.boxes.variables, self.order - k + 1)
+                for p, q in ((x, u), (y, v), (x, v), (y, u))
+            )
+            real, imaginary = xu + -yv, xv + yu
+        return imaginary
+
+    def _beside_cut(
+        self, a: Jet, b: Jet, found: Range, full: BoolArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Go on with the angle across its jump where that does not enter the simplex.
+
+        Where a ≥ 0 the angle is π/2 − atan2(b, a), and where a ≤ 0 it is atan2(b, −a) − π/2. They
+        jump where a has the other sign and b is 0, and nowhere else.
+        """
+        low, high = found
+        bottom, top, _ = self._difference(a, self._constant(0.0))
+        for sign, beside in ((1.0, bottom >= 0), (-1.0, top <= 0)):
+            ends = (a.low, a.high) if sign > 0 else (-a.high, -a.low)
+            here = full & beside & ~((ends[0] <= 0) & (b.low <= 0) & (b.high >= 0))
+            angles = [np.arctan2(x, y) for x in (b.low, b.high) for y in ends]
+            turned = out((np.minimum.reduce(angles), np.maximum.reduce(angles)), LOOSE)
+            first, last = (sign * (0.5 * np.pi - angle) for angle in turned)
+            rows = out((np.minimum(first, last), np.maximum(first, last)), LOOSE)
+            low, high = np.where(here, rows[0], low), np.where(here, rows[1], high)
+            full = full & ~here
+        return low, high, full
 
     # ---- choices
 
@@ -395,34 +449,37 @@ class Enclosure:
 
         Above the order smooth the coefficients are infinite where either may be.
         """
-        first, second = a.all, b.all
-        low = np.where(either, np.minimum(a.low, b.low), np.where(take, a.low, b.low))
-        high = np.where(either, np.maximum(a.high, b.high), np.where(take, a.high, b.high))
-        order = [sum(k) for k in indices(self.boxes.variables, self.order)]
-        rest: list[Ball] = []
-        undecided = bool(np.any(either))
-        for k in range(1, self.size + 1):
-            if first[k] is None and second[k] is None and (order[k] <= smooth or not undecided):
-                rest.append(None)
-                continue
-            (m, r), (n, s) = (ball or _NOTHING for ball in (first[k], second[k]))
-            mid, rad = np.where(take, m, n), np.where(take, r, s)
-            if undecided:
-                hull = _ball((np.minimum(m - r, n - s), np.maximum(m + r, n + s)))
-                hull = hull if order[k] <= smooth and hull is not None else _ANY
-                mid, rad = np.where(either, hull[0], mid), np.where(either, hull[1], rad)
-            rest.append((mid, rad))
-        return Jet(low, high, tuple(rest))
+        low, high = np.where(take, a.low, b.low), np.where(take, a.high, b.high)
+        rows, undecided = union(a.rest.rows, b.rest.rows), np.any(either)
+        known = len(indices(self.boxes.variables, min(smooth, self.order)))
+        if undecided:
+            low = np.where(either, np.minimum(a.low, b.low), low)
+            high = np.where(either, np.maximum(a.high, b.high), high)
+            rows = union(rows, self._every[known - 1 :])
+        (m, r), (n, s) = a.rest.on(rows), b.rest.on(rows)
+        mid, rad = np.where(take, m, n), np.where(take, r, s)
+        if undecided:
+            hull = middle(np.minimum(m - r, n - s), np.maximum(m + r, n + s))
+            above = sum(row < known for row in rows)
+            for array, ends in zip(hull, (0.0, np.inf), strict=True):
+                array[above:] = ends
+            mid, rad = (np.where(either, h, x) for h, x in zip(hull, (mid, rad), strict=True))
+        return Jet(low, high, Balls(rows, mid, rad))
+
+    @property
+    def _every(self) -> Rows:
+        """All coefficients from the first order on."""
+        return tuple(range(1, len(indices(self.boxes.variables, self.order))))
 
     def _maximum(self, a: Jet, b: Jet) -> Jet:
         above, below = a.low >= b.high, b.low >= a.high
         jet = self._choose(above, ~(above | below), a, b, 1)
-        return Jet(np.maximum(a.low, b.low), np.maximum(a.high, b.high), jet.rest)
+        return replace(jet, low=np.maximum(a.low, b.low), high=np.maximum(a.high, b.high))
 
     def _minimum(self, a: Jet, b: Jet) -> Jet:
         above, below = a.low >= b.high, b.low >= a.high
         jet = self._choose(below, ~(above | below), a, b, 1)
-        return Jet(np.minimum(a.low, b.low), np.minimum(a.high, b.high), jet.rest)
+        return replace(jet, low=np.minimum(a.low, b.low), high=np.minimum(a.high, b.high))
 
     def _conditional(self, e: Any) -> Jet:
         condition, first, second = e.ufl_operands
@@ -434,7 +491,7 @@ class Enclosure:
         if agree and _is_extreme(condition, first, second):
             rule = self._maximum if _is_maximum(condition, first) else self._minimum
             extreme = rule(a, b)
-            return Jet(extreme.low, extreme.high, jet.rest)
+            return replace(jet, low=extreme.low, high=extreme.high)
         return jet
 
     def truth(self, e: Any) -> Truth:
@@ -466,26 +523,25 @@ class Enclosure:
     def _difference(self, a: Jet, b: Jet) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Bounds of a − b, and whether it takes each value on a null set only."""
         low, high = a.low - b.high, a.high - b.low  # the sign is right whatever the rounding
-        n = self.boxes.variables
-        slopes = [_add(p, _minus(q)) for p, q in zip(a.rest, b.rest, strict=True)]
-        thin = np.zeros(np.broadcast_shapes(low.shape, self.boxes.low[0].shape), dtype=bool)
+        unclear = np.asarray((low <= 0) & (high >= 0))
+        if not np.any(unclear):
+            return low, high, unclear
+        n, rest = self.boxes.variables, a.rest + -b.rest
         # where a function is 0 its derivatives, and theirs, are 0 almost everywhere
-        for ball in slopes:
-            if ball is not None:
-                thin |= np.abs(ball[0]) > ball[1]
+        thin = np.asarray((np.abs(rest.mid) > rest.rad).any(axis=0))
         corners = self.boxes.corners
-        if corners is None or self.order < 2 or any(a.rest[n:]) or any(b.rest[n:]):
+        if corners is None or self.order < 2 or max(rest.rows, default=0) > n:
             return low, high, thin
-        return *self._at_corners(low, high, slopes[:n], corners), thin
+        self.strips += unclear
+        return *self._at_corners(low, high, rest.on(tuple(range(1, n + 1)))[0], corners), thin
 
     def _at_corners(
-        self, low: FloatArray, high: FloatArray, slopes: Sequence[Ball], corners: FloatArray
+        self, low: FloatArray, high: FloatArray, slopes: FloatArray, corners: FloatArray
     ) -> Range:
         """Bounds of an affine function on simplices, but for strips along their boundary.
 
         The middle of its range on the box is its value in the middle of the box.
         """
-        self.strips += 1
         box = self.boxes
         middle = 0.5 * (low + high)
         offset = corners - 0.5 * (box.low + box.high)
@@ -496,13 +552,12 @@ class Enclosure:
             half = np.einsum("vgn,gn->vn", np.abs(box.along), half)
         rise = np.zeros(offset.shape[::2])
         steep, reach = np.zeros((2, rise.shape[1]))
-        for axis, ball in enumerate(slopes):
-            if ball is not None:
-                rise = rise + ball[0] * offset[:, axis]
-                steep = np.hypot(steep, ball[0])
-                reach = reach + np.abs(ball[0]) * half[axis]
+        for axis, slope in enumerate(slopes):
+            rise = rise + slope * offset[:, axis]
+            steep = np.hypot(steep, slope)
+            reach = reach + np.abs(slope) * half[axis]
         # what the range is wider than an affine function's is rounding
-        rounding = np.maximum(0.5 * (high - low) - reach, 0.0) + _EPS * (np.abs(low) + np.abs(high))
+        rounding = np.maximum(0.5 * (high - low) - reach, 0.0) + EPS * (np.abs(low) + np.abs(high))
         room = steep * box.strip - rounding
         bottom, top = middle + rise.min(axis=0) + room, middle + rise.max(axis=0) - room
         bad = ~(bottom <= top)
@@ -511,84 +566,13 @@ class Enclosure:
         )
 
 
-# ---- coefficients as balls
-
-
-class _Factor:
-    """Coefficients, prepared for products."""
-
-    def __init__(self, balls: Sequence[Ball]):
-        self.terms = [
-            None if ball is None else (*ball, np.abs(ball[0]), np.abs(ball[0]) + ball[1])
-            for ball in balls
-        ]
-
-
-class _Total:
-    """A sum of products of balls."""
-
-    def __init__(self) -> None:
-        self.mid: Any = None
-        self.rad: Any = None
-
-    def product(self, x: _Factor, i: int, y: _Factor, j: int) -> None:
-        """Add one product; 0 times what has no bound is 0."""
-        a, b = x.terms[i], y.terms[j]
-        if a is None or b is None:
-            return
-        mid = a[0] * b[0]
-        rad = np.fmax(a[2] * (b[1] + _LOOSE * b[2]), 0.0) + np.fmax(a[1] * b[3], 0.0)
-        self.mid = mid if self.mid is None else self.mid + mid
-        self.rad = rad if self.rad is None else self.rad + rad
-
-    @property
-    def ball(self) -> Ball:
-        """What the sum is."""
-        return None if self.mid is None else _sane(self.mid, self.rad * (1 + 1e-14))
-
-
-_NOTHING = (np.zeros(()), np.zeros(()))
-_ANY = (np.zeros(()), np.array(np.inf))
-
-
-def _sane(mid: FloatArray, rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    bad = ~(np.isfinite(mid) & (rad < np.inf))
-    return (np.where(bad, 0.0, mid), np.where(bad, np.inf, rad)) if bad.any() else (mid, rad)
-
-
-def _ball(range_: Range) -> Ball:
-    low, high = range_
-    if low.ndim == 0 and low == 0 and high == 0:
-        return None
-    mid = 0.5 * low + 0.5 * high
-    return _sane(mid, np.maximum(high - mid, mid - low) * (1 + 1e-15))
-
-
-def _add(a: Ball, b: Ball) -> Ball:
-    if a is None or b is None:
-        return a if b is None else b
-    mid = a[0] + b[0]
-    return mid, (a[1] + b[1] + _EPS * np.abs(mid)) * (1 + 1e-15)
-
-
-def _minus(a: Ball) -> Ball:
-    return None if a is None else (-a[0], a[1])
-
-
-def _meet(a: Ball, b: Ball) -> Ball:
-    """The smaller of two balls which both hold the number."""
-    if a is None or b is None:
-        return None
-    return np.where(a[1] <= b[1], a[0], b[0]), np.minimum(a[1], b[1])
-
-
 # ---- ranges
 
 
-def out(x: Range, room: float = _EPS) -> Range:
+def out(x: Range, room: float = EPS) -> Range:
     """Make room for rounding."""
     low, high = x[0] - room * np.abs(x[0]), x[1] + room * np.abs(x[1])
-    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    return np.fmax(low, -np.inf), np.fmin(high, np.inf)  # of a number and NaN it is the number
 
 
 def mul(x: Range, y: Range) -> Range:
@@ -624,8 +608,6 @@ def _raised(x: Range, p: float) -> Range:
     """x^p; where p is not whole, for what of x is not negative."""
     if p == 0:
         return np.array(1.0), np.array(1.0)
-    if p < 0:
-        return _inverse(_raised(x, -p))
     if p == 1:
         return x
     if p == 2:
@@ -633,26 +615,28 @@ def _raised(x: Range, p: float) -> Range:
     whole = p == round(p)
     low, high = x if whole else (np.maximum(x[0], 0.0), np.maximum(x[1], 0.0))
     a, b = (np.sqrt(low), np.sqrt(high)) if p == 0.5 else (low**p, high**p)
+    if not whole:
+        return out((a, b) if p > 0 else (b, a), LOOSE)
     least = np.minimum(a, b)
-    if whole and p % 2 == 0:
+    if p % 2 == 0:
         least = np.where((low < 0) & (high > 0), 0.0, least)
-    return out((least, np.maximum(a, b)), _LOOSE)
+    return out((least, np.maximum(a, b)), LOOSE)
 
 
 def _rising(function: Callable[[FloatArray], FloatArray], x: Range) -> Range:
-    return out((function(x[0]), function(x[1])), _LOOSE)
+    return out((function(x[0]), function(x[1])), LOOSE)
 
 
 def _wave(x: Range, function: Callable[[FloatArray], FloatArray], top: float) -> Range:
     """The range of a sine or cosine that has a crest at `top`."""
-    turn, room = 2 * np.pi, _LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
+    turn, room = 2 * np.pi, LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
 
     def meets(crest: float) -> BoolArray:
         last = np.floor((x[1] + room - crest) / turn)
         return ~(last < np.ceil((x[0] - room - crest) / turn))  # NaN meets all
 
     a, b = function(x[0]), function(x[1])
-    low, high = out((np.minimum(a, b), np.maximum(a, b)), _LOOSE)
+    low, high = out((np.minimum(a, b), np.maximum(a, b)), LOOSE)
     low = np.where(meets(top + np.pi), -1.0, np.maximum(low, -1.0))
     return low, np.where(meets(top), 1.0, np.minimum(high, 1.0))
 
@@ -666,7 +650,10 @@ def power_series(p: float) -> Callable[[Range], Sequence[Range]]:
     zero = np.array(0.0), np.array(0.0)
 
     def series(x: Range) -> Sequence[Range]:
-        return [_scaled(c, _raised(x, p - k)) if c else zero for k, c in enumerate(factors)]
+        sign = -1.0 if p < 0 and p == round(p) else 1.0
+        base = _inverse(x) if sign < 0 else x
+        powers = enumerate(factors)
+        return [_scaled(c, _raised(base, sign * (p - k))) if c else zero for k, c in powers]
 
     return series
 
@@ -678,8 +665,9 @@ def _exp(x: Range) -> Sequence[Range]:
 
 def _ln(x: Range) -> Sequence[Range]:
     inside = np.maximum(x[0], 0.0), np.maximum(x[1], 0.0)
-    second, third = _scaled(-1 / 2, _raised(inside, -2.0)), _scaled(1 / 3, _raised(inside, -3.0))
-    return _rising(np.log, inside), _inverse(inside), second, third
+    first = _inverse(inside)
+    second, third = _scaled(-1 / 2, square_of(*first)), _scaled(1 / 3, _raised(first, 3.0))
+    return _rising(np.log, inside), first, second, third
 
 
 def _sin(x: Range) -> Sequence[Range]:
@@ -693,7 +681,7 @@ def _cos(x: Range) -> Sequence[Range]:
 
 
 def _tan(x: Range) -> Sequence[Range]:
-    room = _LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
+    room = LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
     pole = np.floor((x[1] + room) / np.pi - 0.5) >= np.ceil((x[0] - room) / np.pi - 0.5)
     low, high = _rising(np.tan, x)
     t = np.where(pole, -np.inf, low), np.where(pole, np.inf, high)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,9 +12,8 @@ from mpi4py import MPI
 
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare
 from ..fem.space import facet_quadrature
-from ..mesh.domain import NEUMANN
-from .jets import Boxes, Unknown
-from .moments import LOAD_DEGREE, Trace, Volume
+from .jets import Boxes, Enclosure, Unknown
+from .moments import LOAD_DEGREE, OnFacets, Volume
 from .ranges import Cut, Pieces, cut, errors_on, refine
 
 FloatArray = npt.NDArray[np.float64]
@@ -145,7 +145,7 @@ class Certain:
         deviation, points = f.deviation, np.hstack([fine.rule.hats, fine.plain.hats])
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-            quadratic, cubic = deviation(boxes, half, hats=points)
+            quadratic, cubic = deviation(Enclosure(boxes), half, hats=points)
             return np.stack([cubic, quadratic**2])
 
         reach = 4.0 * poincare(cells.tdim) ** 2 * cells.diameter2 * cells.volume / low
@@ -162,7 +162,7 @@ class Certain:
         return cls(load.refined(fine, cells, found), missed, rough, reason)
 
 
-SHARE = 2e-3
+SHARE = 4e-3
 """What may be missed of f, in parts of the bound, or thereabouts."""
 UNBOUNDED = "f is not bounded on the mesh, or not known to be"
 
@@ -177,11 +177,11 @@ class Edge:
         shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
     """
 
-    def __init__(self, g: Trace, cells: Cells):
-        """Evaluate g."""
-        self.g, self._cells = g, cells
-        self.side = cells.sides[NEUMANN]
-        _, _, self.values = g.at(cells.domain.mesh, self.side.entities)
+    def __init__(self, sampled: OnFacets, cells: Cells):
+        """Take g's values, and integrate them."""
+        g = self.g = sampled.trace
+        self.side, self._cells = sampled.side(cells), cells
+        self.values = sampled.seen_from(cells).inside
         self.measure = measures(cells, self.side)
         self.shares = self.measure * (g.hats.T * g.weights @ self.values)
 
@@ -251,7 +251,7 @@ class Segments:
         if not known:
 
             def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-                quadratic, cubic = g.deviation(boxes, half, hats=hats.T)
+                quadratic, cubic = g.deviation(Enclosure(boxes), half, hats=hats.T)
                 return np.stack([cubic, quadratic**2])
 
             here, goal = pick(low, facets.cells), SHARE * size
@@ -362,13 +362,14 @@ def _trace_constant(cells: Cells, side: Side) -> FloatArray:
     return np.sqrt(measures(cells, side) / cells.volume[side.cells] * c * (c + 2.0 * h / d))
 
 
-def chi(load: Load, edge: Edge, cells: Cells) -> FloatArray:
+def chi(load: Load, edges: Sequence[Edge], cells: Cells) -> FloatArray:
     """χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's cells' share."""
-    if load.vanishes and edge.g.vanishes:
+    if load.vanishes and all(edge.g.vanishes for edge in edges):
         return np.zeros(len(cells.exterior))
     values = np.empty((cells.tdim + 1, cells.number))
     for part in blocks(cells.number):
         values[:, part] = load.shares(cells, part)
-    for row, share in zip(values, edge.to_cells(), strict=True):
-        np.add.at(row, edge.side.cells, share)
+    for edge in edges:
+        for row, share in zip(values, edge.to_cells(), strict=True):
+            np.add.at(row, edge.side.cells, share)
     return cells.over_facets(values, shared=False)

@@ -6,11 +6,10 @@ where they are numbers exactly.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import factorial
-from weakref import WeakKeyDictionary, proxy
 
 import basix
 import numpy as np
@@ -21,10 +20,13 @@ from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from .. import compat
-from ..fem.cells import Cells
+from ..fem.cells import Cells, Side
+from ..fem.conditions import Condition
+from ..fem.physics import Imposed
 from ..fem.problem import Forms, number
-from ..fem.space import facet_quadrature
-from .jets import Boxes, Enclosure, strips_of
+from ..fem.space import facet_entities, facet_quadrature
+from ..mesh.domain import Domain
+from .jets import Boxes, Enclosure, values
 from .ranges import Cut, Deviation, Range, cut, range_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -45,10 +47,10 @@ class Rule:
         bumps: b_i = 4 λ_j λ_k, i, j, k different, at the points, shape (d + 1, q); for d = 2.
     """
 
-    def __init__(self, forms: Forms, degree: int):
+    def __init__(self, mesh: Mesh, degree: int):
         """Take the rule that is exact for polynomials of a degree."""
         self.degree = degree
-        self.points, weights = basix.make_quadrature(forms.mesh.basix_cell(), degree)
+        self.points, weights = basix.make_quadrature(mesh.basix_cell(), degree)
         self.weights = weights / weights.sum()
         self.hats = np.vstack([1.0 - self.points.sum(axis=1), self.points.T])
         self.bumps = np.stack(
@@ -61,17 +63,17 @@ class Volume:
 
     Args:
         expression: A scalar.
-        forms: The problem's.
+        mesh: The mesh that it was written for.
         rule: Where to evaluate.
     """
 
-    def __init__(self, expression: Expr, forms: Forms, rule: Rule):
+    def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
         """Compile the expression, unless it is a number."""
         self.number, self.rule = number(expression), rule
-        self.expression, self._forms = expression, forms
+        self.expression, self._mesh = expression, mesh
         self._values = None
         if self.number is None:
-            self._values = compat.compile_expression(expression, rule.points, forms.mesh)
+            self._values = compat.compile_expression(expression, rule.points, mesh)
 
     def at(self, cells: Cells) -> FloatArray:
         """Values at the quadrature points of owned cells, shape (cells, q)."""
@@ -91,14 +93,14 @@ class Volume:
         if self.number is not None or self.rule.degree >= degree:
             return self
         if degree not in self._others:
-            rule = Rule(self._forms, degree)
-            self._others[degree] = Volume(self.expression, self._forms, rule)
+            rule = Rule(self._mesh, degree)
+            self._others[degree] = Volume(self.expression, self._mesh, rule)
         return self._others[degree]
 
     @cached_property
     def plain(self) -> Rule:
         """A rule for pieces of cells: what is missed on these is known."""
-        return Rule(self._forms, LOAD_DEGREE)
+        return Rule(self._mesh, LOAD_DEGREE)
 
     @cached_property
     def _others(self) -> dict[int, Volume]:
@@ -169,16 +171,17 @@ class Coefficient:
         """
         if self.values is None:
             return
-        strips = strips_of(self.deviation.expression)
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-            (r, w), (s, x) = (self.deviation(boxes, half, inverse) for inverse in (False, True))
+            at = Enclosure(boxes)
+            (r, w), (s, x) = (self.deviation(at, half, inverse) for inverse in (False, True))
             low, high = np.zeros((2, len(r)))
-            if strips and boxes.corners is not None:
-                jet = Enclosure(replace(boxes, corners=None), order=0)(self.deviation.expression)
-                part = strips * boxes.strip_part
-                low, high = part / np.maximum(jet.low, 1e-300), part * jet.high
-            return np.stack([r, self._ratio(boxes, r, s), w, x, low, high, r**2])
+            if at.strips.any():
+                which = np.flatnonzero(at.strips)
+                jet = Enclosure(boxes.whole(which), order=0)(self.deviation.expression)
+                part = (at.strips * boxes.strip_part)[which]
+                low[which], high[which] = part / np.maximum(jet.low, 1e-300), part * jet.high
+            return np.stack([r, self._ratio(at, r, s), w, x, low, high, r**2])
 
         # of the bound's square: (e + 2 R a)² for e², a norm κ^{-1/2} weighs
         weights = self.rule.weights
@@ -202,26 +205,23 @@ class Coefficient:
         )
         self.inside = self.deviation.values(self.cut.pieces, cells, self.rule.hats)
 
-    def _ratio(self, boxes: Boxes, r: FloatArray, s: FloatArray) -> FloatArray:
+    def _ratio(self, at: Enclosure, r: FloatArray, s: FloatArray) -> FloatArray:
         """T on boxes, with R for κ and for 1/κ given, shape (n,).
 
         Let q be the quadratic through κ⁻¹ at the rule's points. 1 − κq is within R|q| of a
         polynomial of degree 4, which is known at the points up to R|q|. Without points R for κ⁻¹
         has to do.
         """
-        jet = Enclosure(boxes, order=0)(self.deviation.expression)
+        boxes = at.boxes
         with np.errstate(all="ignore"):
-            excess = 2.0 * jet.high * s
+            excess = 2.0 * at(self.deviation.expression).high * s
             if boxes.corners is None:
                 return np.where(np.isnan(excess), np.inf, excess)
             hats = self.rule.hats
-            at = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
+            x = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
             cells = None if boxes.cells is None else np.tile(boxes.cells, hats.shape[1])
-            there = Enclosure(Boxes(at, at, cells=cells, mesh=boxes.mesh), order=0)
-            jet = there(self.deviation.expression)
-            values = np.broadcast_to(0.5 * (jet.low + jet.high), at.shape[1])
-            values = values.reshape(hats.shape[1], len(r))
-            excess = np.fmin(excess, self._by_points(values, r))
+            there = values(self.deviation.expression, Boxes(x, x, cells=cells, mesh=boxes.mesh))
+            excess = np.fmin(excess, self._by_points(there.reshape(hats.shape[1], len(r)), r))
             return np.where(np.isnan(excess), np.inf, excess)
 
     def _by_points(self, values: FloatArray, r: FloatArray) -> FloatArray:
@@ -273,19 +273,18 @@ class Trace:
         constant: The number that it is, or None.
     """
 
-    def __init__(self, expression: Expr, forms: Forms):
-        """Compile the expression, unless it is a number."""
-        self._expression = expression
-        facet = basix.cell.subentity_types(forms.mesh.basix_cell())[-2][0]
+    def __init__(self, expression: Expr, mesh: Mesh, degree: int):
+        """Compile the expression, written for a mesh, unless it is a number."""
+        self._expression, self.degree = expression, degree
+        facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
         corners = basix.geometry(facet)
-        self.degree = forms.problem.quadrature_degree
-        self.points, self.weights = facet_quadrature(forms.mesh, self.degree)
+        self.points, self.weights = facet_quadrature(mesh, degree)
         self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
         self._corners = len(corners)
         self.constant = number(expression)
         if self.constant is None:
             at = np.vstack([corners, corners.mean(axis=0), self.points])
-            self._values = compat.FacetExpression(expression, at, forms.mesh)
+            self._values = compat.FacetExpression(expression, at, mesh)
 
     @property
     def expression(self) -> Expr:
@@ -320,46 +319,86 @@ class Trace:
         return values[:k], values[k], values[k + 1 :]
 
 
-class Sampled:
-    """The data of a problem for evaluation, each compiled when first asked for; collective."""
+@dataclass(frozen=True, eq=False)
+class OnFacets:
+    """A condition's datum on all facets of its part that a rank sees, evaluated once.
+
+    Attributes:
+        condition: The condition.
+        trace: The datum.
+        facets: Local indices, ghosts included, ascending, shape (n,).
+        entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+        ends: Values at the vertices, in the order of the cell's closure, shape (d, n).
+        middle: At the midpoints, shape (n,).
+        inside: At the trace's quadrature points, shape (q, n).
+    """
+
+    condition: Condition
+    trace: Trace
+    facets: IntArray
+    entities: IntArray
+    ends: FloatArray
+    middle: FloatArray
+    inside: FloatArray
+
+    @classmethod
+    def of(cls, condition: Condition, trace: Trace, domain: Domain) -> OnFacets:
+        """Evaluate a datum on a mesh; collective."""
+        facets = domain.all_facets[condition.number]
+        entities = facet_entities(domain.mesh, facets)
+        return cls(condition, trace, facets, entities, *trace.at(domain.mesh, entities))
+
+    @property
+    def means(self) -> FloatArray:
+        """Means over the facets, shape (n,)."""
+        return self.trace.weights @ self.inside
+
+    @property
+    def imposed(self) -> Imposed:
+        """The same for the one unknown of each facet."""
+        only = np.zeros(1, dtype=np.int32)
+        means, ends = self.means[:, None], self.ends.T[:, :, None]
+        return Imposed(self.condition.key, self.facets, only, means, ends)
+
+    def seen_from(self, cells: Cells) -> OnFacets:
+        """Keep the facets of owned cells, those of the part's `Side`."""
+        own = self.entities[:, 0] < cells.number
+        where = self.facets[own], self.entities[own]
+        values = self.ends[:, own], self.middle[own], self.inside[:, own]
+        return OnFacets(self.condition, self.trace, *where, *values)
+
+    def side(self, cells: Cells) -> Side:
+        """The facets of owned cells, seen from these."""
+        return cells.sides[self.condition.number]
+
+
+class Compiled:
+    """The data of a problem ready for evaluation on any mesh, each compiled when first asked for.
+
+    Args:
+        forms: The problem's.
+    """
 
     def __init__(self, forms: Forms):
-        """Note whose data, weakly: `of` keeps this as long as the forms are there."""
-        self._forms: Forms = proxy(forms)
-        self._rule = Rule(forms, forms.problem.quadrature_degree)
+        """Note whose data."""
+        self.forms = forms
+        self._rule = Rule(forms.mesh, forms.problem.quadrature_degree)
+        self._traces: dict[Expr, Trace] = {}
 
     @cached_property
     def f(self) -> Volume:
-        """Volume load."""
-        return Volume(self._forms.f, self._forms, self._rule)
+        """Volume load; collective."""
+        return Volume(self.forms.f, self.forms.mesh, self._rule)
 
     @cached_property
     def kappa(self) -> Volume | None:
-        """Coefficient; None if it isn't a scalar."""
-        kappa = self._forms.kappa
-        return None if ufl.shape(kappa) else Volume(kappa, self._forms, self._rule)
+        """Coefficient; None if it isn't a scalar; collective."""
+        kappa = self.forms.kappa
+        return None if ufl.shape(kappa) else Volume(kappa, self.forms.mesh, self._rule)
 
-    @cached_property
-    def u_D(self) -> Trace:
-        """Values on Γ0."""
-        return Trace(self._forms.dirichlet, self._forms)
-
-    @cached_property
-    def alpha(self) -> Trace:
-        """Obstacle."""
-        return Trace(self._forms.obstacle, self._forms)
-
-    @cached_property
-    def g(self) -> Trace:
-        """Flux on Γg."""
-        return Trace(self._forms.g, self._forms)
-
-    @classmethod
-    def of(cls, forms: Forms) -> Sampled:
-        """The data of these forms, one object for all who ask."""
-        if forms not in _SAMPLED:
-            _SAMPLED[forms] = cls(forms)
-        return _SAMPLED[forms]
-
-
-_SAMPLED: WeakKeyDictionary[Forms, Sampled] = WeakKeyDictionary()
+    def trace(self, expression: Expr) -> Trace:
+        """Values of a condition's datum on facets; collective."""
+        if expression not in self._traces:
+            degree = self.forms.problem.quadrature_degree
+            self._traces[expression] = Trace(expression, self.forms.mesh, degree)
+        return self._traces[expression]

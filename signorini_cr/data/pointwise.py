@@ -189,35 +189,57 @@ def _truth(function: Callable[..., Any]) -> Callable[..., Value]:
     return lambda *operands: (function(*(operand[0] for operand in operands)), 0.0)
 
 
+_SMOOTH: dict[type, Callable[..., Any]] = {
+    classes.Power: lambda a, p: np.asarray(a, dtype=np.float64) ** p,
+    classes.Sqrt: np.sqrt,
+    classes.Exp: np.exp,
+    classes.Ln: np.log,
+    classes.Sin: np.sin,
+    classes.Cos: np.cos,
+    classes.Tan: np.tan,
+    classes.Asin: np.arcsin,
+    classes.Acos: np.arccos,
+    classes.Atan: np.arctan,
+    classes.Atan2: np.arctan2,
+    classes.Sinh: np.sinh,
+    classes.Cosh: np.cosh,
+    classes.Tanh: np.tanh,
+}
+_EXTREMES: dict[type, Callable[..., Any]] = {
+    classes.MinValue: np.minimum,
+    classes.MaxValue: np.maximum,
+}
+_TRUTHS: dict[type, Callable[..., Any]] = {
+    classes.LT: np.less,
+    classes.LE: np.less_equal,
+    classes.GT: np.greater,
+    classes.GE: np.greater_equal,
+    classes.EQ: np.equal,
+    classes.NE: np.not_equal,
+    classes.AndCondition: np.logical_and,
+    classes.OrCondition: np.logical_or,
+    classes.NotCondition: np.logical_not,
+}
+FUNCTIONS: dict[type, Callable[..., Any]] = {
+    classes.Sum: np.add,
+    classes.Product: np.multiply,
+    classes.Division: np.divide,
+    classes.Abs: np.abs,
+    classes.Conditional: np.where,
+    **_SMOOTH,
+    **_EXTREMES,
+    **_TRUTHS,
+}
+"""What operators do to numbers."""
+
+_PERIODS = {classes.Atan2: 2 * np.pi}
 _RULES: dict[type, Callable[..., Value]] = {
     classes.Sum: _sum,
     classes.Product: _product,
     classes.Division: _quotient,
-    classes.Power: _function_of(lambda a, p: np.power(np.asarray(a, dtype=np.float64), p)),
     classes.Abs: lambda a: (np.abs(a[0]), a[1]),
-    classes.Sqrt: _function_of(np.sqrt),
-    classes.Exp: _function_of(np.exp),
-    classes.Ln: _function_of(np.log),
-    classes.Sin: _function_of(np.sin),
-    classes.Cos: _function_of(np.cos),
-    classes.Tan: _function_of(np.tan),
-    classes.Asin: _function_of(np.arcsin),
-    classes.Acos: _function_of(np.arccos),
-    classes.Atan: _function_of(np.arctan),
-    classes.Atan2: _function_of(np.arctan2, 2 * np.pi),
-    classes.Sinh: _function_of(np.sinh),
-    classes.Cosh: _function_of(np.cosh),
-    classes.Tanh: _function_of(np.tanh),
-    classes.MinValue: _extreme(np.minimum),
-    classes.MaxValue: _extreme(np.maximum),
     classes.Conditional: _choice,
-    classes.LT: _truth(np.less),
-    classes.LE: _truth(np.less_equal),
-    classes.GT: _truth(np.greater),
-    classes.GE: _truth(np.greater_equal),
-    classes.EQ: _truth(np.equal),
-    classes.NE: _truth(np.not_equal),
-    classes.AndCondition: _truth(np.logical_and),
-    classes.OrCondition: _truth(np.logical_or),
-    classes.NotCondition: _truth(np.logical_not),
+    **{kind: _function_of(f, _PERIODS.get(kind, np.inf)) for kind, f in _SMOOTH.items()},
+    **{kind: _extreme(f) for kind, f in _EXTREMES.items()},
+    **{kind: _truth(f) for kind, f in _TRUTHS.items()},
 }

@@ -17,7 +17,8 @@ import ufl
 from mpi4py import MPI
 
 from ..compat import cell_nodes
-from ..fem.cells import Cells, Side, corner_points
+from ..fem.cells import Cells, Side, blocks, corner_points
+from .balls import indices
 from .germs import allowance, first_inside, may_be_singular
 from .jets import (
     Boxes,
@@ -26,9 +27,9 @@ from .jets import (
     Range,
     Unknown,
     has_conditions,
-    indices,
     is_local,
     lowered,
+    values,
 )
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,7 +42,7 @@ GROUPS = 700
 """Boxes to begin with, about."""
 PIECES = 6_000
 """Pieces that a mesh's cells are cut into at most, in all, or one for 64 cells."""
-CHUNK = 1 << 13
+CHUNK = 1 << 12
 """Boxes that are worked on at a time."""
 BEHIND = 0.25
 """Part of what may be missed that is left to cells for which a large box is good enough."""
@@ -49,7 +50,7 @@ ROUNDS = 20
 """How often pieces are cut at most."""
 BISECTIONS = 6
 """Steps towards the smallest size that there is room for."""
-CELLS = 20_000
+CELLS = 60_000
 """Cells that may have boxes of their own, if that is more than twice the pieces."""
 LEAST = 1e-11
 """Part of a cell, or of a facet, that is not cut any more: coordinates have so many digits."""
@@ -67,6 +68,10 @@ ACROSS = 1.15
 """How much better than by quarters errors must fall for a cut across an axis."""
 DEEP = 60.0
 """How far above the threshold pieces are cut twice at once."""
+ENOUGH = 0.5
+"""Sum of errors at which it ends."""
+FALL = 4.0
+"""By how much errors fall where pieces are cut, at least, as a rule."""
 IDLE = 0.25
 """Exponent of the number of pieces by which a cut lowers the error that does little."""
 SLANTED = 4.0
@@ -100,7 +105,9 @@ def range_of(expression: ufl.core.expr.Expr, cells: Cells) -> Range | None:
     return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
 
 
-def remainders(jet: Jet, half: FloatArray) -> tuple[FloatArray, FloatArray]:
+def remainders(
+    jet: Jet, half: FloatArray, in_the_mean: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """R and W for simplices within half extents of a point, shapes (n,).
 
     Taylor's polynomial of the point, with the middles of the coefficients of the highest order
@@ -109,22 +116,42 @@ def remainders(jet: Jet, half: FloatArray) -> tuple[FloatArray, FloatArray]:
     Args:
         jet: On boxes that hold the simplices.
         half: Shape (variables, n).
+        in_the_mean: Whether R may be the root of a mean square and W a mean, also by a rule that
+            is exact for degree 4; else they hold at every point.
     """
     variables, n = half.shape
-    by_order = np.zeros((4, n))
-    by_order[0] = 0.5 * (jet.high - jet.low)
+    by_order, by_order_of_mean = np.zeros((2, 4, n))
+    by_order[0] = by_order_of_mean[0] = 0.5 * (jet.high - jet.low)
     cubic = np.zeros(n)
-    for index, ball in zip(indices(variables)[1:], jet.rest, strict=True):
-        if ball is None:
-            continue
+    of_square, of_mean = means(variables) if in_the_mean else (_ONES, _ONES)
+    for row, mid, rad in zip(jet.rest.rows, jet.rest.mid, jet.rest.rad, strict=True):
+        index = indices(variables)[row]
+        order = sum(index)
         size = np.prod([h**k for h, k in zip(half, index, strict=True) if k], axis=0)
-        by_order[sum(index)] += ball[1] * size
-        if sum(index) == 3:
-            cubic += _CUBIC[max(index)] * np.abs(ball[0]) * size
-    width = np.fmin.reduce(by_order)
+        by_order[order] += of_square[order] * rad * size
+        by_order_of_mean[order] += of_mean[order] * rad * size
+        if order == 3:
+            cubic += _CUBIC[max(index)] * np.abs(mid) * size
     by_order[3] += cubic
-    quadratic = np.fmin.reduce(by_order)
-    return tuple(np.where(np.isnan(x), np.inf, x * (1 + 1e-12)) for x in (quadratic, width))  # type: ignore[return-value]
+    found = np.fmin.reduce(by_order), np.fmin.reduce(by_order_of_mean)
+    return tuple(np.where(np.isnan(x), np.inf, x * (1 + 1e-12)) for x in found)  # type: ignore[return-value]
+
+
+_ONES = 1.0, 1.0, 1.0, 1.0
+
+
+def means(variables: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Bounds of (mean t^2i)^½ and of the mean of |t^i| for multi-indices i, by their order.
+
+    t runs through a simplex in the cube [−1, 1]^d that touches all of its faces, or through a slab
+    of a triangle; means may be a rule's. t₁² and t₁⁴ have the means given here or less, and the
+    inequality of Cauchy and Schwarz gives the others; |t₁|³ t₁³ is at most t₁⁴.
+    """
+    second, fourth = (2 / 5, 9 / 35) if variables == 3 else (1 / 3, 1 / 5)
+    return (
+        (1.0, second**0.5, fourth**0.5, fourth**0.5),
+        (1.0, second**0.5, second, (second * fourth) ** 0.5),
+    )
 
 
 class Deviation:
@@ -139,7 +166,7 @@ class Deviation:
 
     def __call__(
         self,
-        boxes: Boxes,
+        at: Enclosure,
         half: FloatArray,
         inverse: bool = False,
         hats: FloatArray | None = None,
@@ -147,24 +174,24 @@ class Deviation:
         """R and W, shapes (n,).
 
         Args:
-            boxes: Where.
+            at: On the boxes that are asked about.
             half: Half extents of the simplices in them, shape (variables, n).
             inverse: Of the expression's inverse.
-            hats: Points of a rule, for `germs.allowance` on the expression itself; None where data
-                without a bound are of no use.
+            hats: Points of a rule that is exact for degree 4, where R and W need only hold in the
+                mean over a simplex, so that data without a bound may be of use.
 
         Raises:
             Unknown: The expression holds an operator whose range is not known.
         """
-        quadratic, cubic, strips = self._decided(boxes, half, inverse)
-        if strips and boxes.corners is not None:
+        boxes = at.boxes
+        quadratic, cubic = remainders(self._jet(at, inverse), half, in_the_mean=hats is not None)
+        if at.strips.any():
             # What conditions left out along the boundary: there all values are possible
-            whole = replace(boxes, corners=None)
-            jet = self._jet(Enclosure(whole, order=0), inverse)
-            width = jet.high - jet.low
-            part = strips * boxes.strip_part
-            quadratic = np.hypot(quadratic, np.sqrt(part) * width)
-            cubic = np.minimum(cubic + 2 * part * width, quadratic)
+            which = np.flatnonzero(at.strips)
+            jet = self._jet(Enclosure(boxes.whole(which), order=0), inverse)
+            part, width = (at.strips * boxes.strip_part)[which], jet.high - jet.low
+            quadratic[which] += np.sqrt(part) * width
+            cubic[which] = np.minimum(cubic[which] + 2 * part * width, quadratic[which])
         if hats is not None and boxes.corners is not None and self.singular:
             rough, missed = allowance(self.expression, boxes.corners, hats)
             quadratic, cubic = np.fmin(quadratic, rough), np.fmin(cubic, missed)
@@ -183,12 +210,6 @@ class Deviation:
             pieces = pieces[rest] + pieces[which].around(point, hats)
         return pieces
 
-    def _decided(
-        self, boxes: Boxes, half: FloatArray, inverse: bool
-    ) -> tuple[FloatArray, FloatArray, int]:
-        enclosure = Enclosure(boxes)
-        return *remainders(self._jet(enclosure, inverse), half), enclosure.strips
-
     def _jet(self, enclosure: Enclosure, inverse: bool) -> Jet:
         return enclosure.inverse(self.expression) if inverse else enclosure(self.expression)
 
@@ -200,14 +221,11 @@ class Deviation:
             cells: The mesh.
             hats: Barycentric coordinates of the points in a piece, shape (d + 1, q).
         """
-        values = np.empty((hats.shape[1], len(pieces.parent)))
+        found = np.empty((hats.shape[1], len(pieces.parent)))
         for part in chunks(len(pieces.parent)):
-            jet = Enclosure(pieces[part].points(cells, hats), order=0)(self.expression)
-            here = values[:, part]
-            with np.errstate(invalid="ignore"):
-                middle = 0.5 * (jet.low + jet.high)
-            here[:] = np.broadcast_to(middle, here.size).reshape(here.shape)
-        return values
+            here = found[:, part]
+            here[:] = values(self.expression, pieces[part].points(cells, hats)).reshape(here.shape)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -565,9 +583,9 @@ def cut(
         cells,
         apart,
     )
-    for row, values in zip(found, inside, strict=True):
+    for row, amounts in zip(found, inside, strict=True):
         row[pending] = 0.0
-        np.add.at(row, pieces.parent, pieces.part * values)
+        np.add.at(row, pieces.parent, pieces.part * amounts)
     kept = np.flatnonzero(pieces.part < 1.0)
     kept = kept[np.argsort(pieces.parent[kept], kind="stable")]
     return Cut(found, pieces[kept], inside[:, kept])
@@ -611,12 +629,15 @@ def refine(
             first = first if np.isfinite(first[1]) else (number, have)
             if number > 0.7 * room and have / first[1] < (first[0] / number) ** STEEP:
                 room, first = ROOMY * room, (0.0, 0.0)
-        enough = MUCH if room > usual else 0.5
+        enough = MUCH if room > usual else ENOUGH
         idle = idle + 1 if not missing and have > 0.95 * before else 0
         if number >= room or have + missing <= enough or idle == IN_VAIN:
             break
-        # above half the mean is at least half of it
+        # above half the mean is at least half of it; what is not cut may be all that is left over
         threshold = max(0.5 * have, 0.25) / number
+        if not missing and FALL * enough > have:
+            spare = (FALL * enough - have) / (FALL - 1.0)
+            threshold = max(threshold, _negligible(share, spare, cells.comm))
         space = int(room - number) // 3 + 1
         large = (pieces.part > LEAST) | ~np.isfinite(share)
         chosen = _worst(np.where(large, share, 0.0), threshold, space, cells.comm)
@@ -629,7 +650,7 @@ def refine(
             ways[chosen],
             share[chosen],
             inside[:, chosen],
-            share[chosen] > DEEP * threshold,
+            share[chosen] > DEEP * (threshold if 8 * number > usual else ENOUGH / number),
             errors,
             weights,
         )
@@ -688,6 +709,12 @@ def _split(
     # what did little may be followed by another way
     idle = sums > before / np.maximum(np.bincount(origin, minlength=n), 1) ** IDLE
     made = np.where(idle[origin], UNKNOWN, made)
+    # slabs have no corners at which a condition could be decided: where that matters, quarters
+    worse = (sums > 2.0 * before) & (ways[known] != QUARTERS)
+    if worse.any():
+        good, back = ~worse[origin], known[worse]
+        finer, inside = finer[good] + pieces[back], np.hstack([inside[:, good], errors_of[:, back]])
+        made = np.concatenate([made[good], np.full(len(back), QUARTERS)])
     if probed is None:
         return finer, inside, made
     of_probes = np.tile(some.parent, 3)
@@ -768,14 +795,15 @@ def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
 def _extents(cells: Cells) -> Range:
     """Least and largest coordinates in each cell, shapes (gdim, cells)."""
     mesh = cells.domain.mesh
-    nodes = cell_nodes(mesh)[: cells.number].T
+    nodes = cell_nodes(mesh)[: cells.number]
     low, high = np.empty((2, mesh.geometry.dim, cells.number))
-    for axis, x in enumerate(np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)):
-        corners = [x.take(i) for i in nodes]
-        low[axis], high[axis] = corners[0], corners[0]
-        for corner in corners[1:]:
-            np.minimum(low[axis], corner, out=low[axis])
-            np.maximum(high[axis], corner, out=high[axis])
+    points = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
+    for part in blocks(cells.number):
+        corners = points.take(nodes[part], axis=1)
+        low[:, part], high[:, part] = corners[..., 0], corners[..., 0]
+        for corner in corners.transpose(2, 0, 1)[1:]:
+            np.minimum(low[:, part], corner, out=low[:, part])
+            np.maximum(high[:, part], corner, out=high[:, part])
     return low, high
 
 

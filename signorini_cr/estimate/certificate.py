@@ -18,11 +18,11 @@ import ufl
 from dolfinx import fem
 
 from .. import compat
+from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
-from ..data.moments import Coefficient, Sampled
+from ..data.moments import Coefficient
 from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
 from ..jit import compiled
-from ..mesh.domain import CONTACT
 from .beyond import Beyond
 from .companion import Companion, companion, on_facet
 from .cubic import cubed, with_thirds
@@ -33,7 +33,7 @@ from .gap import integrate, integrate_edge
 from .sums import Sums
 
 if TYPE_CHECKING:
-    from ..vi.assembly import Level
+    from ..vi.level import Level
     from ..vi.solved import Solved
 
 FloatArray = npt.NDArray[np.float64]
@@ -68,6 +68,15 @@ class Certificate:
     reason: str | None = None
     seconds: float = 0.0
     _made: _Made | None = None
+
+    def __repr__(self) -> str:
+        """A line."""
+        if self.bound_h1 is None or self.energy is None:
+            return f"<Certificate: no bound, {self.reason}>"
+        low, high = self.energy
+        return (
+            f"<Certificate: error at most {self.bound_h1:.3g}, energy in [{low:.9g}, {high:.9g}]>"
+        )
 
     @cached_property
     def flux(self) -> fem.Function | None:
@@ -174,38 +183,38 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     level, u = base.level, base.u
     if base.element != "CR" or base.domain is not solution.domain:
         return Certificate(reason=NO_FLUX)
-    data = Sampled.of(level.forms)
-    if data.kappa is None:
+    data = diffusion(level.data)
+    if data.forms.uncertified is not None:
+        return Certificate(reason=data.forms.uncertified)
+    if data.compiled.kappa is None:
         return Certificate(reason=TENSOR)
-    cells, load, edge = level.cells, level.load, level.edge
-    kappa = Coefficient(data.kappa, cells)
+    cells, load, (edge,) = data.cells, data.load, data.edges
+    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.u_D, data.alpha))
+    kappa = Coefficient(data.compiled.kappa, cells)
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
     slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
-    contact_side = cells.sides[CONTACT]
-    obstacle = data.alpha.at(level.domain.mesh, contact_side.entities)
-    gap = u.x.array[contact_side.dofs] - data.alpha.weights @ obstacle[2]
-    flux = equilibrate(cells, kappa.mean, w, load, edge, gap)
+    contact_side = alpha.side(cells)
+    gap = u.x.array[contact_side.dofs] - alpha.means
+    flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
     size = _size(cells, kappa, w, flux, slopes)
-    certain = Certain.of(data.f, load, cells, kappa.low, size)
+    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
     if certain.reason is not None:
-        level.tidy()
         return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
     flux.left += cells.volume * (certain.load.mean - load.mean)
     load = certain.load
     segments = Segments.of(edge, cells, kappa.low, size)
     if segments.reason is not None:
-        level.tidy()
         return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
     there = edge.side.local, edge.side.cells
     change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
     flux.excess[there] += change
     np.add.at(flux.left, edge.side.cells, change)
-    left = unbalanced(level, cells, flux.left, kappa.low)
+    left = unbalanced(level, cells, flux.left, kappa.low, size)
     carried = balance(cells, flux, kappa.low, size, left)
     if carried:
-        left = unbalanced(level, cells, flux.left, kappa.low)
+        left = unbalanced(level, cells, flux.left, kappa.low, size)
     excess = field_squares(cells, flux.excess, slice(0, cells.number))
     kappa.enclose(cells, slopes, excess, size)
     if solution.element != "CR":
@@ -216,9 +225,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         w = own
     steady = kappa.high - kappa.low <= STEADY * kappa.mean
     goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
-    v = companion(
-        cells, kappa.mean, w, u.x.array, flux, data.u_D, data.alpha, obstacle, sweeps, steady, goal
-    )
+    v = companion(cells, kappa.mean, w, u.x.array, flux, u_D, alpha, sweeps, steady, goal)
     sums = integrate(cells, kappa, w, load, flux, v)
     if promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
@@ -239,7 +246,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, *with_lift
     )
     lift = np.sqrt(lift)
-    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums)
+    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums, size)
     rounding = _rounding(cells, kappa, w, load, flux)
     loose = np.sqrt(edge_square) + left + hidden + rounding
     same = total["flux"] + total["companion"] + total["load"]
@@ -258,7 +265,6 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
     lift_energy += hidden_energy + total["energy_slack"]
     lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    level.tidy()
     reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
     if reason is not None:
         return Certificate(reason=reason, seconds=time.perf_counter() - began)
@@ -367,11 +373,13 @@ def _hidden(
     segments: Segments,
     v: Companion,
     sums: Sums,
+    size: float,
 ) -> tuple[float, float]:
     """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
 
     On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
-    on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise.
+    on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise. Whatever the signs of the first
+    terms, they are bounded as if all were the same: by what they are for |e|, which has ∇e's norm.
     """
     counts = certain.missed is not None, bool(segments.missed.any())
     if not any(cells.total(*counts)):
@@ -394,7 +402,7 @@ def _hidden(
     change += segments.change(v.vertices, v.bumps)
     square, on_edge, change = cells.total(square, on_edge**2, change)
     loose = np.sqrt(square) + np.sqrt(on_edge)
-    return loose + unbalanced(level, cells, missed, kappa.low, False), float(change)
+    return loose + unbalanced(level, cells, missed, kappa.low, size), float(change)
 
 
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:

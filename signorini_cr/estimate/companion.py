@@ -18,9 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data.admissible import differs
-from ..data.moments import Trace
+from ..data.moments import OnFacets
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
-from ..mesh.domain import CONTACT, DIRICHLET
 from .cusps import Cusps
 from .flux import Flux
 from .lifting import Cubic, Lift, affine, lift
@@ -103,9 +102,8 @@ def companion(
     w: FloatArray,
     u: FloatArray,
     flux: Flux,
-    u_D: Trace,
-    alpha: Trace,
-    on_contact: tuple[FloatArray, FloatArray, FloatArray],
+    u_D: OnFacets,
+    alpha: OnFacets,
     sweeps: int,
     steady: BoolArray,
     goal: float,
@@ -118,29 +116,29 @@ def companion(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         u: u_h by facet dof.
         flux: y.
-        u_D: Values on Γ0.
-        alpha: Obstacle on Γ1.
-        on_contact: Its values.
+        u_D: Values on Γ0, seen from the cells.
+        alpha: Obstacle on Γ1, seen from the cells.
         sweeps: How often the bumps are improved.
         steady: Where κ is constant on the cell, shape (cells,) or ().
         goal: What ‖∇ℓ‖ need not be known better than.
     """
-    fixed, contact = cells.sides[DIRICHLET], cells.sides[CONTACT]
-    on_fixed = u_D.at(cells.domain.mesh, fixed.entities)
-    obstacle, middle, _ = on_contact
+    fixed, contact = u_D.side(cells), alpha.side(cells)
+    obstacle, middle = alpha.ends, alpha.middle
     touching = flux.touching
-    v = _at_vertices(cells, kappa, w, fixed, on_fixed[0], contact, obstacle, touching)
+    v = _at_vertices(cells, kappa, w, fixed, u_D.ends, contact, obstacle, touching)
     scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
     scale = max(cells.comm.allgather(scale))
     wrong = [
-        JUMP if differs(cells, fixed, np.abs(v[fixed.ends] - on_fixed[0]), scale, u_D) else None,
-        BELOW if differs(cells, contact, obstacle - v[contact.ends], scale, u_D, alpha) else None,
+        JUMP if differs(cells, fixed, np.abs(v[fixed.ends] - u_D.ends), scale, u_D.trace) else None,
+        BELOW
+        if differs(cells, contact, obstacle - v[contact.ends], scale, u_D.trace, alpha.trace)
+        else None,
     ]
     bumps = np.zeros(len(u))
     lowest = np.full(len(u), -np.inf)
     free = np.ones(len(u), dtype=bool)
     if cells.tdim == 2:
-        bumps[fixed.dofs] = on_fixed[1] - v[fixed.ends].mean(axis=0)
+        bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
         free[fixed.dofs] = False
         lowest[contact.dofs] = _lowest(v[contact.ends], obstacle, middle)
         free[contact.dofs[touching]] = False
@@ -164,10 +162,10 @@ def companion(
         promise += _promise(cells, kappa, excess, bumps, loose)
         if promise > PROMISE * energy:
             v[:], bumps[:], cusps = _solved(
-                cells, kappa, steady, w, (v, bumps), (loose, free), contact, on_contact[:2]
+                cells, kappa, steady, w, (v, bumps), (loose, free), contact, (obstacle, middle)
             )
             excess = v[cells.vertices] - w
-    boundary = Boundary(u_D, alpha, on_fixed, on_contact, scale, goal)
+    boundary = Boundary(u_D, alpha, scale, goal)
     above, lifts, reasons = boundary.lifted(cells, flux, v, bumps, np.zeros(len(u)))
     words = [word for word in (*wrong, *reasons) if word]
     words = [word for rank in cells.comm.allgather(words) for word in rank]
@@ -179,18 +177,14 @@ class Boundary:
     """What v has to be on Γ0 and above on Γ1.
 
     Attributes:
-        u_D: Values on Γ0.
-        alpha: Obstacle on Γ1.
-        on_fixed: u_D at the ends, the midpoints and the quadrature points of the facets of Γ0.
-        on_contact: The same of α on Γ1.
+        u_D: Values on Γ0, seen from the cells.
+        alpha: Obstacle on Γ1, seen from the cells.
         scale: Size of the values.
         goal: What ‖∇ℓ‖ need not be known better than.
     """
 
-    u_D: Trace
-    alpha: Trace
-    on_fixed: tuple[FloatArray, FloatArray, FloatArray]
-    on_contact: tuple[FloatArray, FloatArray, FloatArray]
+    u_D: OnFacets
+    alpha: OnFacets
     scale: float
     goal: float
 
@@ -202,13 +196,10 @@ class Boundary:
         Returns:
             `Companion.contact`, `Companion.lift`, and why there are none.
         """
-        fixed, contact = cells.sides[DIRICHLET], cells.sides[CONTACT]
+        fixed, contact = self.u_D.side(cells), self.alpha.side(cells)
         lifts = [
-            _lift(cells, side, trace, values, v, bumps, thirds, self.scale, self.goal)
-            for side, trace, values in (
-                (fixed, self.u_D, self.on_fixed),
-                (contact, self.alpha, self.on_contact),
-            )
+            _lift(cells, data, v, bumps, thirds, self.scale, self.goal, obstacle)
+            for data, obstacle in ((self.u_D, False), (self.alpha, True))
         ]
         # y·n is constant on a facet: the mean of v + ℓ − α
         above = v[contact.ends].mean(axis=0) - lifts[1].least
@@ -455,21 +446,19 @@ def on_facet(
 
 def _lift(
     cells: Cells,
-    side: Side,
-    trace: Trace,
-    values: tuple[FloatArray, FloatArray, FloatArray],
+    data: OnFacets,
     v: FloatArray,
     bumps: FloatArray,
     thirds: FloatArray,
     scale: float,
     goal: float,
+    obstacle: bool,
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
+    side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
     if cells.tdim != 2:
-        return affine(cells, side, trace, v[side.ends], values[0], scale)
-    ends, middle, _ = values
+        return affine(cells, side, trace, v[side.ends], ends, scale)
     third = cells.ways[side.local, side.cells] * thirds[side.dofs]
     companion = Cubic(v[side.ends], bumps[side.dofs], third)
-    obstacle = side is cells.sides[CONTACT]
     base = Cubic(ends, middle - ends.mean(axis=0), third) if obstacle else companion
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

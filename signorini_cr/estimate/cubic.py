@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
-from ..data.moments import Trace
-from ..fem.cells import Cells, Side, blocks, dot_rows, pick
-from ..mesh.domain import CONTACT, DIRICHLET
+from ..data.moments import OnFacets
+from ..fem.cells import Cells, blocks, dot_rows, pick
 from .companion import Companion
 from .flux import Flux
 from .lifting import Cubic
@@ -35,13 +34,9 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         v: Without cusps.
     """
     boundary, thirds = v.boundary, np.zeros(len(cells.exterior))
-    for part, trace, values in (
-        (DIRICHLET, boundary.u_D, boundary.on_fixed),
-        (CONTACT, boundary.alpha, boundary.on_contact),
-    ):
-        side = cells.sides[part]
-        found = _of_data(trace, values, side)
-        thirds[side.dofs] = cells.ways[side.local, side.cells] * found
+    for data in (boundary.u_D, boundary.alpha):
+        side = data.side(cells)
+        thirds[side.dofs] = cells.ways[side.local, side.cells] * _of_data(data)
     cells.share(thirds)
     thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
     contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)
@@ -69,12 +64,10 @@ def with_thirds(cells: Cells, v: fem.Function, thirds: FloatArray) -> fem.Functi
     return cubic
 
 
-def _of_data(
-    trace: Trace, values: tuple[FloatArray, FloatArray, FloatArray], side: Side
-) -> FloatArray:
+def _of_data(data: OnFacets) -> FloatArray:
     """Heights of c_F in the data, as seen from the facets' cells, shape (n,)."""
-    ends, middle, inside = values
-    n = len(side.cells)
+    trace, ends, middle, inside = data.trace, data.ends, data.middle, data.inside
+    n = len(middle)
     quadratic = Cubic(ends, middle - ends.mean(axis=0), np.zeros(n))
     first, second = trace.hats.T
     cubic = first * second * (first - second)

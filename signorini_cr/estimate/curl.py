@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from ..data.loads import Load, Segments
 from ..fem.cells import Cells, blocks, measures, pick
-from ..mesh.domain import CONTACT, NEUMANN
 from .beyond import Beyond
 from .companion import Companion
 from .flux import Flux, field_squares
@@ -68,11 +67,11 @@ def improve(
     given, held = np.zeros((2, len(cells.exterior)))
     # ω = 4 height λ_j λ_k has the slope 4 height (λ_j − λ_k)/|F|; to the left of the facet's normal
     # it goes from j to k, but for the facet 1 of cells whose vertices turn left
-    side = cells.sides[NEUMANN]
+    side = edge.facets
     left = np.where(side.local == 1, -1.0, 1.0) * cells.turns[side.cells]
     given[side.dofs] = left * edge.slope * measures(cells, side) / 4.0
-    for part in (CONTACT, NEUMANN):
-        held[cells.sides[part].dofs] = 1.0
+    for known in (v.boundary.alpha.side(cells), side):
+        held[known.dofs] = 1.0
     given, free = cells.share(given), cells.share(held) == 0.0
     flux.beyond = Beyond(given, rise)
     slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa, flux, v), np.zeros(0))

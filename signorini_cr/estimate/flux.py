@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from ..data.diffusion import diffusion
 from ..data.loads import Edge, Load
-from ..fem.cells import Cells, blocks, pick, poincare, sum_rows
-from ..mesh.domain import CONTACT, NEUMANN
+from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
 from .beyond import Beyond
 
 if TYPE_CHECKING:
-    from ..vi.assembly import Level
+    from ..vi.level import Level
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -46,7 +46,13 @@ class Flux:
 
 
 def equilibrate(
-    cells: Cells, kappa: FloatArray, w: FloatArray, load: Load, edge: Edge, gap: FloatArray
+    cells: Cells,
+    kappa: FloatArray,
+    w: FloatArray,
+    load: Load,
+    edge: Edge,
+    on_contact: Side,
+    gap: FloatArray,
 ) -> Flux:
     """Find the facet fluxes of y from the local residuals of u_h.
 
@@ -61,7 +67,8 @@ def equilibrate(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f.
         edge: Integrals of g.
-        gap: u_h − α on the facets of Γ1, by means, shape (n,).
+        on_contact: The facets of Γ1.
+        gap: u_h − α on them, by means, shape (n,).
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
@@ -70,8 +77,7 @@ def equilibrate(
         shares = load.shares(cells, part)
         np.negative(shares, out=excess[:, part])
         fluxes[:, part] = -d * pick(kappa, part) * cells.apply(w[:, part], part) - shares
-    on_contact, on_neumann = cells.sides[CONTACT], cells.sides[NEUMANN]
-    through = edge.shares.sum(axis=0)
+    on_neumann, through = edge.side, edge.shares.sum(axis=0)
     for i, share in enumerate(edge.to_cells()):
         # the facet itself gets all of it further down
         share = np.where(on_neumann.local == i, 0.0, share)
@@ -96,26 +102,26 @@ def equilibrate(
 
 
 def unbalanced(
-    level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray, signed: bool = True
+    level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float = 0.0
 ) -> float:
     """Bound W with |Σ_T left_T e_T| ≤ W ‖κ^{1/2} ∇e‖ for e ∈ H¹ that vanishes on Γ0.
 
     e_T is the mean over T. Level by level, what a cell's children have too much or too little is
     spread over the cell: Poincaré's inequality on the cell bounds the difference. On the coarsest
-    mesh the rest is carried to Γ0 along a tree of cells, as a flux in H(div).
+    mesh the rest is carried to Γ0 from cell to cell, as a flux in H(div).
 
     Args:
         level: The mesh and the coarser ones below it.
         cells: The same mesh.
         left: Integrals over the cells, shape (cells,).
         kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
-        signed: Whether left is known; else it is an upper bound of the absolute value.
+        size: Of the bound, to which what is carried may be small.
     """
     volume, bound = cells.volume, 0.0
-    while level.coarser is not None and level.parent_cell is not None:
-        parent = level.parent_cell[: len(left)].astype(np.intp)
-        level = level.coarser
-        domain = level.domain
+    meshes = level.meshes
+    for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
+        assert mesh.parents is not None
+        parent, domain = mesh.parents.cell[: len(left)].astype(np.intp), coarser.domain
         d = domain.mesh.topology.dim
         number = domain.mesh.topology.index_map(d).size_local
         square, left, volume = (
@@ -127,17 +133,16 @@ def unbalanced(
             np.minimum.at(coarse, parent, kappa_min)
             kappa_min = coarse
         h = domain.mesh.h(d, np.arange(number, dtype=np.int32))
-        if signed:
-            square = np.maximum(square - left**2 / volume, 0.0)
+        square = np.maximum(square - left**2 / volume, 0.0)
         part = float(np.sum(h**2 * square / kappa_min))
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
-    if level.domain is not cells.domain:
-        cells = Cells(level.domain, level.V)
-    return float(bound + _carried(cells, left, kappa_min, signed))
+    if len(meshes) > 1:
+        cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
+    return float(bound + _carried(cells, left, kappa_min, size))
 
 
 def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
-    """Add to y what the cells lack, carried to Γ0 along a tree, where that is worth it; collective.
+    """Add to y what the cells lack, carried to Γ0 cell by cell, where that is worth it; collective.
 
     Args:
         cells: The mesh.
@@ -151,7 +156,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     """
     if bound <= WORTH * size:
         return 0.0
-    fluxes, _, all_reached = _carry(cells, flux.left)
+    fluxes, all_reached = _carry(cells, flux.left)
     if not all_reached:
         return 0.0
     squares = field_squares(cells, fluxes, slice(0, cells.number)) / kappa_min
@@ -163,57 +168,101 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     return float(np.sqrt(square))
 
 
+STEPS = 30
+"""Of conjugate gradients, for a small field of given divergence."""
 WORTH = 1e-3
 """Part of the bound from which on what is left of the equation is carried away by y itself."""
 
 
-def _carry(cells: Cells, left: FloatArray) -> tuple[FloatArray, IntArray, bool]:
+def _carry(cells: Cells, left: FloatArray) -> tuple[FloatArray, bool]:
     """Fluxes of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
 
     q·n vanishes on the boundary but Γ0. Cell after cell, the farthest from Γ0 first, sends what it
-    holds through the facet by which a walk from Γ0 first came to it.
+    holds through the facets by which a walk from Γ0 first came to it, the same through each: so q
+    does not depend on how cells and facets are numbered.
 
     Returns:
-        Fluxes out of each cell, shape (d + 1, cells), the local facets that the cells send through,
-        and whether all cells have a way.
+        Fluxes out of each cell, shape (d + 1, cells), and whether all cells have a way.
     """
     comm = cells.comm
     fluxes = np.zeros((cells.tdim + 1, cells.number))
-    ways = np.zeros(cells.number, dtype=np.intp)
     arrived = np.zeros(len(cells.exterior))
-    for layer, way_out in reversed(cells.layers):
-        inflow = arrived[cells.facets[:, layer]]
-        outflow = -left[layer] - inflow.sum(axis=0)
-        fluxes[:, layer] = inflow
-        fluxes[way_out, layer] = outflow
-        ways[layer] = way_out
-        through = cells.facets[way_out, layer]
-        arrived[through] = -outflow
+    for layer, ways in reversed(cells.layers):
+        facets = cells.facets[:, layer]
+        inflow = arrived[facets]
+        outflow = np.broadcast_to(
+            -(left[layer] + inflow.sum(axis=0)) / ways.sum(axis=0), ways.shape
+        )
+        fluxes[:, layer] = np.where(ways, outflow, inflow)
+        arrived[facets[ways]] = -outflow[ways]
         if comm.size > 1:
-            arrived[cells.between] += cells.from_others(through, -outflow)
+            arrived[cells.between] += cells.from_others(facets[ways], -outflow[ways])
     reached = cells.total(sum(len(layer) for layer, _ in cells.layers), cells.number)
-    return fluxes, ways, bool(reached[0] == reached[1])
+    return fluxes, bool(reached[0] == reached[1])
 
 
-def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, signed: bool) -> float:
-    """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T."""
-    fluxes, ways, all_reached = _carry(cells, left)
+def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float) -> float:
+    """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
+
+    Where a walk's q is not small against `size`, one that is nearly the smallest takes its place.
+    """
+
+    def norm(fluxes: FloatArray) -> float:
+        squares = field_squares(cells, fluxes, slice(0, cells.number))
+        return float(np.sqrt(cells.total(np.sum(squares / kappa_min))[0]))
+
+    fluxes, all_reached = _carry(cells, left)
     if not all_reached:
         return np.inf
-    everywhere = slice(0, cells.number)
-    if signed:
-        squares = field_squares(cells, fluxes, everywhere)
-    else:  # the triangle inequality for what comes in by each facet, and for the cell's own
-        norms, at = np.zeros(cells.number), np.arange(cells.number)
-        for i, amount in enumerate((*fluxes, left)):
-            unit = np.zeros_like(fluxes)
-            if i < len(fluxes):
-                unit[i] = 1.0
-            amount = np.where(ways == i, 0.0, np.abs(amount))
-            unit[ways, at] = -1.0
-            norms += amount * np.sqrt(np.maximum(field_squares(cells, unit, everywhere), 0.0))
-        squares = norms**2
-    return float(np.sqrt(cells.comm.allreduce(float(np.sum(squares / kappa_min)))))
+    found = norm(fluxes)
+    if found > WORTH * size:
+        fluxes = _diffused(cells, left, kappa_min)
+        rest, _ = _carry(cells, left + sum_rows(fluxes))
+        found = min(found, norm(fluxes + rest))
+    return found
+
+
+def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
+    """Fluxes of nearly the smallest q with nearly ∫_T div q = −left_T; collective.
+
+    They are those of `equilibrate` for the load left_T/|T| and no contact. A few steps of conjugate
+    gradients are enough where there are few cells, and of use on any mesh.
+    """
+    d, owned = cells.tdim, cells.owned_facets()
+    fixed = np.zeros(len(cells.exterior))
+    for part in cells.fixed:
+        fixed[cells.sides[part].dofs] = 1.0
+    free = cells.share(fixed) == 0
+
+    def residuals(z: FloatArray) -> FloatArray:
+        values = z[cells.facets]
+        return -d * kappa * cells.apply(sum_rows(values) - d * values, slice(0, cells.number))
+
+    def assembled(local: FloatArray) -> FloatArray:
+        return np.where(free, cells.over_facets(local), 0.0)
+
+    def product(a: FloatArray, b: FloatArray) -> float:
+        return float(cells.total(a[:owned] @ b[:owned])[0])
+
+    load = np.tile(left / (d + 1), (d + 1, 1))
+    diagonal = cells.over_facets(d**2 * kappa * cells.squares(slice(0, cells.number)))
+    r, before = assembled(load), np.inf
+    z, p = np.zeros_like(r), np.zeros_like(r)
+    for _ in range(STEPS):
+        s = r / diagonal
+        now = product(r, s)
+        if now == 0.0:
+            break
+        p = s + now / before * p
+        Ap = assembled(residuals(p))
+        step = now / product(p, Ap)
+        z, r, before = z + step * p, r - step * Ap, now
+    fluxes = residuals(z) - load
+    half = 0.5 * cells.over_facets(fluxes)
+    half[cells.exterior] = 0.0
+    fluxes -= half[cells.facets]
+    fluxes[(cells.exterior & free)[cells.facets]] = 0.0
+    return fluxes
 
 
 def field_squares(

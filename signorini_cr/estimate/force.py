@@ -12,11 +12,12 @@ from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
 from petsc4py import PETSc
 
+from ..data.diffusion import diffusion
 from ..errors import InputError
-from ..fem.cells import dot_rows, sum_rows
+from ..fem.cells import Cells, dot_rows, sum_rows
+from ..fem.conditions import facets_of
 from ..fem.space import ghosted_vector, shared_sum
 from ..jit import compiled
-from ..mesh.domain import CONTACT, DIRICHLET
 from ..options import AMG
 from ..vi.solved import Solved
 from .certificate import Certificate
@@ -54,7 +55,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     if made is None or certificate.bound_h1 is None:
         raise InputError(f"the contact force has no bounds: {certificate.reason}")
     level = made.level
-    cells = level.cells
+    cells = Cells(level.domain, level.V)
     if made.varies or cells.tdim != 2:
         why = VARIES if made.varies else SPATIAL
         raise InputError(f"the contact force has no bounds: {why}")
@@ -86,7 +87,6 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     middle, energy = cells.total(
         made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)
     )
-    level.tidy()
     reach = made.reach * np.sqrt(energy)
     return max(float(middle - reach), 0.0), float(middle + reach)
 
@@ -97,26 +97,27 @@ def _weight(solution: Certified) -> fem.Function:
     mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
     V = fem.functionspace(mesh, ("Lagrange", 1))
     phi, marks = fem.Function(V), fem.Function(V)
-    parts = {}
-    for part in (CONTACT, DIRICHLET):
+    forms, parts = diffusion(solution.level.data).forms, []
+    for conditions in (forms.bounded, forms.fixed):
         marks.x.array[:] = 0.0
-        marks.x.array[fem.locate_dofs_topological(V, fdim, domain.facets(part))] = 1.0
+        marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, conditions))] = 1.0
         seen = shared_sum(mesh.comm, V.dofmap.index_map, marks.x.array)
-        parts[part] = np.flatnonzero(seen > 0).astype(np.int32)
-    both = len(np.intersect1d(parts[CONTACT], parts[DIRICHLET]))
+        parts.append(np.flatnonzero(seen > 0).astype(np.int32))
+    bounded, fixed = parts
+    both = len(np.intersect1d(bounded, fixed))
     if mesh.comm.allreduce(both) > 0:
         raise InputError(f"the contact force has no bounds: {TOUCHES}")
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    fixed = np.concatenate(list(parts.values()))
+    known = np.concatenate(parts)
     marks.x.array[:] = 0.0
-    marks.x.array[parts[CONTACT]] = 1.0
-    bc = fem.dirichletbc(marks, fixed)
+    marks.x.array[bounded] = 1.0
+    bc = fem.dirichletbc(marks, known)
     form = compiled(mesh.comm, fem.form, ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])
     b.x.scatter_reverse(InsertMode.add)
-    b.x.array[fixed] = marks.x.array[fixed]
+    b.x.array[known] = marks.x.array[known]
     ksp = PETSc.KSP().create(mesh.comm)
     ksp.setOperators(A)
     ksp.setType(PETSc.KSP.Type.CG)
@@ -127,7 +128,7 @@ def _weight(solution: Certified) -> fem.Function:
     for thing in (ksp, A, *vectors):
         thing.destroy()
     # Exactly so, whatever the solver did
-    phi.x.array[parts[CONTACT]] = 1.0
-    phi.x.array[parts[DIRICHLET]] = 0.0
+    phi.x.array[bounded] = 1.0
+    phi.x.array[fixed] = 0.0
     phi.x.scatter_forward()
     return phi

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..data.jets import Enclosure, Jet, Unknown, indices
+from ..data.balls import indices, middle
+from ..data.jets import Enclosure, Jet, Unknown
 from ..data.moments import Trace
 from ..data.ranges import Pieces, refine
 from ..fem.cells import Cells, Side, corner_points
@@ -225,8 +226,10 @@ def _bounds(
 
 
 def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
-    zero = np.zeros(n)
-    return [(zero, zero) if ball is None else (ball[0] + zero, ball[1] + zero) for ball in jet.all]
+    """The value and the coefficients up to the third order in one variable."""
+    mid, rad = jet.rest.on((1, 2, 3))
+    pairs = [middle(jet.low, jet.high), *zip(mid, rad, strict=True)]
+    return [(np.broadcast_to(a, n), np.broadcast_to(b, n)) for a, b in pairs]
 
 
 def _jump_at_ends(
@@ -274,9 +277,10 @@ def affine(
         return Lift(zero, zero, zero, zero, NO_RANGE.format("u_D or α", error))
     off = zero.copy()
     half = whole.half(boxes)
-    for index, ball in zip(indices(boxes.variables)[1:], jet.rest, strict=True):
-        if sum(index) == 2 and ball is not None:
+    for row, mid, rad in zip(jet.rest.rows, jet.rest.mid, jet.rest.rad, strict=True):
+        index = indices(boxes.variables)[row]
+        if sum(index) == 2:
             size = np.prod([h**k for h, k in zip(half, index, strict=True)], axis=0)
-            off = off + 2.0 * (np.abs(ball[0]) + ball[1]) * size
+            off = off + 2.0 * (np.abs(mid) + rad) * size
     curved = not (off <= JUMP * scale).all() or (values - v > JUMP * scale).any()
     return Lift(zero, zero, zero, values.mean(axis=0) - off, CURVED if curved else None)

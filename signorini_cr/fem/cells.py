@@ -6,7 +6,7 @@ opposite vertex i.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from dolfinx import fem, la
 
 from .. import compat
-from ..mesh.domain import DIRICHLET, PARTS, Domain
+from ..mesh.domain import DIRICHLET, Domain
 from .space import facet_entities, shared_sum
 
 FloatArray = npt.NDArray[np.float64]
@@ -98,11 +98,12 @@ class Cells:
         stiffness: |T| ∇λ_i·∇λ_j, shape (pairs, cells).
         volume: |T|, shape (cells,).
         sides: The boundary facets by part.
+        fixed: The parts that make Γ0.
     """
 
-    def __init__(self, domain: Domain, V: fem.FunctionSpace):
+    def __init__(self, domain: Domain, V: fem.FunctionSpace, fixed: Sequence[int] = (DIRICHLET,)):
         """Read a domain's mesh; V is its Crouzeix-Raviart space."""
-        mesh = domain.mesh
+        mesh, self.fixed = domain.mesh, fixed
         self.domain, self.V, self.comm = domain, V, mesh.comm
         d = self.tdim = mesh.topology.dim
         n = self.number = mesh.topology.index_map(d).size_local
@@ -151,16 +152,9 @@ class Cells:
     @cached_property
     def sides(self) -> dict[int, Side]:
         """Boundary facets of owned cells."""
-        mesh, d = self.domain.mesh, self.tdim
-        index_map = mesh.topology.index_map(d - 1)
-        mark = la.vector(index_map, dtype=np.float64)
-        for part in PARTS.values():
-            mark.array[self.domain.facets(part)] = part
-        mark.scatter_forward()
         sides = {}
-        for part in PARTS.values():
-            found = np.flatnonzero(mark.array == part).astype(np.int32)
-            cells, local = facet_entities(mesh, found).T.astype(np.intp)
+        for part, found in self.domain.all_facets.items():
+            cells, local = facet_entities(self.domain.mesh, found).T.astype(np.intp)
             own = cells < self.number
             cells, local = cells[own], local[own]
             sides[part] = Side(
@@ -181,10 +175,11 @@ class Cells:
         return mark.array > 0
 
     @cached_property
-    def layers(self) -> list[tuple[IntArray, IntArray]]:
+    def layers(self) -> list[tuple[IntArray, npt.NDArray[np.bool_]]]:
         """Cells by the number of facets between them and Γ0, nearest first.
 
-        Each layer has its cells and, for each, the local facet that leads back towards Γ0.
+        Each layer has its cells, shape (n,), and which of their local facets lead back towards Γ0,
+        shape (d + 1, n): one or more.
         """
         d = self.tdim
         owners = np.full((2, len(self.exterior)), -1)
@@ -192,18 +187,19 @@ class Cells:
         owners[0, flat] = cell
         other = owners[0, flat] != cell
         owners[1, flat[other]] = cell[other]
-        way_out = np.full(self.number, -1, dtype=np.intp)
+        reached = np.zeros(self.number, dtype=bool)
         front = np.zeros(len(self.exterior))
-        front[self.sides[DIRICHLET].dofs] = 1.0
+        for part in self.fixed:
+            front[self.sides[part].dofs] = 1.0
         seen = self.share(front) > 0
         found, layers = np.flatnonzero(seen), []
         while self.comm.allreduce(len(found)) > 0:
             near = owners[:, found].ravel()
             layer = np.unique(near[near >= 0])
-            layer = layer[way_out[layer] < 0]
+            layer = layer[~reached[layer]]
             facets = self.facets[:, layer]
-            way_out[layer] = np.argmax(seen[facets], axis=0)
-            layers.append((layer, way_out[layer]))
+            reached[layer] = True
+            layers.append((layer, seen[facets]))
             new = np.unique(facets[~seen[facets]])
             if self.comm.size > 1:
                 theirs = self.from_others(new, np.ones(len(new))) > 0

@@ -9,8 +9,9 @@ with κ = 1 unless a coefficient is given.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -24,7 +25,9 @@ from ufl.core.expr import Expr
 
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import NEUMANN, Domain
+from ..mesh.domain import Domain
+from .conditions import KINDS, Condition, Given
+from .simplified import simplified
 from .space import facet_entities, ufl_element
 
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
@@ -56,6 +59,17 @@ class Problem:
     exact: Data | None = None
     quadrature_degree: int = 4
     error_degree: int = 6
+
+    def __repr__(self) -> str:
+        """What differs from nothing, functions by their names."""
+        given = []
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if value is not each.default and value != each.default:
+                given.append(
+                    f"{each.name}={getattr(value, '__name__', None) or reprlib.repr(value)}"
+                )
+        return f"Problem({', '.join(given)})"
 
     def __post_init__(self) -> None:
         """Refuse degrees that Basix would stop the process for."""
@@ -99,7 +113,13 @@ class Kernel:
             if not any(w is s for s in self._stand_ins)
         }
         self._constants = {c: c for c in ufl.algorithms.analysis.extract_constants(form)}
-        self._types = {i.integral_type() for i in form.integrals()}
+        self._sides = sorted(
+            {
+                i.subdomain_id()[0] if isinstance(i.subdomain_id(), tuple) else i.subdomain_id()
+                for i in form.integrals()
+                if i.integral_type() == "exterior_facet"
+            }
+        )
 
     def on(
         self,
@@ -109,9 +129,11 @@ class Kernel:
     ) -> fem.Form:
         """Bind to a mesh, argument spaces and one function per stand-in."""
         subdomains: dict[Any, list[tuple[int, npt.NDArray[np.int32]]]] = {}
-        if "exterior_facet" in self._types:
-            entities = facet_entities(domain.mesh, domain.facets(NEUMANN))
-            subdomains[fem.IntegralType.exterior_facet] = [(NEUMANN, entities.ravel())]
+        if self._sides:
+            subdomains[fem.IntegralType.exterior_facet] = [
+                (part, facet_entities(domain.mesh, domain.facets(part)).ravel())
+                for part in self._sides
+            ]
         return fem.create_form(
             self._compiled,
             list(spaces),
@@ -129,6 +151,13 @@ class Forms:
         problem: The data.
         mesh: A mesh of the kind they will be used on; data tied to a mesh must be tied to this one.
         element: "CR" or "P1".
+
+    Attributes:
+        f: Volume load.
+        asked: The load that an exact solution asks for; None if there is none, or a constant.
+        kappa: κ.
+        exact: The exact solution, if it is known.
+        conditions: What holds on the parts of the boundary.
     """
 
     def __init__(self, problem: Problem, mesh: Mesh, element: str = "CR"):
@@ -145,19 +174,13 @@ class Forms:
         # UFL can't differentiate a number
         level = self.exact is None or number(self.exact) is not None
         flux = None if level else self.kappa * ufl.grad(self.exact)
-        n = ufl.FacetNormal(cell)
 
-        def given(data: Data | None, derived: Callable[[], Expr]) -> Expr:
-            if data is not None:
-                return as_expression(data, self.x)
-            return ufl.as_ufl(0.0) if flux is None else derived()
-
-        self.f = given(problem.f, lambda: -ufl.div(flux))
-        self.g = given(problem.g, lambda: ufl.dot(flux, n))
-        boundary = self.exact if problem.dirichlet is None else problem.dirichlet
-        self.dirichlet = as_expression(0.0 if boundary is None else boundary, self.x)
-        self.source = "exact.u" if boundary is self.exact is not None else "data.dirichlet"
-        self.obstacle = as_expression(problem.obstacle, self.x)
+        outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
+        given = Given(problem, lambda data: as_expression(data, self.x), self.exact, outward)
+        self.asked = None if flux is None else simplified(-ufl.div(flux))
+        self.f, _ = given.or_derived("f", self.asked)
+        made = (kind.of(given) for kind in KINDS)
+        self.conditions: tuple[Condition, ...] = tuple(c for c in made if c is not None)
         d = mesh.geometry.dim
         for key, data in self._data.items():
             if data.ufl_shape != () and (key, data.ufl_shape) != ("coefficient", (d, d)):
@@ -171,18 +194,35 @@ class Forms:
         data = {
             "coefficient": self.kappa,
             "f": self.f,
-            "g": self.g,
-            "dirichlet": self.dirichlet,
-            "obstacle": self.obstacle,
-            "exact": self.exact,
+            **{key: value for c in self.conditions for key, value in c.data.items()},
         }
-        return {key: expression for key, expression in data.items() if expression is not None}
+        return data if self.exact is None else data | {"exact": self.exact}
+
+    @property
+    def fixed(self) -> tuple[Condition, ...]:
+        """The conditions that set u: their parts make Γ0."""
+        return tuple(c for c in self.conditions if c.fixed is not None)
+
+    @property
+    def bounded(self) -> tuple[Condition, ...]:
+        """The conditions that bound u: their parts make Γ1."""
+        return tuple(c for c in self.conditions if c.lower is not None)
+
+    @property
+    def natural(self) -> tuple[Condition, ...]:
+        """The conditions that know of a flux."""
+        return tuple(c for c in self.conditions if c.flux is not None)
+
+    @property
+    def uncertified(self) -> str | None:
+        """Why there is no certificate, if some condition has none."""
+        return next((c.uncertified for c in self.conditions if c.uncertified), None)
 
     @cached_property
     def a(self) -> Kernel:
-        """a_h(u, v) = Σ_T ∫_T κ∇u·∇v, (1.9)."""
+        """a_h(u, v) = Σ_T ∫_T κ∇u·∇v, (1.9), and what the conditions add to it."""
         u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
-        return Kernel(self._stiffness(u, v), self.mesh)
+        return Kernel(self._bilinear(u, v), self.mesh)
 
     def insist_on_mesh(self, mesh: Mesh) -> None:
         """Refuse a mesh on which the data are not to be had.
@@ -204,30 +244,49 @@ class Forms:
 
     @property
     def loaded(self) -> bool:
-        """Whether f or g is more than the number 0."""
-        return number(self.f) != 0.0 or number(self.g) != 0.0
+        """Whether f or a flux is more than the number 0."""
+        return any(number(data) != 0.0 for data in (self.f, *(c.flux for c in self.natural)))
 
     @cached_property
     def chi(self) -> Kernel | None:
         """χ(v) = ∫_Ω f v + ∫_Γg g v, (1.10); None where f and g vanish."""
         v = ufl.TestFunction(self.space)
         degree = {"quadrature_degree": self.problem.quadrature_degree}
+        loads = [(self.f, self.dx), *((c.flux, self.ds(c.number)) for c in self.natural)]
         terms = [
-            data * v * measure(metadata=degree)
-            for data, measure in ((self.f, self.dx), (self.g, self.ds(NEUMANN)))
-            if number(data) != 0.0
+            data * v * measure(metadata=degree) for data, measure in loads if number(data) != 0.0
         ]
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
     @cached_property
     def a_of_w(self) -> Kernel:
         """a_h(w, w)."""
-        return Kernel(self._stiffness(self.w, self.w), self.mesh, [self.w])
+        return Kernel(self._bilinear(self.w, self.w), self.mesh, [self.w])
 
-    def _stiffness(self, u: Expr, v: Expr) -> ufl.Form:
+    @cached_property
+    def a_p1(self) -> Kernel:
+        """a_h in P1, for coarse meshes."""
+        space = ufl.FunctionSpace(self.mesh.ufl_domain(), ufl_element(self.mesh, "P1"))
+        u, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+        return Kernel(self._bilinear(u, v), self.mesh)
+
+    @cached_property
+    def of_one(self) -> Kernel | None:
+        """a_h(1, v), exactly 0 but for the terms without gradients; None if there are none."""
+        terms = self._without_gradients(ufl.as_ufl(1.0), ufl.TestFunction(self.space))
+        return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
+
+    def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
         """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
         rule = {} if self.uniform else {"quadrature_degree": self.problem.quadrature_degree}
-        return ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
+        form = ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
+        return sum(self._without_gradients(u, v), form)
+
+    def _without_gradients(self, u: Expr, v: Expr) -> list[ufl.Form]:
+        """What a_h has beside κ∇u·∇v."""
+        degree = {"quadrature_degree": self.problem.quadrature_degree}
+        added = [(c.a(u, v), self.ds(c.number, metadata=degree)) for c in self.conditions]
+        return [a * measure for a, measure in added if a is not None]
 
     @cached_property
     def _squared_errors(self) -> Kernel:

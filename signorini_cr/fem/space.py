@@ -86,6 +86,20 @@ def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
     return np.take_along_axis(V.dofmap.list[cells], closure[local], axis=1)
 
 
+def unknowns(V: fem.FunctionSpace, facets: Int32Array, components: Int32Array) -> Int32Array:
+    """Numbers of some unknowns that fix a function on boundary facets.
+
+    Args:
+        V: CR or P1, with a block of unknowns at each node.
+        facets: Local indices of exterior facets, shape (n,).
+        components: Which unknowns of each node, shape (c,).
+
+    Returns:
+        Local unknowns, shape (n, 1, c) or (n, d, c).
+    """
+    return closure_dofs(V, facets)[:, :, None] * V.dofmap.index_map_bs + components
+
+
 def facet_to_dof(V: fem.FunctionSpace) -> Int32Array:
     """The CR dof of every facet, shape (facets,), ghosts included."""
     tdim = V.mesh.topology.dim
@@ -130,36 +144,40 @@ def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> F
     return values
 
 
-def ghosted(comm: MPI.Comm, index_map: Any, array: FloatArray | None = None) -> PETSc.Vec:
+def ghosted(
+    comm: MPI.Comm, index_map: Any, array: FloatArray | None = None, block: int = 1
+) -> PETSc.Vec:
     """A PETSc vector with room for ghosts.
 
     Args:
         comm: The ranks.
-        index_map: How they share its entries.
-        array: Memory for it, one number for each local entry, ghosts included (no copy).
+        index_map: How they share nodes.
+        array: Memory for it, the numbers of each local node, ghosts included (no copy).
+        block: How many numbers a node has.
     """
-    size = (index_map.size_local, index_map.size_global)
+    size = (block * index_map.size_local, block * index_map.size_global)
     ghosts = index_map.ghosts.astype(PETSc.IntType)
     if array is None:
-        return PETSc.Vec().createGhost(ghosts, size, comm=comm)
-    return PETSc.Vec().createGhostWithArray(ghosts, array, size, comm=comm)
+        return PETSc.Vec().createGhost(ghosts, size, block, comm=comm)
+    return PETSc.Vec().createGhostWithArray(ghosts, array, size, block, comm=comm)
 
 
 def ghosted_vector(V: fem.FunctionSpace, array: FloatArray) -> PETSc.Vec:
     """A PETSc vector with room for the ghosts of V, on an array (no copy)."""
-    return ghosted(V.mesh.comm, V.dofmap.index_map, array)
+    return ghosted(V.mesh.comm, V.dofmap.index_map, array, V.dofmap.index_map_bs)
 
 
-def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray) -> FloatArray:
+def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray, block: int = 1) -> FloatArray:
     """Sum up, in place, what the ranks have for each shared entity.
 
     Args:
         comm: The ranks.
         index_map: How they share the entities.
-        array: One number for each local entity, ghosts included.
+        array: The numbers of each local entity, ghosts included.
+        block: How many numbers an entity has.
     """
     if comm.size > 1:
-        vector = ghosted(comm, index_map, array)
+        vector = ghosted(comm, index_map, array, block)
         vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
         vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
         vector.destroy()

@@ -10,6 +10,7 @@ from ..compat import cell_nodes
 from .space import facet_entities
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
 def along_boundary(
@@ -72,50 +73,71 @@ def _by_position(rows: dict[str, npt.NDArray]) -> dict[str, npt.NDArray]:
 def _ordered(rows: dict[str, npt.NDArray]) -> tuple[dict[str, npt.NDArray], FloatArray]:
     """Put facets in the order in which the boundary passes through them, Ω to the left."""
     flip = rows["reverse"]
-    ends, gaps = rows["vertices"], rows["gap_at_vertices"]
-    ends = np.where(flip[:, None, None], ends[:, ::-1], ends)
-    gaps = np.where(flip[:, None], gaps[:, ::-1], gaps)
-    number = len(ends)
-    midpoints = ends.mean(axis=1)
+    ends = np.where(flip[:, None, None], rows["vertices"][:, ::-1], rows["vertices"])
+    gaps = np.where(flip[:, None], rows["gap_at_vertices"][:, ::-1], rows["gap_at_vertices"])
+    before = _predecessors(ends)
     # The same order whatever the ranks held: by coordinates first
-    start = np.lexsort(midpoints.T[::-1])
-    rank = np.empty(number, dtype=np.int64)
-    rank[start] = np.arange(number)
+    rank = np.empty(len(ends), dtype=np.int64)
+    rank[np.lexsort(ends.mean(axis=1).T[::-1])] = np.arange(len(ends))
+    length = rows["measure"]
+    first, steps, distance = _way_from_first(_cut(before, rank), length)
+    part = np.unique(rank[first], return_inverse=True)[1]
+    order = np.lexsort([steps, rank[first]])
+    table = _columns(rows, part, distance + 0.5 * length[first])
+    points, behind = _transitions(before, ends, gaps, rows)
+    along = np.lexsort([steps[behind], part[behind]])
+    return {name: column[order] for name, column in table.items()}, points[along]
+
+
+def _predecessors(ends: FloatArray) -> IntArray:
+    """For each facet the one that ends where it begins, itself where there is none."""
+    own = np.arange(len(ends))
     _, vertex = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
     tail, head = vertex.reshape(-1, 2).T
     arriving = np.full(vertex.max(initial=-1) + 1, -1)
-    arriving[head] = np.arange(number)
-    before = np.where(arriving[tail] >= 0, arriving[tail], np.arange(number))
-    # Closed curves have no first facet: cut them at the one of lowest rank
-    lowest, jump = rank.copy(), before.copy()
-    for _ in range(max(number, 1).bit_length()):
+    arriving[head] = own
+    return np.where(arriving[tail] >= 0, arriving[tail], own)
+
+
+def _cut(before: IntArray, rank: IntArray) -> IntArray:
+    """Give closed curves, which have no first facet, one: that of lowest rank."""
+    lowest, jump = rank, before
+    for _ in range(_doublings(before)):
         lowest, jump = np.minimum(lowest, lowest[jump]), jump[jump]
     closed = before[jump] != jump
-    cut = closed & (lowest == rank)
-    before = np.where(cut, np.arange(number), before)
-    # Distance to the first facet of the part, by doubling the stride
-    length = rows["measure"]
-    is_first = before == np.arange(number)
+    return np.where(closed & (lowest == rank), np.arange(len(before)), before)
+
+
+def _way_from_first(before: IntArray, length: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """The first facet of each one's curve, steps from there, and the distance of the midpoints."""
+    is_first = before == np.arange(len(before))
     distance = np.where(is_first, 0.0, 0.5 * (length + length[before]))
     steps, jump = (~is_first).astype(np.int64), before
-    for _ in range(max(number, 1).bit_length()):
+    for _ in range(_doublings(before)):
         distance, steps, jump = distance + distance[jump], steps + steps[jump], jump[jump]
-    order = np.lexsort([steps, rank[jump]])
-    part = np.unique(rank[jump], return_inverse=True)[1]
-    table = _columns(rows, part, distance + 0.5 * length[jump])
-    # A transition lies between a facet and the one after it when just one of them is active;
-    # inside the free one if its trace changes sign there, at the vertex between them if not
-    later = np.flatnonzero(arriving[tail] >= 0)
-    earlier = arriving[tail[later]]
-    differ = rows["active"][later] != rows["active"][earlier]
-    later, earlier = later[differ], earlier[differ]
-    free_is_later = rows["active"][earlier]
+    return jump, steps, distance
+
+
+def _doublings(before: IntArray) -> int:
+    """How often a stride has to be doubled to pass through all facets."""
+    return max(len(before), 1).bit_length()
+
+
+def _transitions(
+    before: IntArray, ends: FloatArray, gaps: FloatArray, rows: dict[str, npt.NDArray]
+) -> tuple[FloatArray, IntArray]:
+    """Find where just one of two neighbours is active, and the facet behind each such place.
+
+    The transition lies inside the free facet if its trace changes sign there, else at the vertex
+    between the two.
+    """
+    active, midpoints = rows["active"], ends.mean(axis=1)
+    later = np.flatnonzero((active != active[before]) & (before != np.arange(len(before))))
+    earlier = before[later]
+    free_is_later = active[earlier]
     free = np.where(free_is_later, later, earlier)
     vertex_gap = gaps[free, np.where(free_is_later, 0, 1)]
     middle_gap = rows["u"][free] - rows["obstacle"][free]
     inside = (vertex_gap < 0) & (middle_gap > 0)
     share = np.where(inside, middle_gap / np.where(inside, middle_gap - vertex_gap, 1.0), 1.0)
-    between = ends[later, 0]
-    points = midpoints[free] + share[:, None] * (between - midpoints[free])
-    along = np.lexsort([steps[earlier], part[earlier]])
-    return {name: column[order] for name, column in table.items()}, points[along]
+    return midpoints[free] + share[:, None] * (ends[later, 0] - midpoints[free]), earlier

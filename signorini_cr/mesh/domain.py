@@ -9,11 +9,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import basix.ufl
 import numpy as np
 import numpy.typing as npt
+from dolfinx import la
 from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 from dolfinx.mesh import (
@@ -34,6 +36,9 @@ from .polygon import check_labels, check_loops, coordinates
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
+"""Names of the parts of a boundary, and their values in facet tags."""
+REST = NEUMANN
+"""The part of the exterior facets that nobody names: the weak form's natural condition."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +53,32 @@ class Domain:
     mesh: Mesh
     tags: MeshTags
 
+    def __repr__(self) -> str:
+        """A line; the facets are those of this rank."""
+        cells = self.mesh.topology.index_map(self.mesh.topology.dim).size_global
+        facets = ", ".join(f"{len(self.facets(part))} {name}" for name, part in PARTS.items())
+        here = f" on rank {self.mesh.comm.rank}" if self.mesh.comm.size > 1 else ""
+        return f"<Domain: {cells} cells; facets{here}: {facets}>"
+
     def facets(self, part: int) -> npt.NDArray[np.int32]:
         """Local indices of the facets of one part that this rank owns.
 
         Args:
-            part: CONTACT, DIRICHLET or NEUMANN.
+            part: A value of `PARTS`.
         """
         found = self.tags.find(part)
         return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
+
+    @cached_property
+    def all_facets(self) -> dict[int, npt.NDArray[np.int32]]:
+        """Local indices of the facets of each part, ghosts included, ascending; collective."""
+        mark = la.vector(self.mesh.topology.index_map(self.mesh.topology.dim - 1))
+        for part in PARTS.values():
+            mark.array[self.facets(part)] = part
+        mark.scatter_forward()
+        return {
+            part: np.flatnonzero(mark.array == part).astype(np.int32) for part in PARTS.values()
+        }
 
     @classmethod
     def from_tags(
@@ -66,6 +89,7 @@ class Domain:
         contact: int | Sequence[int] = CONTACT,
         dirichlet: int | Sequence[int] = DIRICHLET,
         neumann: int | Sequence[int] | None = None,
+        **others: int | Sequence[int],
     ) -> Domain:
         """Take a mesh and facet tags of the user's own; collective.
 
@@ -80,19 +104,20 @@ class Domain:
             contact: The value or values that stand for Γ1.
             dirichlet: The value or values that stand for Γ0.
             neumann: The value or values that stand for Γg; named so that they can be checked.
+            **others: The same for further parts, by the names in `PARTS`.
 
         Raises:
             InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
         fdim = mesh.topology.dim - 1
+        given = {"contact": contact, "dirichlet": dirichlet, **others}
+        given["neumann"] = [] if neumann is None else neumann
+        if unknown := [name for name in given if name not in PARTS]:
+            raise InputError(f"no part is called {unknown[0]!r}; allowed: {_list(PARTS)}")
         wanted = {
-            part: np.unique(np.atleast_1d(np.asarray(values, dtype=np.int32)))
-            for part, values in (
-                (CONTACT, contact),
-                (DIRICHLET, dirichlet),
-                (NEUMANN, [] if neumann is None else neumann),
-            )
+            PARTS[name]: np.unique(np.atleast_1d(np.asarray(values, dtype=np.int32)))
+            for name, values in given.items()
         }
         for a, b in itertools.combinations(wanted, 2):
             if len(both := np.intersect1d(wanted[a], wanted[b])):
@@ -102,7 +127,7 @@ class Domain:
                 )
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
         exterior = _exterior(mesh)
-        values = np.full(_count(mesh, fdim), NEUMANN, dtype=np.int32)
+        values = np.full(_count(mesh, fdim), REST, dtype=np.int32)
         inside = np.ones(len(values), dtype=bool)
         inside[exterior] = False
         complaint = None
@@ -124,16 +149,17 @@ class Domain:
         for part, numbers in wanted.items():
             known.update(int(value) for value in numbers)
             missing = [int(value) for value in numbers if value not in there]
-            if part != NEUMANN and (missing or not len(numbers)):
+            if part != REST and (missing or not len(numbers)):
                 raise InputError(
                     f"no exterior facet is tagged {part_name(part)} (value {_list(missing)}): the"
                     f" values there are {_list(sorted(there))}"
                 )
         if neumann is not None and (left := sorted(there - known)):
+            words = [f"{part_name(part)} {_list(numbers)}" for part, numbers in wanted.items()]
+            words[0] = words[0].replace(" ", " is ", 1)
             raise InputError(
-                f"exterior facets are tagged {_list(left)}, which stands for nothing: contact is"
-                f" {_list(wanted[CONTACT])}, dirichlet {_list(wanted[DIRICHLET])} and neumann"
-                f" {_list(wanted[NEUMANN])}"
+                f"exterior facets are tagged {_list(left)}, which stands for nothing:"
+                f" {', '.join(words[:-1])} and {words[-1]}"
             )
         return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
 
@@ -286,6 +312,6 @@ def _distribute(
     ends, labels = distribute_entity_data(mesh, 1, raw.facets, raw.labels)
     mesh.topology.create_connectivity(1, 0)
     found = meshtags_from_entities(mesh, 1, adjacencylist(ends), labels)
-    values = np.full(_count(mesh, 1), NEUMANN, dtype=np.int32)
+    values = np.full(_count(mesh, 1), REST, dtype=np.int32)
     values[found.indices] = found.values
     return Domain(mesh, meshtags(mesh, 1, exterior, values[exterior]))

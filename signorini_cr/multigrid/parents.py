@@ -6,7 +6,8 @@ refinements the same pattern repeats in every parent, and one copy of it does fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +19,7 @@ from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from .. import compat
+from ..fem.physics import Imposed
 from ..fem.space import facet_corners, facet_entities, function_space, shared_sum
 
 FloatArray = npt.NDArray[np.float64]
@@ -32,66 +34,77 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the dofs of CR or P1 are.
+    """Where the nodes of CR or P1 are, and how many unknowns each has.
 
     Attributes:
         mesh: The mesh.
-        cells: Local dofs of the local cells, shape (cells, d + 1); dof i of a cell belongs to its
-            vertex i (P1) or to the facet opposite (CR).
+        cells: Local nodes of the local cells, shape (cells, d + 1); node i of a cell belongs to
+            its vertex i (P1) or to the facet opposite (CR).
         index_map: Their distribution over the ranks.
         cr: Whether it is CR.
+        block: Unknowns, or dofs, of a node: those of node i have the numbers from block * i on.
     """
 
     mesh: Mesh
     cells: IntArray
     index_map: Any
     cr: bool
+    block: int = 1
 
     @classmethod
     def of_space(cls, V: fem.FunctionSpace) -> Layout:
         """The dofs of a CR or P1 space."""
         cr = V.element.basix_element.family is basix.ElementFamily.CR
-        return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr)
+        return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr, V.dofmap.index_map_bs)
 
     @classmethod
-    def of_p1(cls, mesh: Mesh) -> Layout:
+    def of_p1(cls, mesh: Mesh, block: int = 1) -> Layout:
         """P1 without new numbers: the nodes of a straight-sided mesh are its vertices."""
         if compat.coordinate_map(mesh).degree == 1:
-            return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False)
-        return cls.of_space(function_space(mesh, "P1"))
+            return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False, block)
+        return replace(cls.of_space(function_space(mesh, "P1")), block=block)
 
     @property
     def size(self) -> tuple[int, int]:
         """Number of owned dofs, and of all on all ranks, as PETSc takes them."""
-        return self.index_map.size_local, self.index_map.size_global
+        return self.block * self.index_map.size_local, self.block * self.index_map.size_global
+
+    @property
+    def local(self) -> int:
+        """Number of local dofs, ghosts included."""
+        nodes: int = self.index_map.size_local + self.index_map.num_ghosts
+        return self.block * nodes
 
     def numbers(self, dofs: IntArray) -> IntArray:
         """Global numbers of local dofs."""
         if self.mesh.comm.size == 1:
             return dofs
-        numbers = self.index_map.local_to_global(dofs.ravel())
-        return numbers.astype(PETSc.IntType).reshape(dofs.shape)
+        nodes, component = np.divmod(dofs.ravel(), self.block)
+        numbers = self.index_map.local_to_global(nodes).astype(PETSc.IntType) * self.block
+        return (numbers + component).reshape(dofs.shape)
 
     def ends(self, facets: IntArray) -> IntArray:
-        """The dofs of P1 at the vertices of exterior facets, shape (n, d)."""
+        """The nodes of P1 at the vertices of exterior facets, shape (n, d)."""
         cells, local = facet_entities(self.mesh, facets).T
         ends: IntArray = self.cells[cells[:, None], facet_corners(self.mesh)[local]]
         return ends
 
-    def owned_ends(self, facets: IntArray) -> IntArray:
-        """The owned dofs of P1 at the vertices of any rank's exterior facets, ascending."""
-        return self.owned_among(self.ends(facets))
+    def owned_at(self, imposed: Sequence[Imposed]) -> IntArray:
+        """The owned dofs of P1 at whose vertices any rank has something imposed, ascending."""
+        dofs = [self.block * self.ends(i.facets)[:, :, None] + i.components for i in imposed]
+        none = np.empty(0, dtype=np.int32)
+        return self.owned_among(np.concatenate([none, *(each.ravel() for each in dofs)]))
 
     def owned_among(self, dofs: IntArray) -> IntArray:
         """The owned dofs among those that any rank names, local numbers, ascending."""
-        named = np.zeros(self.size[0] + self.index_map.num_ghosts)
+        named = np.zeros(self.local)
         named[dofs] = 1.0
         # numpy is ten times as fast over truth values as over numbers
         return np.flatnonzero(self.shared_sum(named)[: self.size[0]] > 0.0).astype(np.int32)
 
     def shared_sum(self, array: FloatArray) -> FloatArray:
         """Sum up, in place, what the ranks have for each shared dof."""
-        return shared_sum(self.mesh.comm, self.index_map, array)
+        return shared_sum(self.mesh.comm, self.index_map, array, self.block)
 
 
 class Parents:

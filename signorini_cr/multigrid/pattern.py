@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from ..fem.space import shared_sum
 from .parents import Layout
 
 
@@ -20,7 +21,7 @@ def empty_matrix(dofs: Layout) -> PETSc.Mat:
     Args:
         dofs: The dofs of CR or P1.
     """
-    (owned, everywhere), comm = dofs.size, dofs.mesh.comm
+    owned, comm, block = dofs.index_map.size_local, dofs.mesh.comm, dofs.block
     local, d = owned + dofs.index_map.num_ghosts, dofs.cells.shape[1] - 1
     cells = dofs.cells[: dofs.mesh.topology.index_map(d).size_local]
     inside = d * np.bincount(cells.ravel(), minlength=local).astype(np.float64)
@@ -29,19 +30,23 @@ def empty_matrix(dofs: Layout) -> PETSc.Mat:
         owner = np.full(local, comm.rank)
         owner[owned:] = dofs.index_map.owners
         there = cells[np.unique(np.flatnonzero(cells.ravel() >= owned) // (d + 1))]
-        elsewhere = owner[there][:, :, None] != owner[there][:, None, :]
-        np.add.at(outside, there, elsewhere.sum(axis=2))
-        inside = dofs.shared_sum(inside - outside)
-        dofs.shared_sum(outside)
-    most = (1.0 + inside, owned), (outside, everywhere - owned)  # PETSc refuses more than that
-    lengths = [np.minimum(n[:owned], columns).astype(PETSc.IntType) for n, columns in most]
+        apart = owner[there][:, :, None] != owner[there][:, None, :]
+        np.add.at(outside, there, apart.sum(axis=2))
+        inside = shared_sum(comm, dofs.index_map, inside - outside)
+        shared_sum(comm, dofs.index_map, outside)
+    elsewhere = dofs.index_map.size_global - owned
+    most = (1.0 + inside, owned), (outside, elsewhere)  # PETSc refuses more than that
+    lengths = [
+        np.repeat(block * np.minimum(n[:owned], columns), block).astype(PETSc.IntType)
+        for n, columns in most
+    ]
     nnz = lengths if comm.size > 1 else lengths[0]
-    matrix = PETSc.Mat().createAIJ((dofs.size, dofs.size), nnz=nnz, comm=comm)
+    matrix = PETSc.Mat().createAIJ((dofs.size, dofs.size), block, nnz=nnz, comm=comm)
     # PETSc does not set it on ranks without rows, and these alone would then wait for an answer
     # when the matrix is assembled
     matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, True)
-    numbers = dofs.numbers(np.arange(local, dtype=np.int32))
-    local_to_global = PETSc.LGMap().create(numbers.astype(PETSc.IntType, copy=False), comm=comm)
+    nodes = dofs.index_map.local_to_global(np.arange(local, dtype=np.int32))
+    local_to_global = PETSc.LGMap().create(nodes.astype(PETSc.IntType), block, comm=comm)
     matrix.setLGMap(local_to_global, local_to_global)
     local_to_global.destroy()
     return matrix

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..garbage import release
-from .masking import numbers_of, rows_of
+from .constrained import numbers_of, rows_of
 from .parents import Layout
 
 IntArray = npt.NDArray[np.int32]
@@ -41,7 +41,7 @@ class GaussSeidel:
     """
 
     def __init__(self, matrix: PETSc.Mat, dofs: Layout, sweeps: int):
-        """Prepare the sweeps; rows and columns may be taken out of the matrix later.
+        """Prepare the sweeps; rows and columns of the matrix may be constrained later.
 
         Args:
             matrix: A, symmetric positive definite.
@@ -55,17 +55,17 @@ class GaussSeidel:
             return
         self._rows, self._between, radius = _entries_between_ranks(matrix, dofs)
         self.relaxation = min(OVER_RELAXATION, 0.99 * 2.0 / (1.0 + radius))
-        self._taken_out: npt.NDArray[np.intp] = np.empty(0, dtype=np.intp)
+        self._constrained: npt.NDArray[np.intp] = np.empty(0, dtype=np.intp)
         self._share = self._between.createVecLeft()
         self._local = matrix.getDiagonalBlock()
         whole = matrix.createVecRight()
         self._b, self._x = self._local.createVecLeft(), whole.createLocalVector()
         release(whole)
 
-    def take_out(self, dofs: IntArray) -> None:
-        """Note the owned dofs that have the identity's rows and columns now, and x = 0."""
+    def constrain(self, dofs: IntArray) -> None:
+        """Note the owned dofs whose rows and columns are the identity's now, and x = 0 there."""
         if not self._alone:
-            self._taken_out = np.flatnonzero(np.isin(self._rows, dofs))
+            self._constrained = np.flatnonzero(np.isin(self._rows, dofs))
 
     def forward(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Sweep from the first row to the last, starting from x = 0."""
@@ -90,7 +90,7 @@ class GaussSeidel:
         for sweep in range(self._sweeps):
             if sweep > 0 or not from_zero:
                 self._between.mult(x, self._share)
-                self._share.array[self._taken_out] = 0.0
+                self._share.array[self._constrained] = 0.0
                 self._b.array[self._rows] = b.array_r[self._rows] - self._share.array_r
             x.getLocalVector(self._x)
             self._local.SOR(self._b, self._x, self.relaxation, first if sweep == 0 else way)
@@ -109,10 +109,10 @@ def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[IntArray, P
     first, end = matrix.getOwnershipRange()
     # An entry stems from a cell. If this rank does not own the cell, its dof is a ghost there and
     # thereby shared; if it does, the other dof is a ghost here, whose row has this one for a column
-    owned, ghosts = dofs.size[0], dofs.index_map.ghosts
-    ghost = np.arange(owned, owned + len(ghosts), dtype=np.int32)
+    ghost = np.arange(dofs.size[0], dofs.local, dtype=np.int32)
     shared = numbers_of(matrix, dofs.owned_among(ghost))
-    _, column, _ = rows_of(matrix, np.sort(ghosts))  # PETSc looks for their owners in order
+    # PETSc looks for their owners in order
+    _, column, _ = rows_of(matrix, np.sort(dofs.numbers(ghost)))
     numbers = np.union1d(shared, column[(column >= first) & (column < end)])
     start, column, value = rows_of(matrix, numbers)
     rows = (numbers - first).astype(np.int32)

@@ -11,14 +11,16 @@ P1 is contained in CR: a conforming function's mean over a facet is the mean of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..fem.space import ghosted
+from ..fem.space import ghosted, shared_sum
 from ..garbage import release
-from .masking import rows_of
+from .constrained import rows_of
 from .parents import FloatArray, IntArray, Layout, Parents
 
 
@@ -42,26 +44,28 @@ class Transfer:
         Args:
             coarse: The coarse dofs.
             fine: The fine dofs.
-            lengths: Number of entries of each owned fine dof's row.
-            dofs: The entries' local coarse dofs, in each row in any order.
-            values: The entries.
+            lengths: Number of entries of each owned fine node's row.
+            dofs: The entries' local coarse nodes, in each row in any order.
+            values: The entries, the same for all unknowns of a node.
         """
         self._coarse, self._fine = coarse, fine
         rows = fine.size[0]
+        if fine.block > 1:
+            lengths, dofs, values = _for_each_unknown(fine, lengths, dofs.ravel(), values)
         if isinstance(lengths, int):
             start = np.arange(0, (rows + 1) * lengths, lengths, dtype=PETSc.IntType)
         else:
             start = np.zeros(rows + 1, dtype=PETSc.IntType)
             np.cumsum(lengths, out=start[1:])
         self._csr = start, dofs.ravel().astype(PETSc.IntType, copy=False), values
-        sizes = rows, coarse.size[0] + coarse.index_map.num_ghosts
+        sizes = rows, coarse.local
         self._rows = PETSc.Mat().createAIJWithArrays(sizes, self._csr, comm=PETSc.COMM_SELF)
         self._own = self._rows.createVecLeft()
-        self._marks = ghosted(coarse.mesh.comm, coarse.index_map)
 
     def coarse_vector(self) -> PETSc.Vec:
         """A vector for coarse functions, with room for ghosts."""
-        return self._marks.duplicate()
+        coarse = self._coarse
+        return ghosted(coarse.mesh.comm, coarse.index_map, block=coarse.block)
 
     def add(self, x_coarse: PETSc.Vec, x: PETSc.Vec) -> None:
         """Add a coarse function to x."""
@@ -79,15 +83,10 @@ class Transfer:
         b.restoreLocalVector(self._own, readonly=True)
         b_coarse.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
 
-    def touched(self, dofs: IntArray) -> IntArray:
+    def coarse_support(self, dofs: IntArray) -> IntArray:
         """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
         _, columns, values = rows_of(self._rows, dofs)
-        with self._marks.localForm() as local:
-            local.set(0.0)
-            local.array[columns[values != 0.0]] = 1.0
-        self._marks.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
-        # numpy is ten times as fast over truth values as over numbers
-        return np.flatnonzero(self._marks.array_r > 0.0).astype(np.int32)
+        return self._coarse.owned_among(columns[values != 0.0])
 
     def matrix(self) -> PETSc.Mat:
         """As a matrix of all ranks, for products."""
@@ -99,13 +98,27 @@ class Transfer:
 
     def free(self) -> None:
         """Free the rows."""
-        release(self._rows, self._own, self._marks)
+        release(self._rows, self._own)
+
+
+def _for_each_unknown(
+    fine: Layout, lengths: IntArray | int, nodes: IntArray, values: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Repeat the rows of nodes for each of their unknowns, and number columns by unknowns."""
+    block, rows = fine.block, fine.index_map.size_local
+    lengths = np.full(rows, lengths) if isinstance(lengths, int) else lengths
+    start = np.cumsum(lengths) - lengths
+    repeated = np.repeat(lengths, block)
+    row = np.repeat(np.arange(rows * block), repeated)
+    within = np.arange(len(row)) - np.repeat(np.cumsum(repeated) - repeated, repeated)
+    entry = start[row // block] + within
+    return repeated, nodes[entry] * block + row % block, values[entry]
 
 
 def inclusion(p1: Layout, cr: Layout) -> Transfer:
     """P1 in CR on the same mesh: d entries 1/d in each row."""
     d = cr.cells.shape[1] - 1
-    owned = cr.size[0]
+    owned = cr.index_map.size_local
     columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
     for i in range(d + 1):
         others = [j for j in range(d + 1) if j != i]
@@ -126,7 +139,7 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
     corners = fine.cells.shape[1]
     slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
     slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
-    slot = slot[: fine.size[0]]
+    slot = slot[: fine.index_map.size_local]
     if len(weights) < len(parent_cell):  # the same in each parent, whose children are in a row
         parent = slot // (len(weights) * corners)
         slot = slot - parent * (len(weights) * corners)
@@ -140,37 +153,24 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
     return Transfer(coarse, fine, kept.sum(axis=1, dtype=np.int32), dofs[kept], values[kept])
 
 
-def averaging(coarse: Layout, fine: Layout, parents: Parents) -> PETSc.Mat:
-    """The matrix of the prolongation from CR to CR, which `prolongate` applies without it.
+@dataclass(frozen=True, eq=False)
+class Ancestor:
+    """What a function was prolonged from.
 
-    Args:
-        coarse: The coarse dofs.
-        fine: The fine dofs.
-        parents: The coarse cells that hold the fine ones.
+    Attributes:
+        u: The function on the mesh below.
+        parents: The cells there that hold those of the mesh above.
     """
-    weights, parent_cell = parents.weights(coarse, fine), parents.cell
-    repeats = len(parent_cell) // max(len(weights), 1)
-    touching = _sums(fine, np.ones(fine.cells.size))
-    values = np.tile(weights, (repeats, 1, 1)) / touching[fine.cells][:, :, None]
-    kept = values != 0.0
-    columns = np.broadcast_to(coarse.numbers(coarse.cells)[parent_cell][:, None, :], kept.shape)
-    start = np.zeros(fine.cells.size + 1, dtype=PETSc.IntType)
-    np.cumsum(kept.sum(axis=2), out=start[1:])
-    # no facet touches more than two cells
-    most = 2 * fine.cells.shape[1]
-    matrix = PETSc.Mat().createAIJ((fine.size, coarse.size), nnz=(most, most), comm=fine.mesh.comm)
-    rows = fine.numbers(fine.cells).ravel().astype(PETSc.IntType, copy=False)
-    columns = columns[kept].astype(PETSc.IntType, copy=False)
-    matrix.setValuesIJV(start, columns, values[kept], PETSc.InsertMode.ADD_VALUES, rows)
-    matrix.assemble()
-    return matrix
+
+    u: fem.Function
+    parents: Parents
 
 
 def prolongate(
     u: fem.Function,
     V: fem.FunctionSpace,
     parents: Parents,
-    below: tuple[fem.Function, Parents] | None = None,
+    ancestor: Ancestor | None = None,
 ) -> FloatArray:
     """Apply the prolongation once, without its matrix, and extrapolate if there is what it takes.
 
@@ -182,40 +182,42 @@ def prolongate(
         u: A CR or P1 function on the coarse mesh, ghosts up to date.
         V: The same kind of space on the fine mesh.
         parents: The coarse cells that hold the fine ones.
-        below: u's predecessor on the mesh below, and the cells there that hold the coarse ones.
-            Not used where either of the meshes is not a regular refinement.
+        ancestor: u's predecessor on the mesh below. Not used where either of the meshes is not a
+            regular refinement.
 
     Returns:
         Values of all local dofs, ghosts included.
     """
     coarse, fine = Layout.of_space(u.function_space), Layout.of_space(V)
     weights, parent_cell = parents.weights(coarse, fine), parents.cell
-    corners = fine.cells.shape[1]
-    local = u.x.array[coarse.cells]
-    if len(weights) == len(parent_cell):
-        values = np.einsum("cij,cj->ci", weights, local[parent_cell])
-    else:  # the same pattern in each parent
-        values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
-    if below is not None:
-        repeats = len(weights) < len(parent_cell) and below[1].regular
+    corners, block = fine.cells.shape[1], fine.block
+    gain, repeats = None, False
+    if ancestor is not None:
+        repeats = len(weights) < len(parent_cell) and ancestor.parents.regular
         # A rank without cells has no say, but a part in what follows
         if V.mesh.comm.allreduce(repeats or len(parent_cell) == 0, op=MPI.LAND):
-            gain = 0.25 * (u.x.array - prolongate(below[0], u.function_space, below[1]))
-            if repeats:
-                of_families = gain[coarse.cells].reshape(-1, 1, values.shape[1])
-                values.reshape(len(of_families), len(weights), -1)[:] += of_families
-    values = values.ravel()
-    total = _sums(fine, values)
-    values[:] = 1.0
-    return total / _sums(fine, values)
+            before = prolongate(ancestor.u, u.function_space, ancestor.parents)
+            gain = 0.25 * (u.x.array - before)
+    result, cells_of_node = np.empty(fine.local), _sums(fine, np.ones(fine.cells.size))
+    for component in range(block):
+        local = u.x.array[component::block][coarse.cells]
+        if len(weights) == len(parent_cell):
+            values = np.einsum("cij,cj->ci", weights, local[parent_cell])
+        else:  # the same pattern in each parent
+            values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+        if gain is not None and repeats:
+            of_families = gain[component::block][coarse.cells].reshape(-1, 1, values.shape[1])
+            values.reshape(len(of_families), len(weights), -1)[:] += of_families
+        result[component::block] = _sums(fine, values.ravel()) / cells_of_node
+    return result
 
 
 def _sums(layout: Layout, values: FloatArray) -> FloatArray:
-    """Sum of what all ranks' cells have for each local dof; PETSc's loop needs no copies."""
+    """Sum of what all ranks' cells have for each local node; PETSc's loop needs no copies."""
     result = np.zeros(layout.index_map.size_local + layout.index_map.num_ghosts)
     vector = PETSc.Vec().createWithArray(result, comm=PETSc.COMM_SELF)
     dofs = layout.cells.ravel().astype(PETSc.IntType, copy=False)
     vector.setValues(dofs, values, PETSc.InsertMode.ADD_VALUES)
     vector.assemble()
     vector.destroy()
-    return layout.shared_sum(result)
+    return shared_sum(layout.mesh.comm, layout.index_map, result)

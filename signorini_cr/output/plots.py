@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain
 from .canvas import (
     BLUE,
     GREY,
@@ -46,6 +46,8 @@ STYLES: dict[int, dict[str, Any]] = {
     NEUMANN: {"color": YELLOW, "linewidth": 3.5, "label": r"$\Gamma_g$: Neumann"},
     CONTACT: {"color": RED, "linewidth": 4.5, "label": r"$\Gamma_1$: contact"},
 }
+for _name, _part in PARTS.items():  # others as they come
+    STYLES.setdefault(_part, {"color": "black", "linewidth": 3.0, "label": _name})
 SERIES = {
     "error_h1": {"color": BLUE, "marker": "o", "label": r"$\|\nabla_h(u-u_h)\|$"},
     "bound_h1": {

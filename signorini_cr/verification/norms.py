@@ -68,13 +68,13 @@ def distance(coarse: Solution, fine: Solution) -> float:
     Raises:
         ValueError: They are not neighbours in a sequence.
     """
-    parent = fine.level.parent_cell
-    if parent is None or fine.level.coarser is not coarse.level:
+    parents = fine.level.parents
+    if parents is None or fine.level.meshes[:-1] != coarse.level.meshes:
         raise ValueError("the second solution isn't from the level after the first one's")
     mesh = fine.domain.mesh
     gradients, volumes = cell_gradients(fine.u)
     coarse_gradients, _ = cell_gradients(coarse.u)
-    difference = gradients - coarse_gradients[parent[: len(gradients)]]
+    difference = gradients - coarse_gradients[parents.cell[: len(gradients)]]
     return _total(mesh, float(volumes @ (difference**2).sum(axis=1))) ** 0.5
 
 

@@ -11,15 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.la import InsertMode
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from ..fem.space import closure_dofs, facet_corners, facet_entities, facet_measures, vertex_values
+from ..fem.physics import OnMesh
+from ..fem.space import facet_measures
 from ..fem.walk import along_boundary
-from ..mesh.domain import CONTACT, Domain
+from ..garbage import release
+from ..multigrid.parents import Layout
+from .active import ActiveSet
 from .solver import Iterations
 from .stopping import NOISE
+from .system import System
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,9 +35,9 @@ class Kkt:
         min_pressure: Smallest λ_h at a contact dof on its bound; 0 or above, up to the solver's
             tolerance.
         complementarity: Σ |λ_h (u_h − α)| over the contact dofs, weighted by their facets' measure.
-        residual: Norm of what is left of the equations, relative to the load; or to what the rows
-            are made of, in the class of stiffness where that is larger (`stopping`). Rounding of
-            A u_h does not count.
+        residual: Norm of what is left of the equations, relative to `System.residual_scale`; or to
+            what the rows are made of, in the class of stiffness where that is larger (`stopping`).
+            Rounding of A u_h does not count.
         force_error: What the solver left wrong with the contact forces, summed up without regard
             to sign, relative to their sum, as measured by the solver.
     """
@@ -62,6 +64,7 @@ class Contact:
         active: Whether the facet is in contact, shape (n,).
         gap_at_vertices: u_h − α at the facet's vertices, shape (n, d); negative in places even for
             a feasible CR function, which respects the bound at midpoints only.
+        active_set: The dofs in contact.
         force: Σ r over the dofs in contact, the total contact force (per unit depth).
         length: Total length of the active facets.
         number: Number of contact facets.
@@ -79,6 +82,7 @@ class Contact:
     pressure: FloatArray
     active: npt.NDArray[np.bool_]
     gap_at_vertices: FloatArray
+    active_set: ActiveSet
     force: float
     length: float
     number: int
@@ -86,6 +90,13 @@ class Contact:
     transitions: FloatArray
     kkt: Kkt
     _table: dict[str, npt.NDArray] | None
+
+    def __repr__(self) -> str:
+        """A line."""
+        return (
+            f"<Contact: {self.number_active} of {self.number} facets, length {self.length:.6g}, "
+            f"force {self.force:.6g}>"
+        )
 
     @property
     def midpoints(self) -> FloatArray:
@@ -102,94 +113,102 @@ class Contact:
 
 
 def contact_facts(
-    domain: Domain,
-    u: fem.Function,
-    residual: fem.Function,
-    diagonal: FloatArray,
-    lower: FloatArray,
-    obstacle_at_vertices: FloatArray,
-    load: float,
-    rounding: FloatArray,
-    iterations: Iterations,
+    data: OnMesh, system: System, u: fem.Function, residual: fem.Function, iterations: Iterations
 ) -> Contact:
-    """Read the state of Γ1 off a solution.
+    """Read the state of Γ1 off a solution; collective.
 
     Args:
-        domain: Mesh and boundary parts.
+        data: The physics on the mesh.
+        system: The variational inequality.
         u: u_h, ghosts up to date.
         residual: r = A u_h − b, ghosts up to date.
-        diagonal: Diagonal of A, owned dofs.
-        lower: Bound of each dof, `PETSc.NINFINITY` where there is none, ghosts included.
-        obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
-        load: What the residual is measured against.
-        rounding: What rounding makes of r, owned dofs with a bound only.
         iterations: What the solver says about its errors.
     """
-    V = u.function_space
-    mesh, facets = domain.mesh, domain.facets(CONTACT)
-    comm, owned = mesh.comm, V.dofmap.index_map.size_local
+    mesh, facets, dofs = data.domain.mesh, system.bounded_facets, system.contact_dofs
     vertices, measure = facet_measures(mesh, facets)
-    dofs = closure_dofs(V, facets)
-
-    work = fem.Function(V)
-    np.add.at(work.x.array, dofs, (measure / dofs.shape[1])[:, None])
-    work.x.scatter_reverse(InsertMode.add)
-    bounded = np.flatnonzero(lower[:owned] > PETSc.NINFINITY)
-    weight = work.x.array[bounded]
-    work.x.array[:] = 0.0
+    at_dofs = _AtDofs.of(system, u, residual)
+    layout, total = Layout.of_space(u.function_space), _Totals(mesh.comm)
+    share = np.zeros(len(u.x.array))  # of Γ1 that is a dof's
+    np.add.at(share, dofs, (measure / dofs.shape[1])[:, None])
+    pressure = at_dofs.force / layout.shared_sum(share)[system.bounded]
 
     def on_facets(values: FloatArray) -> FloatArray:
         """Values at bounded dofs, 0 at others, as the facets see them."""
-        work.x.array[bounded] = values
-        work.x.scatter_forward()
-        return work.x.array[dofs]
+        everywhere = np.zeros(len(share))
+        everywhere[system.bounded] = values
+        return layout.shared_sum(everywhere)[dofs]
 
-    gap = u.x.array[bounded] - lower[bounded]
-    raw = residual.x.array[bounded]
-    force, stiff_gap = np.where(np.abs(raw) > rounding, raw, 0.0), diagonal[bounded] * gap
-    # The primal-dual criterion: it tells gap from pressure also where both are nearly zero
-    in_contact = force > stiff_gap
-    state = on_facets(np.where(in_contact, 1.0, -1.0))
-    # Off the bound r is what is left of an equation; on it, a pull is a pressure of wrong sign
-    force = np.where(in_contact | (gap <= 0.0), force, 0.0)
-    pressure = force / weight
+    state = on_facets(np.where(at_dofs.active.mask, 1.0, -1.0))
     is_active: npt.NDArray[np.bool_] = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
-    # What is left of the equations: all of r off Γ1, min(r, a_ii gap) on it
-    left = residual.x.array[:owned].copy()
-    left[bounded] = np.minimum(raw, stiff_gap)
-    left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[:owned])] = 0.0
-
-    local = _cells_values(u, facets)
-    total = _Totals(comm)
-    kkt = Kkt(
-        min_gap=total.min(gap),
-        min_pressure=total.min(pressure),
-        complementarity=total.sum(np.abs(force * gap)),
-        residual=max(float(np.sqrt(total.sum(left @ left))) / (load or 1.0), iterations.imbalance),
-        force_error=iterations.force_error,
-    )
+    obstacle, local = system.obstacle_at_vertices, data.at_vertices(u, facets)
     fields: dict[str, npt.NDArray] = {
         "vertices": vertices,
         "measure": measure,
-        "obstacle": obstacle_at_vertices.mean(axis=1) if dofs.shape[1] > 1 else lower[dofs[:, 0]],
+        "obstacle": obstacle.mean(axis=1) if dofs.shape[1] > 1 else system.lower[dofs[:, 0]],
         "u": local.mean(axis=1),
         "pressure": on_facets(pressure).mean(axis=1),
         "active": is_active,
-        "gap_at_vertices": local - obstacle_at_vertices,
+        "gap_at_vertices": local - obstacle,
     }
     table, transitions = along_boundary(mesh, facets, fields)
+    of_load = float(np.sqrt(total.sum(at_dofs.left @ at_dofs.left))) / (
+        system.residual_scale or 1.0
+    )
     return Contact(
-        comm=comm,
+        comm=mesh.comm,
         facets=facets,
         **fields,
-        force=total.sum(force),
+        active_set=at_dofs.active,
+        force=total.sum(at_dofs.force),
         length=total.sum(measure[is_active]),
         number=int(total.sum(np.ones(len(facets)))),
         number_active=int(total.sum(is_active)),
         transitions=transitions,
-        kkt=kkt,
+        kkt=Kkt(
+            min_gap=total.min(at_dofs.gap),
+            min_pressure=total.min(pressure),
+            complementarity=total.sum(np.abs(at_dofs.force * at_dofs.gap)),
+            residual=max(of_load, iterations.imbalance),
+            force_error=iterations.force_error,
+        ),
         _table=table,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _AtDofs:
+    """What a solution does at the dofs.
+
+    Attributes:
+        gap: u − α at the bounded dofs, shape (n,).
+        force: Contact forces there, 0 where they are rounding alone, shape (n,).
+        active: The active set.
+        left: What is left of the equations at owned dofs: all of r off Γ1, min(r, a_ii gap) on it,
+            and 0 where that is rounding alone.
+    """
+
+    gap: FloatArray
+    force: FloatArray
+    active: ActiveSet
+    left: FloatArray
+
+    @classmethod
+    def of(cls, system: System, u: fem.Function, residual: fem.Function) -> _AtDofs:
+        """Compare what is there with what rounding makes of it; collective."""
+        bounded = system.bounded
+        with system.vectors(u, residual) as vectors:
+            terms = system.operator.magnitude(vectors.x) + np.abs(system.b.x.array[bounded])
+        entries = system.A.getDiagonal()
+        diagonal = entries.array_r.copy()
+        release(entries)
+        gap, raw = u.x.array[bounded] - system.lower[bounded], residual.x.array[bounded]
+        force = np.where(np.abs(raw) > NOISE * terms, raw, 0.0)
+        left = residual.x.array[: len(diagonal)].copy()
+        left[bounded] = np.minimum(raw, diagonal[bounded] * gap)
+        left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[: len(diagonal)])] = 0.0
+        active = ActiveSet.of(bounded, gap, force)
+        # Off the bound r is what is left of an equation; on it, a pull is a pressure of wrong sign
+        return cls(gap, np.where(gap <= 0.0, force, 0.0), active, left)
 
 
 class _Totals:
@@ -203,11 +222,3 @@ class _Totals:
 
     def min(self, values: npt.NDArray) -> float:
         return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), op=MPI.MIN))
-
-
-def _cells_values(u: fem.Function, facets: npt.NDArray[np.int32]) -> FloatArray:
-    """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
-    mesh = u.function_space.mesh
-    cells, local = facet_entities(mesh, facets).T
-    corners = facet_corners(mesh)
-    return np.take_along_axis(vertex_values(u, cells), corners[local], axis=1)

@@ -13,25 +13,31 @@ the prolonged u does, by the sign of the residual with the facet on its bound.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.mesh import Mesh
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from .. import compat
 from ..fem.space import (
-    closure_dofs,
     facet_corners,
     facet_entities,
     facet_measures,
     ghosted_vector,
 )
-from ..mesh.domain import CONTACT
+from ..garbage import release
 from ..multigrid.parents import Layout, barycentric_coordinates
-from ..multigrid.transfer import prolongate
-from .assembly import Level
+from ..multigrid.transfer import Ancestor, prolongate
+from .active import ActiveSet
+from .level import Level
 from .solved import Solved
+from .system import System
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
 
 ENOUGH = 0.5
 """Part of the parent's force from which on the residual is left as the prolongation has it."""
@@ -40,92 +46,128 @@ ROUNDS = 3
 """Neighbours share facets, so that corrections disturb one another a little."""
 
 
-def nested_start(coarse: Solved, level: Level, start: fem.Function) -> None:
-    """Fill in the start on a level.
+def nested_start(
+    coarse: Solved, level: Level, start: fem.Function, before: fem.Function | None = None
+) -> None:
+    """Fill in the start on a level; collective.
 
     Args:
         coarse: The solution on the mesh below, CR or P1, ghosts up to date.
         level: The fine mesh and what is assembled on it.
         start: On entry with the Dirichlet values; on exit the start.
+        before: The solution that the coarse one was started from, if it was.
     """
-    parents, below = level.parents, coarse.level.parents
-    if parents is None:
+    if level.parents is None:
         return
-    system, operator = level.system, level.grid.operator
-    before = None if coarse.before is None or below is None else (coarse.before, below)
-    V = start.function_space
-    x = start.x.array
-    values = x[system.dirichlet].copy()
-    x[:] = prolongate(coarse.u, V, parents, before)
-    x[system.dirichlet] = values
-    facets = level.domain.facets(CONTACT)
-    dofs = closure_dofs(V, facets)
-    if dofs.shape[1] > 1:  # a P1 dof has many cells, and no one to change its residual through
+    system, below = level.system, coarse.level.parents
+    ancestor = None if before is None or below is None else Ancestor(before, below)
+    values = start.x.array[system.dirichlet].copy()
+    start.x.array[:] = prolongate(coarse.u, level.V, level.parents, ancestor)
+    start.x.array[system.dirichlet] = values
+    if coarse.element == "P1":  # a dof has many cells, and no one to change its residual through
         return
-    facets = facets[np.argsort(dofs[:, 0])]  # the order of the operator's bounded dofs
-    bounded, b = operator.dofs, system.b.x.array[operator.dofs]
-    lower = system.lower[bounded]
-    vector, layout = ghosted_vector(V, x), Layout.of_space(V)
-    active, force, at_front = _from_parents(coarse, level.domain.mesh, parents.cell, facets)
-    on_bound = operator.times(vector) - b - operator.diagonal * (x[bounded] - lower)
-    active = np.where(at_front, on_bound > 0.0, active)
-    force = np.where(at_front, on_bound, force)
-    scale = V.mesh.comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
-    above = lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
-    x[bounded] = np.where(active, lower, np.maximum(x[bounded], above))
+    vector = ghosted_vector(level.V, start.x.array)
+    order = np.argsort(system.contact_dofs[:, 0])  # as the bounded dofs are
+    facets = system.bounded_facets[order]
+    active, force = _expected(_Inherited.of(coarse, level, facets), system, vector)
+    _put_on_bounds(start, system, active)
+    _make_forces(start, vector, system, facets, np.where(active.mask, force, 0.0))
+    release(vector)
 
-    others = V.dofmap.list[facet_entities(level.domain.mesh, facets)[:, 0]]
-    free = np.ones(len(x), dtype=bool)
-    free[system.dirichlet] = free[bounded] = False
+
+def _expected(inherited: _Inherited, system: System, x: PETSc.Vec) -> tuple[ActiveSet, FloatArray]:
+    """The active set to begin with, and the forces there, shape (n,)."""
+    operator, bounded = system.operator, system.bounded
+    gap = x.array_r[bounded] - system.lower[bounded]
+    on_bound = operator.times(x) - system.b.x.array[bounded] - operator.diagonal * gap
+    force = np.where(inherited.at_front, on_bound, inherited.force)
+    # with its parent off the bound a facet has no force, as the criterion sees it
+    pushing = np.where(inherited.at_front | inherited.active, force, 0.0)
+    return ActiveSet.of(bounded, 0.0, pushing), force
+
+
+def _put_on_bounds(start: fem.Function, system: System, active: ActiveSet) -> None:
+    """Put active dofs on their bounds and the others above, if only by rounding; collective."""
+    x, bounded, lower = start.x.array, system.bounded, system.lower[system.bounded]
+    comm = start.function_space.mesh.comm
+    scale = comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
+    above = lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
+    x[bounded] = np.where(active.mask, lower, np.maximum(x[bounded], above))
+
+
+def _make_forces(
+    start: fem.Function, vector: PETSc.Vec, system: System, facets: IntArray, force: FloatArray
+) -> None:
+    """Make forces the residual of active facets where it is far from them; collective.
+
+    Args:
+        start: The start.
+        vector: The same numbers as PETSc has them.
+        system: The variational inequality.
+        facets: The contact facets, as the bounded dofs are.
+        force: The forces wanted, positive; 0 where the residual is to be left alone.
+    """
+    V, operator, b = start.function_space, system.operator, system.b.x.array[system.bounded]
+    block = V.dofmap.index_map_bs
+    others = block * V.dofmap.list[facet_entities(V.mesh, facets)[:, 0]]
+    others += (system.bounded % block)[:, None]
+    free = np.ones(len(start.x.array), dtype=bool)
+    free[system.dirichlet] = free[system.bounded] = False
     surplus = operator.times(vector) - b - force
-    weak = active & (surplus < (ENOUGH - 1.0) * force)
+    weak = (force > 0.0) & (surplus < (ENOUGH - 1.0) * force)
     movable = free[others] & weak[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
-    moves = np.zeros(len(x))
+    layout, moves = Layout.of_space(V), np.zeros(len(free))
     for _ in range(ROUNDS):
         shift = surplus / operator.diagonal * (others.shape[1] - 1) / number
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
-        x += layout.shared_sum(moves)
+        start.x.array[:] += layout.shared_sum(moves)
         moves[:] = 0.0
         surplus = operator.times(vector) - b - force
-    vector.destroy()
 
 
-def _from_parents(
-    coarse: Solved,
-    fine: Mesh,
-    parent_cell: npt.NDArray[np.int32],
-    facets: npt.NDArray[np.int32],
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """What the fine contact facets' parents say.
+@dataclass(frozen=True, eq=False)
+class _Inherited:
+    """What the parents of contact facets say.
 
-    Returns:
-        Whether the parent is active, the facet's share of its contact force, and whether contact
-        begins or ends at one of the parent's vertices.
+    Attributes:
+        active: Whether the parent is active, shape (n,).
+        force: The facet's share of its contact force, shape (n,).
+        at_front: Whether contact begins or ends at one of the parent's vertices, shape (n,).
     """
-    mesh, V = coarse.domain.mesh, coarse.u.function_space
-    x, measure = facet_measures(fine, facets)
-    parents = parent_cell[facet_entities(fine, facets)[:, 0]]
-    # The parent facet lies opposite the vertex whose barycentric coordinate vanishes on the facet
-    simplices = mesh.geometry.x[compat.cell_nodes(mesh)[parents]]
-    points = x.mean(axis=1, keepdims=True)
-    local = np.argmin(np.abs(barycentric_coordinates(simplices, points)[:, 0]), axis=1)
-    tdim = mesh.topology.dim
-    mesh.topology.create_connectivity(tdim, tdim - 1)
-    c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
-    _, parent_measure = facet_measures(mesh, c2f[parents, local])
-    dof = V.dofmap.list[parents, local]
-    force = coarse.residual.x.array[dof]
-    active = (coarse.u.x.array[dof] <= coarse.level.system.lower[dof]) & (force > 0.0)
-    ends = Layout.of_p1(mesh).cells[parents[:, None], facet_corners(mesh)[local]]
-    at_front = _front(coarse)[ends].any(axis=1)
-    return active, force * measure / parent_measure, at_front
+
+    active: npt.NDArray[np.bool_]
+    force: FloatArray
+    at_front: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, coarse: Solved, level: Level, facets: IntArray) -> _Inherited:
+        """Ask the parents of some fine contact facets; collective."""
+        mesh, V = coarse.domain.mesh, coarse.u.function_space
+        assert level.parents is not None
+        x, measure = facet_measures(level.domain.mesh, facets)
+        parents = level.parents.cell[facet_entities(level.domain.mesh, facets)[:, 0]]
+        # The parent facet lies opposite the vertex whose barycentric coordinate vanishes on it
+        simplices = mesh.geometry.x[compat.cell_nodes(mesh)[parents]]
+        points = x.mean(axis=1, keepdims=True)
+        local = np.argmin(np.abs(barycentric_coordinates(simplices, points)[:, 0]), axis=1)
+        tdim = mesh.topology.dim
+        mesh.topology.create_connectivity(tdim, tdim - 1)
+        c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
+        _, parent_measure = facet_measures(mesh, c2f[parents, local])
+        block = V.dofmap.index_map_bs
+        dof = block * V.dofmap.list[parents, local] + level.system.bounded % block
+        marks = np.zeros(len(coarse.u.x.array))
+        marks[coarse.contact.active_set.dofs] = 1.0
+        active = Layout.of_space(V).shared_sum(marks)[dof] > 0.0
+        force = coarse.residual.x.array[dof] * measure / parent_measure
+        ends = Layout.of_p1(mesh).cells[parents[:, None], facet_corners(mesh)[local]]
+        return cls(active, force, _front(coarse)[ends].any(axis=1))
 
 
 def _front(solution: Solved) -> npt.NDArray[np.bool_]:
-    """Whether contact begins or ends at a vertex, for all local ones."""
-    mesh, contact = solution.domain.mesh, solution.contact
-    p1 = Layout.of_p1(mesh)
+    """Whether contact begins or ends at a vertex, for all local ones; collective."""
+    contact, p1 = solution.contact, Layout.of_p1(solution.domain.mesh)
     ends = p1.ends(contact.facets)
     there = np.ones(p1.size[0] + p1.index_map.num_ghosts, dtype=bool)
     for which in (contact.active, ~contact.active):

@@ -21,6 +21,8 @@ from ..errors import raise_together
 from ..fem.space import shared_maximum
 from ..garbage import release
 from ..mesh.planar import pieces
+from ..multigrid.parents import Layout
+from .active import ActiveSet
 from .stopping import NOISE
 from .system import System
 
@@ -46,7 +48,7 @@ class Loose:
 
         Args:
             V: The discrete space: dofs of a cell are connected.
-            dirichlet: Local dofs on Γ0, ghosts included.
+            dirichlet: Local dofs that are held, ghosts included.
         """
         comm, labels = V.mesh.comm, _labels(V)
         held, own = (
@@ -68,7 +70,7 @@ class Loose:
             InputError: One is not.
         """
         V = system.chi.function_space
-        owned, comm = V.dofmap.index_map.size_local, V.mesh.comm
+        owned, comm = Layout.of_space(V).size[0], V.mesh.comm
         piece, chi = self.piece[:owned], system.chi.x.array[:owned]
         sums = [
             np.bincount(piece, values, self.count + 1) for values in (chi, np.abs(chi), piece > 0)
@@ -79,7 +81,7 @@ class Loose:
         adrift[0] = False
         complaint, bad = None, int(np.argmax(adrift))
         if adrift.any() and len(dofs := np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == bad)):
-            nodes = compat.cell_nodes(V.mesh)[dofs[0]]
+            nodes = compat.cell_nodes(V.mesh)[dofs[0] // V.dofmap.index_map_bs]
             middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
             complaint = (
                 "the domain falls into pieces, and the one around "
@@ -106,8 +108,8 @@ class Loose:
         residual = fem.Function(start.function_space)
         system.residual(start, residual)
         bounded, lower = system.bounded, system.lower
-        pushed = (x[bounded] <= lower[bounded]) & (residual.x.array[bounded] > 0.0)
-        active = np.bincount(self.piece[bounded], pushed, self.count + 1)
+        pushed = ActiveSet.of(bounded, x[bounded] - lower[bounded], residual.x.array[bounded])
+        active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
         entries = system.A.getDiagonal()
         lift = np.abs(system.b.x.array[: entries.local_size]) / entries.array_r
         release(entries)
@@ -127,18 +129,18 @@ class Loose:
 
 
 def _cell_dofs(V: fem.FunctionSpace) -> npt.NDArray[np.int32]:
-    """Dofs of the owned cells, shape (cells, dofs of a cell)."""
-    topology = V.mesh.topology
-    dofs: npt.NDArray[np.int32] = V.dofmap.list[: topology.index_map(topology.dim).size_local]
-    return dofs
+    """Dofs of the owned cells that hang together, a row for each of a node's unknowns."""
+    topology, block = V.mesh.topology, V.dofmap.index_map_bs
+    nodes = V.dofmap.list[: topology.index_map(topology.dim).size_local, None]
+    dofs: npt.NDArray[np.int32] = block * nodes + np.arange(block, dtype=np.int32)[:, None]
+    return dofs.reshape(-1, nodes.shape[-1])
 
 
 def _labels(V: fem.FunctionSpace) -> npt.NDArray[np.float64]:
     """For each local dof the largest number of all dofs that it is connected with; collective."""
-    dofs, index_map = _cell_dofs(V), V.dofmap.index_map
-    local = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
-    piece = pieces(dofs, len(local))
-    labels = index_map.local_to_global(local).astype(np.float64)
+    dofs, layout = _cell_dofs(V), Layout.of_space(V)
+    piece = pieces(dofs, layout.local)
+    labels = layout.numbers(np.arange(layout.local, dtype=np.int32)).astype(np.float64)
     total = -1.0
     while total != (total := V.mesh.comm.allreduce(float(labels.sum()))):
         largest = np.full(len(dofs), -1.0)

@@ -8,8 +8,8 @@ from dolfinx import fem
 
 from ..fem.problem import Problem
 from ..mesh.domain import Domain
-from .assembly import Level
 from .contact import Contact
+from .level import Level
 
 
 class Solved(Protocol):
@@ -20,7 +20,6 @@ class Solved(Protocol):
     residual: fem.Function
     contact: Contact
     energy: float
-    before: fem.Function | None
     seconds: dict[str, float]
 
     @property

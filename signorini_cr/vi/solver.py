@@ -20,17 +20,14 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..errors import NotConverged
+from ..errors import InputError, NotConverged, fail_together
 from ..garbage import release
-from ..multigrid.cycle import Grid
-from ..options import PREFIX, defaults, explained, read, read_number
-from .reduced import LINEAR_SHARE, SET_SHARE, MaskedSolver
+from ..multigrid.cycle import Multigrid
+from ..options import NEWTON, PREFIX, REDUCED_PREFIX, defaults, explained, read, read_number
+from .active import ActiveSet
+from .reduced import LINEAR_SHARE, SET_SHARE, FullJacobian, ReducedSolver
 from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, Stiffness
-
-# What can be set through options only. Full steps are the primal-dual active set method: PETSc's
-# usual line search tests a norm that may rightly rise. A contact dof counts as active within the
-# zero tolerance of its bound; PETSc's is absolute and would freeze data of small magnitude.
-DEFAULTS = {"snes_linesearch_type": "basic", "snes_vi_zero_tolerance": 0.0}
+from .system import Vectors
 
 SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""
@@ -79,94 +76,56 @@ class Iterations:
 
 
 def solve_vi(
-    grid: Grid,
-    b: PETSc.Vec,
-    lower: PETSc.Vec,
-    x: PETSc.Vec,
-    residual: PETSc.Vec,
+    cycle: Multigrid,
+    vectors: Vectors,
+    scale: float,
     *,
-    load: float,
     tolerance: float = 1e-8,
     monitor: Monitor | None = None,
-    level: int | None = None,
     row_sums: Callable[[], FloatArray] | None = None,
 ) -> Iterations:
-    """Solve the variational inequality in place.
+    """Solve the variational inequality in place; collective.
 
     Args:
-        grid: The matrix A, symmetric positive definite, Dirichlet rows and columns those of the
-            identity, and the multigrid that goes with it.
-        b: Right-hand side, with the Dirichlet values in their rows.
-        lower: Bound of each dof, `PETSc.NINFINITY` for all but the grid's bounded ones.
-        x: On entry the start, with the Dirichlet values in place; on exit the solution.
-        residual: On exit A x − b.
-        load: Norm that the residual is measured against, `System.load`; the same for all starts.
-        tolerance: The solve ends when the residual's norm is below ``tolerance * load``, or lost
+        cycle: The preconditioner, with the matrix A on its finest grid: symmetric positive
+            definite, Dirichlet rows and columns those of the identity. A is whole on return, and
+            after errors, too.
+        vectors: Right-hand side and bounds, start and solution.
+        scale: Norm that the residual is measured against, `System.residual_scale`; the same for
+            all starts.
+        tolerance: The solve ends when the residual's norm is below ``tolerance * scale``, or lost
             in rounding, and what is due to the choice of the active set far below; and the contact
             forces and each class of stiffness are converged for themselves, see `stopping`.
         monitor: Called after each step.
-        level: Named in the error.
         row_sums: `System.row_sums`; without them all equations are of one class of stiffness.
 
     Raises:
         NotConverged: With the name PETSc gives to the reason, or what is lost in rounding.
-        InputError: PETSc can't solve with the options that are set. On several ranks the grid's
-            matrices are then left as they are, without the dofs taken out last.
+        InputError: PETSc can't solve with the options that are set.
     """
-    operator, comm = grid.operator, grid.matrix.getComm()
-    bounds = lower.array_r[operator.dofs]
-    target = tolerance * load or 1e-300
+    target = tolerance * scale or 1e-300
     # looked up here, as the linear solver has to know; what is below rounding is all the same to it
     wanted = max(read_number("snes_atol", target), 1e-30 * target)
-    snes = PETSc.SNES().create(comm)
-    snes.setOptionsPrefix(PREFIX)
-    snes.setType(PETSc.SNES.Type.VINEWTONRSLS)
-
-    stiffness = Stiffness(grid, row_sums)
-
-    def function(_: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        stiffness.residual(x, b, f)
-
-    snes.setFunction(function, residual)
-    linear = MaskedSolver(
-        grid, bounds, x, residual, LINEAR_SHARE * wanted, stiffness, max(1.0, wanted / target)
+    snes = PETSc.SNES().create(cycle.matrix.getComm())
+    stiffness = Stiffness(cycle.finest, row_sums)
+    linear = ReducedSolver(
+        cycle,
+        vectors.lower.array_r[cycle.operator.dofs],
+        snes,
+        (vectors.x, vectors.residual),
+        LINEAR_SHARE * wanted,
+        stiffness,
+        max(1.0, wanted / target),
     )
-    jacobian = PETSc.Mat().createPython(grid.matrix.getSizes(), linear, comm=comm)
-    jacobian.setUp()
-    snes.setJacobian(lambda *_: None, jacobian)
-    upper = b.duplicate()
-    upper.set(PETSc.INFINITY)
-    snes.setVariableBounds(lower, upper)
-    # rtol is relative to the start, so a warm start needs the absolute one
-    snes.setTolerances(rtol=0.0, atol=target, max_it=100)
-    outer = snes.getKSP()
-    outer.setOptionsPrefix(PREFIX + "reduced_")
-    outer.setType(PETSc.KSP.Type.PYTHON)
-    outer.setPythonContext(linear)
-    outer.getPC().setType(PETSc.PC.Type.NONE)
-
-    def report(snes: PETSc.SNES, step: int, norm: float) -> None:
-        number = comm.tompi4py().allreduce(int(linear.active().sum()))
-        if monitor is not None:
-            monitor(step, norm, number, linear.iterations)
-
-    test = _Test(grid, b, linear, stiffness, target)
-
-    def converged(snes: PETSc.SNES, step: int, norms: tuple[float, float, float]) -> int:
-        return test(snes, step, norms[2])
-
-    snes.setConvergenceTest(converged)
-    # all ranks report, though there may be a monitor on one of them only
-    if comm.tompi4py().allreduce(monitor is not None, op=MPI.LOR):
-        snes.setMonitor(report)
-    with defaults(DEFAULTS):
-        read(snes)
-    together = comm.getSize() == 1
+    test = NewtonTest(cycle, vectors.b, linear, stiffness, target)
+    things: tuple[PETSc.Object, ...] = ()
     try:
+        things = _prepare(snes, linear, stiffness, vectors, target)
+        snes.setConvergenceTest(lambda snes, step, norms: test(snes, step, norms[2]))
+        _report(snes, linear, monitor)
         with explained():
-            snes.solve(None, x)
-        together = True
-        reason, linear_reason = snes.getConvergedReason(), linear.ksp.getConvergedReason()
+            snes.solve(None, vectors.x)
+        reason, inner = snes.getConvergedReason(), linear.ksp.getConvergedReason()
         iterations = Iterations(
             snes.getIterationNumber(),
             linear.iterations,
@@ -175,25 +134,75 @@ def solve_vi(
             test.imbalance,
         )
     finally:
-        if together:  # a monitor may raise on one rank alone, which must not wait for the others
-            grid.restore()
-        release(outer, snes, jacobian, upper)
+        release(snes, *things)
         linear.free()
         stiffness.free()
     if reason < 0:
-        words = _name(PETSc.SNES.ConvergedReason, reason)
-        if linear_reason < 0:
-            words += f" (KSP {_name(PETSc.KSP.ConvergedReason, linear_reason)})"
-        words = f"SNES stopped with {words}" if test.failure is None else f"{test.failure}; stopped"
         raise NotConverged(
-            f"{words} after {iterations.newton} Newton steps "
-            f"and {iterations.linear} linear iterations",
-            level,
+            f"{test.failure or _stopped(reason, inner)} after {iterations.newton} Newton steps "
+            f"and {iterations.linear} linear iterations"
         )
     return iterations
 
 
-class _Test:
+def _prepare(
+    snes: PETSc.SNES, linear: ReducedSolver, stiffness: Stiffness, vectors: Vectors, target: float
+) -> tuple[PETSc.Object, ...]:
+    """Tell SNES what to solve, and what solves its reduced systems; return what is to be freed."""
+    snes.setOptionsPrefix(PREFIX)
+    outer = snes.getKSP()
+    outer.setOptionsPrefix(REDUCED_PREFIX)
+    outer.setType(PETSc.KSP.Type.PYTHON)
+    outer.setPythonContext(linear)
+    outer.getPC().setType(PETSc.PC.Type.NONE)
+    snes.setTolerances(atol=target)
+    with defaults(NEWTON):
+        read(snes)
+    if outer.getType() != PETSc.KSP.Type.PYTHON:
+        raise InputError(
+            f"PETSc can't solve with -{REDUCED_PREFIX}ksp_type {outer.getType()}: it needs the "
+            f"method mult of a matrix that is never made; see -{PREFIX}ksp_type"
+        )
+    # after the type, which brings functions of its own
+    snes.setFunction(lambda _, x, r: stiffness.residual(x, vectors.b, r), vectors.residual)
+    sizes = vectors.b.getSizes(), vectors.b.getSizes()
+    jacobian = PETSc.Mat().createPython(sizes, FullJacobian(linear.matrix), comm=snes.getComm())
+    jacobian.setUp()
+    snes.setJacobian(lambda *_: None, jacobian)
+    upper = vectors.b.duplicate()
+    upper.set(PETSc.INFINITY)
+    snes.setVariableBounds(vectors.lower, upper)
+    return outer, jacobian, upper
+
+
+def _report(snes: PETSc.SNES, linear: ReducedSolver, monitor: Monitor | None) -> None:
+    """Have the monitor called, which only some of the ranks may have; collective."""
+    comm = snes.getComm().tompi4py()
+
+    def report(_: PETSc.SNES, step: int, norm: float) -> None:
+        number = comm.allreduce(int(linear.active_now().mask.sum()))
+        error = None
+        try:
+            if monitor is not None:
+                monitor(step, norm, number, linear.iterations)
+        except MemoryError:
+            raise  # at once, there may be none left to talk about it
+        except Exception as caught:
+            error = caught
+        fail_together(comm, error)
+
+    # all ranks report, though there may be a monitor on one of them only
+    if comm.allreduce(monitor is not None, op=MPI.LOR):
+        snes.setMonitor(report)
+
+
+def _stopped(reason: int, inner: int) -> str:
+    """What to say when SNES gives up, and the linear solver perhaps before it."""
+    words = f"SNES stopped with {_name(PETSc.SNES.ConvergedReason, reason)}"
+    return words + (f" (KSP {_name(PETSc.KSP.ConvergedReason, inner)})" if inner < 0 else "")
+
+
+class NewtonTest:
     """Whether SNES may stop; see `stopping`.
 
     Attributes:
@@ -203,10 +212,15 @@ class _Test:
     """
 
     def __init__(
-        self, grid: Grid, b: PETSc.Vec, linear: MaskedSolver, stiffness: Stiffness, target: float
+        self,
+        cycle: Multigrid,
+        b: PETSc.Vec,
+        linear: ReducedSolver,
+        stiffness: Stiffness,
+        target: float,
     ):
         """Start the tests; target is what the residual may be unless options say otherwise."""
-        self._grid, self._b, self._target = grid, b, target
+        self._cycle, self._b, self._target = cycle, b, target
         self._linear, self._stiffness = linear, stiffness
         self._start = np.inf
         self._for_the_set = self._passes = 0
@@ -216,55 +230,65 @@ class _Test:
 
     def __call__(self, snes: PETSc.SNES, step: int, norm: float) -> int:
         """Decide; the same on all ranks."""
-        Reason, linear, x = PETSc.SNES.ConvergedReason, self._linear, snes.getSolution()
+        Reason = PETSc.SNES.ConvergedReason
         if not np.isfinite(norm):
             return DIVERGED_NAN
         if step == 0:
             self._start = norm
         rtol, atol, _, _ = snes.getTolerances()
         small = max(atol, rtol * self._start)
-        before, self._forces = self._forces, linear.forces()
         loose = max(1.0, small / self._target)  # who sets a tolerance sets them all
+        before, self._forces = self._forces, self._linear.forces()
         if step == 0:
             enough = norm == 0.0 or (loose > 1.0 and norm <= small)
             if enough:
                 self.force_error = self.imbalance = 0.0
             return Reason.CONVERGED_FNORM_ABS if enough else Reason.ITERATING
-        disputed, total, moved, in_dispute = self._sums(before)
         known, solved = self.force_error, self.imbalance
         self.force_error = self.imbalance = np.inf  # what was known of another set says nothing
-        if norm > small and (step == 1 or norm > NOISE * self._grid.rounding(x)):
+        x, last = snes.getSolution(), self._linear.active.dofs
+        facts = self._contact_facts(before)
+        if norm > small and (step == 1 or norm > NOISE * self._cycle.finest.rounding(x, last)):
             return Reason.ITERATING
         allowed = SET_STEPS if step <= SET_STEPS else 1
-        if self._for_the_set < allowed and disputed > SET_TOLERANCE * small:
+        if self._for_the_set < allowed and facts.misclassified_norm > SET_TOLERANCE * small:
             self._for_the_set += 1
             return Reason.ITERATING
-        # the linear solver knows what it left, unless rounding has added to the residual; a dof
-        # in the wrong set has its force there, its neighbours as much, and so may other forces
-        sure = norm <= 2.0 * (linear.reached + disputed) and np.isfinite(linear.force_errors).all()
-        errors = (linear.force_errors if sure else moved) + 2.0 * in_dispute
-        errors += STORED * self._stiffness.magnitude(x, linear.active())
-        noise = np.zeros_like(total)
-        if (errors > loose * FORCES * total).any():
-            noise = LOST * NOISE * self._stiffness.magnitude(x)
-            errors = np.where((errors <= noise) & (total <= noise), 0.0, errors)
-        self.force_error = float(np.max(errors / np.maximum(total, 1e-300), initial=0.0))
-        self.imbalance = self._stiffness.imbalance(x, self._b, snes.getFunction()[0])
+        errors, noise = self._force_errors(x, norm, facts, loose)
+        self.force_error = float(np.max(errors / np.maximum(facts.forces, 1e-300), initial=0.0))
+        self.imbalance = self._stiffness.imbalance(x, self._b, snes.getFunction()[0], last)
         if self.force_error <= loose * FORCES and self.imbalance <= loose * FLOWS:
             return Reason.CONVERGED_FNORM_ABS
-        if (in_dispute > np.maximum(loose * FORCES * total, noise)).any():
+        if (facts.misclassified > np.maximum(loose * FORCES * facts.forces, noise)).any():
             self.force_error = self.imbalance = np.inf  # of another set
             return Reason.ITERATING
         self._passes += 1
         figures = (self.force_error, known, FORCES), (self.imbalance, solved, FLOWS)
         gains = any(loose * limit < now <= GAIN * last for now, last, limit in figures)
         if gains and self._passes < PASSES:
-            linear.reduction = SET_SHARE * min(1.0, loose * FLOWS / max(self.imbalance, 1e-300))
+            reduction = min(1.0, loose * FLOWS / max(self.imbalance, 1e-300))
+            self._linear.reduction = SET_SHARE * reduction
             return Reason.ITERATING
         if max(self.force_error, self.imbalance) <= loose * ROUNDED:
             return Reason.CONVERGED_FNORM_ABS
         self.failure = self._lost_in_rounding(float(x.norm(PETSc.NormType.INFINITY)))
         return DIVERGED_ROUNDING
+
+    def _force_errors(
+        self, x: PETSc.Vec, norm: float, facts: _ContactFacts, loose: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """What may be wrong with the forces of each class, and what rounding makes of them."""
+        # the linear solver knows what it left, unless rounding has added to the residual; a
+        # misclassified dof has its force there, its neighbours as much, and so may other forces
+        left, reached = self._linear.force_errors, self._linear.reached
+        sure = norm <= 2.0 * (reached + facts.misclassified_norm) and np.isfinite(left).all()
+        errors = (left if sure else facts.moved) + 2.0 * facts.misclassified
+        errors += STORED * self._stiffness.magnitude(x, facts.active.mask)
+        noise = np.zeros_like(errors)
+        if (errors > loose * FORCES * facts.forces).any():
+            noise = LOST * NOISE * self._stiffness.magnitude(x)
+            errors = np.where((errors <= noise) & (facts.forces <= noise), 0.0, errors)
+        return errors, noise
 
     def _lost_in_rounding(self, largest: float) -> str:
         """What to say to users; u_h is as large as given."""
@@ -275,29 +299,44 @@ class _Test:
         return (
             f"{known}, {ROUNDED:.0e} is wanted. The rest is lost in rounding, as the stiffness "
             f"varies by a factor of {self._stiffness.contrast:.1e} and u_h is as large as "
-            f"{largest:.1e}"
+            f"{largest:.1e}; stopped"
         )
 
-    def _sums(self, before: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        """Sum up contact forces.
-
-        Returns:
-            The norm of the residual in the dofs in dispute; and for each class of stiffness the
-            forces, what they have changed by since ``before``, and those in dispute.
-        """
-        forces, linear = self._forces, self._linear
-        active, disputed = linear.active(), linear.disputed()
+    def _contact_facts(self, before: FloatArray) -> _ContactFacts:
+        """Sum up contact forces; collective."""
+        forces, active = self._forces, self._linear.active_now()
+        misclassified = active.mask != self._linear.active.mask
         facts = [
             self._stiffness.sums(np.where(which, values, 0.0))
             for which, values in (
-                (disputed, forces**2),
-                (active, forces),
-                (active, np.abs(forces - before)),
-                (disputed, np.abs(forces)),
+                (misclassified, forces**2),
+                (active.mask, forces),
+                (active.mask, np.abs(forces - before)),
+                (misclassified, np.abs(forces)),
             )
         ]
-        sums = self._grid.matrix.getComm().tompi4py().allreduce(np.array(facts))
-        return float(np.sqrt(sums[0].sum())), sums[1], sums[2], sums[3]
+        squares, *sums = self._cycle.matrix.getComm().tompi4py().allreduce(np.array(facts))
+        return _ContactFacts(active, float(np.sqrt(squares.sum())), *sums)
+
+
+@dataclass(frozen=True, eq=False)
+class _ContactFacts:
+    """Forces after a Newton step, over all ranks; sums have one figure a class of stiffness.
+
+    Attributes:
+        active: The active set of the iterate.
+        misclassified_norm: Norm of the residual in the dofs that the last system had in the other
+            set.
+        forces: Sum of the forces on active dofs.
+        moved: Sum of what they have changed by since the step before.
+        misclassified: Sum of the forces on misclassified dofs.
+    """
+
+    active: ActiveSet
+    misclassified_norm: float
+    forces: FloatArray
+    moved: FloatArray
+    misclassified: FloatArray
 
 
 def _name(reasons: type, value: int) -> str:

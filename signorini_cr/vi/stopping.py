@@ -31,6 +31,7 @@ from ..garbage import release
 from ..multigrid.cycle import Grid
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
 
 DECADES = 2.0
 """Dofs whose diagonal entries are within so many powers of ten make a class."""
@@ -117,7 +118,7 @@ class Stiffness:
     def residual(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> None:
         """Compute r = A x − b."""
         if self._differences is None:
-            self._grid.operator.mult(x, r)
+            self._grid.matrix.mult(x, r)
             r.axpy(-1.0, b)
             return
         flows = self._differences.createVecLeft()
@@ -127,13 +128,14 @@ class Stiffness:
         r.array[:] += self._row_sums * x.array_r - b.array_r
         release(flows)
 
-    def imbalance(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> float:
+    def imbalance(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec, active: IntArray) -> float:
         """Compute the largest ‖r‖ / ‖flows‖ of all classes, 0 for what is lost in rounding.
 
         Args:
             x: The iterate.
             b: Right-hand side.
-            r: A x − b; only dofs outside the present active set count.
+            r: A x − b.
+            active: Owned dofs whose equations do not count, local numbers.
         """
         if self._differences is None:
             return 0.0
@@ -146,7 +148,7 @@ class Stiffness:
         made_of.assemble()
         made_of.multTranspose(flows, sizes)
         counted = self._free.copy()
-        counted[self._grid.operator.out] = False
+        counted[active] = False
         facts = [
             np.bincount(self._class[counted], values[counted] ** 2, minlength=self.number)
             for values in (

@@ -2,30 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
-from dolfinx.la import InsertMode
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..data.moments import Sampled
 from ..errors import InputError, raise_together
-from ..fem.problem import Forms
-from ..fem.space import closure_dofs, facet_entities, ghosted_vector, shared_maximum
+from ..fem.physics import Imposed, OnMesh
+from ..fem.space import ghosted_vector, shared_maximum, unknowns
 from ..garbage import release
-from ..mesh.domain import CONTACT, DIRICHLET, Domain
+from ..multigrid.constrained import ConstrainedMatrix
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
-from ..options import NO_INODES, defaults
+from ..options import MATRICES, defaults
 
 FloatArray = npt.NDArray[np.float64]
 
 ROUNDING = 1e-5
-"""Least load, in parts of what it would be from zero: A u is not known to all digits of u."""
+"""Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """The complementarity problem's vectors.
+
+    Attributes:
+        b: Right-hand side, with the Dirichlet values in their rows.
+        lower: Bound of each dof, `PETSc.NINFINITY` for all but the bounded ones.
+        x: For the solver the start on entry, with the Dirichlet values in place, and the solution
+            on exit.
+        residual: On exit A x − b.
+    """
+
+    b: PETSc.Vec
+    lower: PETSc.Vec
+    x: PETSc.Vec
+    residual: PETSc.Vec
 
 
 class System:
@@ -39,42 +58,38 @@ class System:
         dirichlet: Local dofs on Γ0, ghosts included.
         bounded: Owned local dofs with a bound, ascending.
         u_D: Function with the Dirichlet values, 0 elsewhere.
+        bounded_facets: Owned facets of Γ1, ascending, shape (n,).
+        contact_dofs: The dofs with a bound that each of them has, shape (n, 1) or (n, d).
         obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
-        load: Norm of the residual at the most trivial start, which all residuals are measured
-            against: the number in the middle of the values u_D takes, raised to α on Γ1 where that
-            is larger, u_D on Γ0. A constant added to u_D and α makes no difference unless it is
-            so large that differences drown in it.
+        residual_scale: Norm of the residual at the most trivial start, which all residuals are
+            measured against: the number in the middle of the values u_D takes, raised to α on Γ1
+            where that is larger, u_D on Γ0. A constant added to u_D and α makes no difference
+            unless it is so large that differences drown in it.
     """
 
-    def __init__(
-        self, forms: Forms, domain: Domain, V: fem.FunctionSpace, chi: Callable[[], FloatArray]
-    ):
+    def __init__(self, data: OnMesh):
         """Assemble it; collective.
 
         Args:
-            forms: The compiled forms.
-            domain: Mesh and boundary parts.
-            V: The discrete space.
-            chi: Gives χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's share.
+            data: The physics on the mesh.
 
         Raises:
             InputError: Data are not finite, or κ is not above 0.
         """
-        comm = domain.mesh.comm
-        forms.insist_on_mesh(domain.mesh)
-        on_dirichlet, self.u_D, _ = _boundary_values(forms, domain, V, DIRICHLET)
-        on_contact, lower, self.obstacle_at_vertices = _boundary_values(forms, domain, V, CONTACT)
+        self._data, V = data, data.V
+        comm, layout = V.mesh.comm, Layout.of_space(V)
+        on_dirichlet, self.u_D = _imposed(data.fixed, V)
+        on_contact, lower = _imposed(data.lower, V)
+        self._read_contact(data.lower)
         # Where the two parts meet in a P1 vertex the Dirichlet value holds
         bounded = on_contact & ~on_dirichlet
         self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
-        owned = V.dofmap.index_map.size_local
-        self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
-        bc = fem.dirichletbc(self.u_D, self.dirichlet)
-        self._a = a = forms.a.on(domain, [V, V])
-        with defaults(NO_INODES, prefix=""):
-            if forms.element == "CR":
-                self.A = assemble_matrix(empty_matrix(Layout.of_space(V)), a, [bc])
+        self.bounded = np.flatnonzero(bounded[: layout.size[0]]).astype(np.int32)
+        bc, a = self._bc(self.u_D), data.a
+        with defaults(MATRICES, prefix=""):
+            if layout.cr:
+                self.A = assemble_matrix(empty_matrix(layout), a, [bc])
             else:
                 self.A = assemble_matrix(a, [bc])
         self.A.assemble()
@@ -85,22 +100,22 @@ class System:
         raise_together(comm, None if positive else complaint)
         self.A.setOption(PETSc.Mat.Option.SPD, True)
         self.chi = fem.Function(V)
-        if forms.element == "CR" and forms.loaded:
-            self.chi.x.array[:] = chi()
-        elif forms.chi is not None:
-            fem.assemble_vector(self.chi.x.array, forms.chi.on(domain, [V]))
+        self.chi.x.array[:] = data.chi()
         self.b = fem.Function(V)
         self.b.x.array[:] = self.chi.x.array
         fem.apply_lifting(self.b.x.array, [a], [[bc]])
         for vector in (self.chi, self.b):
-            vector.x.scatter_reverse(InsertMode.add)
-            vector.x.scatter_forward()
+            layout.shared_sum(vector.x.array)
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
-        self.load = self._load(bounded)
+        self.residual_scale = self._scale(bounded)
 
-    def _load(self, bounded: npt.NDArray[np.bool_]) -> float:
-        """The load; ``bounded`` tells for all local dofs whether they have a bound."""
+    def _scale(self, bounded: npt.NDArray[np.bool_]) -> float:
+        """Measure the trivial start's residual.
+
+        Args:
+            bounded: Whether the dofs have a bound, for all local ones.
+        """
         comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
         top = comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
         bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
@@ -112,18 +127,67 @@ class System:
             start.x.array[self.dirichlet] = values
             start.x.array[bounded] = np.maximum(self.lower[bounded], number)
             norms.append(self.residual(start, residual))
-        load = max(norms[0], ROUNDING * norms[-1])
-        if not np.isfinite(load):
+        scale = max(norms[0], ROUNDING * norms[-1])
+        if not np.isfinite(scale):
             raise InputError("data: so large that their squares overflow; choose other units")
-        return load
+        return scale
+
+    @cached_property
+    def operator(self) -> ConstrainedMatrix:
+        """A as the solver uses it."""
+        return ConstrainedMatrix(self.A, self.bounded)
+
+    @property
+    def owned_dirichlet(self) -> npt.NDArray[np.int32]:
+        """The owned ones of the dofs on Γ0."""
+        return self.dirichlet[self.dirichlet < self.A.getLocalSize()[0]]
+
+    @contextmanager
+    def vectors(self, u: fem.Function, residual: fem.Function) -> Iterator[Vectors]:
+        """Lend the complementarity problem's vectors for a block, on the functions' memory."""
+        V = u.function_space
+        arrays = self.b.x.array, self.lower, u.x.array, residual.x.array
+        vectors = Vectors(*(ghosted_vector(V, array) for array in arrays))
+        try:
+            yield vectors
+        finally:
+            release(vectors.b, vectors.lower, vectors.x, vectors.residual)
+
+    @property
+    def held(self) -> npt.NDArray[np.int32]:
+        """Local dofs on Γ0, or on which a_h(1, ·) does not vanish; collective."""
+        of_constants = self._data.of_constants()
+        if of_constants is None:
+            return self.dirichlet
+        layout = Layout.of_space(self._data.V)
+        of_constants[self.dirichlet] = 1.0
+        return np.flatnonzero(layout.shared_sum(of_constants) > 0.0).astype(np.int32)
+
+    def _bc(self, values: fem.Function) -> fem.DirichletBC:
+        """Values on Γ0, where all unknowns of a node are set."""
+        block = values.function_space.dofmap.index_map_bs
+        return fem.dirichletbc(values, np.unique(self.dirichlet // block))
+
+    def _read_contact(self, bounds: Sequence[Imposed]) -> None:
+        """Note what the owned facets of Γ1 have, in ascending order."""
+        V = self._data.V
+        facets = np.concatenate([each.facets for each in bounds])
+        dofs = [unknowns(V, each.facets, each.components) for each in bounds]
+        order = np.argsort(facets)
+        topology = V.mesh.topology
+        order = order[facets[order] < topology.index_map(topology.dim - 1).size_local]
+        self.bounded_facets = facets[order]
+        self.contact_dofs = np.concatenate([each[:, :, 0] for each in dofs])[order]
+        self.obstacle_at_vertices = np.concatenate([each.ends[:, :, 0] for each in bounds])[order]
 
     def row_sums(self) -> FloatArray:
-        """Sum up the owned rows of A: 0 where no neighbour is on Γ0, whose columns A is without."""
+        """Sum up the owned rows of A: a_h(1, ·) but where a neighbour is on Γ0."""
         ones, sums = (fem.Function(self.u_D.function_space) for _ in range(2))
         ones.x.array[:] = 1.0
-        bc = fem.dirichletbc(ones, self.dirichlet)
-        fem.apply_lifting(sums.x.array, [self._a], [[bc]])
-        sums.x.scatter_reverse(InsertMode.add)
+        fem.apply_lifting(sums.x.array, [self._data.a], [[self._bc(ones)]])
+        if (of_constants := self._data.of_constants()) is not None:
+            sums.x.array[:] += of_constants
+        Layout.of_space(sums.function_space).shared_sum(sums.x.array)
         sums.x.array[self.dirichlet] = 1.0
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
@@ -146,38 +210,30 @@ class System:
         return norm
 
 
-def _boundary_values(
-    forms: Forms, domain: Domain, V: fem.FunctionSpace, part: int
-) -> tuple[npt.NDArray[np.bool_], fem.Function, FloatArray]:
-    """Data on one boundary part as the element takes them: CR facet means, P1 values at vertices.
+def _imposed(
+    imposed: Sequence[Imposed], V: fem.FunctionSpace
+) -> tuple[npt.NDArray[np.bool_], fem.Function]:
+    """Data on the boundary as the element takes them: CR facet means, P1 values at vertices.
 
     Returns:
-        Which dofs lie on the part, a Function with the values there, and the values at the
-        facets' vertices, shape (n, d).
+        Which dofs have some, and a Function with the values there.
     """
-    facets = domain.facets(part)
-    sampled = Sampled.of(forms)
-    if part == DIRICHLET:
-        key, trace = "dirichlet", sampled.u_D
-    else:
-        key, trace = "obstacle", sampled.alpha
-    at_vertices, _, inside = trace.at(domain.mesh, facet_entities(domain.mesh, facets))
-    at_vertices, means = at_vertices.T, trace.weights @ inside
-    dofs = closure_dofs(V, facets)
-    # Π_h K ⊂ K_h holds with facet means for any α and u_D
-    of_dofs = means[:, None] if dofs.shape[1] == 1 else at_vertices
-    # before the maximum over the ranks, which a NaN may lose
-    _require_finite(V.mesh.comm, key, of_dofs)
     values = fem.Function(V)
     on_part = np.zeros_like(values.x.array)
     values.x.array[:] = PETSc.NINFINITY
-    values.x.array[dofs] = of_dofs
-    on_part[dofs] = 1.0
+    for data in imposed:
+        dofs = unknowns(V, data.facets, data.components)
+        # Π_h K ⊂ K_h holds with facet means for any α and u_D
+        of_dofs = data.means[:, None] if dofs.shape[1] == 1 else data.ends
+        # before the maximum over the ranks, which a NaN may lose
+        _require_finite(V.mesh.comm, data.key, of_dofs)
+        np.maximum.at(values.x.array, dofs, of_dofs)
+        on_part[dofs] = 1.0
     # A rank may own a dof of the part without owning any of its facets
     for array in (values.x.array, on_part):
         shared_maximum(V, array)
     values.x.array[on_part == 0.0] = 0.0
-    return on_part > 0.0, values, at_vertices
+    return on_part > 0.0, values
 
 
 def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:

@@ -1,0 +1,128 @@
+"""Every key of a problem file, told once: what may be there, and what the reference says of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from .formula import CONSTANTS, FUNCTIONS, VARIABLES
+
+
+class Key(NamedTuple):
+    """One key.
+
+    Attributes:
+        section: Where it belongs; "" for the top of the file.
+        name: What it is called.
+        value: What belongs there.
+        default: What it means to leave it out; "" where it is needed.
+        about: What it does.
+        example: A line of TOML.
+    """
+
+    section: str
+    name: str
+    value: str
+    default: str
+    about: str
+    example: str
+
+
+EXPRESSION = "an expression or a number"
+
+KEYS = (
+    Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
+        'title = "S1"'),
+    Key("domain", "vertices", "a list of points [x, y]", "", "The corners of a simple polygon, in "
+        "either orientation. Needed, unless there is a `mesh`.",
+        "vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]"),
+    Key("domain", "boundary", 'a list of "contact", "dirichlet" or "neumann"', "",
+        "What each edge is; edge i runs from vertex i to the next. One of them is to be contact, "
+        "one dirichlet.",
+        'boundary = ["contact", "dirichlet", "neumann", "dirichlet"]'),
+    Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh, no "
+        "longer than the domain.", "size = 0.25"),
+    Key("domain", "holes", "a list of { vertices, boundary }", "no holes", "Polygons inside the "
+        "polygon and apart from one another, with labels of their own.",
+        'holes = [{ vertices = [[0.2, 0.4], [0.5, 0.4], [0.3, 0.7]], '
+        'boundary = ["neumann", "neumann", "neumann"] }]'),
+    Key("domain", "mesh", "the path of a .msh file, relative to this one", "", "A gmsh file, 2.2 "
+        "or 4.1, in the place of the polygon; physical curves named contact, dirichlet and neumann "
+        "are the parts of its boundary.", 'mesh = "signorini.msh"'),
+    Key("data", "f", EXPRESSION, "0, or derived from `exact.u`", "The load.", 'f = "-3 + x*y"'),
+    Key("data", "g", EXPRESSION, "0, or derived from `exact.u`", "The flux κ∂ₙu on neumann edges.",
+        'g = "where(y > 0.5, 1, 0)"'),
+    Key("data", "obstacle", EXPRESSION, "0", "α: u stays above it on contact edges.",
+        'obstacle = "0.1*sin(2*pi*x) - 0.25"'),
+    Key("data", "dirichlet", EXPRESSION, "0, or derived from `exact.u`",
+        "u_D: the value of u on dirichlet edges. It is to be continuous, and not below the "
+        "obstacle where the two parts meet.", 'dirichlet = "0.2*y"'),
+    Key("data", "coefficient", EXPRESSION, "1", "κ, above 0 everywhere. It may jump.",
+        'coefficient = "where(x < 0, 1, 100)"'),
+    Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "
+        "are then computed, and f, g and dirichlet, where left out, are derived from it.",
+        'u = "x**2 - y**2"'),
+    Key("refine", "mode", '"uniform" or "adaptive"', '"uniform"', "Every triangle into four; or "
+        "where the error sits.", 'mode = "adaptive"'),
+    Key("refine", "levels", "a whole number above 0", "1; if adaptive, as many as it takes",
+        "Number of meshes, the coarsest included.", "levels = 5"),
+    Key("refine", "tolerance", "a number, 0 or above", "0", "Adaptive: stop when the certified "
+        "bound of ‖∇(u − u_h)‖ is below it.", "tolerance = 0.05"),
+    Key("refine", "max_dofs", "a whole number above 0", "1000000", "Adaptive: stop before a mesh "
+        "with more degrees of freedom.", "max_dofs = 200000"),
+)  # fmt: skip
+
+ABOUT = {
+    "": "At the top of the file, before all sections.",
+    "domain": "A polygon, or a mesh. Needed.",
+    "define": "Helper names, usable in what follows and in [data] and [exact], in this order.",
+    "data": "What is left out is 0. An expression stands between quotes.",
+    "exact": "Optional.",
+    "refine": "Optional.",
+}
+"""The sections, and what is said of each."""
+
+SECTIONS = tuple(name for name in ABOUT if name)
+
+
+def allowed(section: str) -> tuple[str, ...]:
+    """The keys that may be in a section."""
+    return tuple(key.name for key in KEYS if key.section == section)
+
+
+def page() -> str:
+    """The reference of the problem file, in Markdown."""
+    lines = [
+        "# The problem file",
+        "",
+        "TOML in UTF-8. A key that is not listed here, a value of another kind, and data that make "
+        "no sense are refused with the key, what was found and what is allowed; `signorini-cr "
+        "check FILE` does that without solving.",
+        "",
+    ]
+    for section, about in ABOUT.items():
+        lines += [f"## [{section}]" if section else "## Title", "", about, ""]
+        if section == "define":
+            example = ["[define]", 'r = "sqrt(x**2 + y**2)"', 'w = "r**1.5*cos(1.5*atan2(y, x))"']
+            lines += ["```toml", *example, "```", ""]
+            continue
+        lines += ["| key | value | if left out | |", "|---|---|---|---|"]
+        keys = [key for key in KEYS if key.section == section]
+        lines += [f"| `{k.name}` | {k.value} | {k.default} | {k.about} |" for k in keys]
+        lines += ["", "```toml", *([f"[{section}]"] if section else [])]
+        lines += [("# or: " if key.name == "mesh" else "") + key.example for key in keys]
+        lines += ["```", ""]
+    names = ", ".join(f"`{name}`" for name in FUNCTIONS)
+    variables = ", ".join(f"`{name}`" for name in (*VARIABLES, *CONSTANTS))
+    lines += [
+        "## Expressions",
+        "",
+        f"Numbers, {variables}, names from [define]; `+ - * / **` and parentheses; comparisons "
+        "`< <= > >= == !=`, and, or, not; and the functions "
+        f"{names}. `where(condition, a, b)` is a where the condition holds and b elsewhere; min "
+        "and max take two or more. Angles are in radians. Expressions are parsed, never run as "
+        "Python.",
+        "",
+        "*This page is made by `./container/run python3 docs/reference.py` from the table that the "
+        "program reads files by.*",
+    ]
+    return "\n".join(lines) + "\n"

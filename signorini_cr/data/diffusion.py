@@ -1,0 +1,144 @@
+"""The problem on one mesh: its data, each sampled once, for the system and for the certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from .. import compat
+from ..fem.cells import Cells
+from ..fem.conditions import Condition
+from ..fem.physics import Imposed, OnMesh
+from ..fem.problem import Kernel
+from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
+from ..mesh.domain import Domain
+from .loads import Edge, Load, chi
+from .moments import Compiled, OnFacets
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+class DiffusionOnMesh:
+    """A problem's data on one mesh, each sampled when first asked for, and kept.
+
+    Attributes:
+        compiled: The data, whatever the mesh.
+        forms: Their forms.
+        domain: Mesh and boundary parts.
+        V: The discrete space.
+    """
+
+    def __init__(self, compiled: Compiled, domain: Domain):
+        """Make the space; collective."""
+        self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
+        self.forms.insist_on_mesh(domain.mesh)
+        self.V = function_space(domain.mesh, self.forms.element)
+
+    @cached_property
+    def cells(self) -> Cells:
+        """The mesh as arrays, for the Crouzeix-Raviart element."""
+        return Cells(self.domain, self.V, [condition.number for condition in self.forms.fixed])
+
+    @cached_property
+    def load(self) -> Load:
+        """Moments of f."""
+        return Load.of(self.compiled.f, self.cells)
+
+    @cached_property
+    def edges(self) -> tuple[Edge, ...]:
+        """Moments of the fluxes that are known, one for each condition."""
+        sampled = self._sampled(self.forms.natural, lambda condition: condition.flux)
+        return tuple(Edge(on_facets, self.cells) for on_facets in sampled)
+
+    @cached_property
+    def u_D(self) -> tuple[OnFacets, ...]:
+        """What u is set to on Γ0, one for each condition."""
+        return self._sampled(self.forms.fixed, lambda condition: condition.fixed)
+
+    @cached_property
+    def alpha(self) -> tuple[OnFacets, ...]:
+        """What u must not be below on Γ1, one for each condition."""
+        return self._sampled(self.forms.bounded, lambda condition: condition.lower)
+
+    # what the system asks for
+
+    @cached_property
+    def a(self) -> fem.Form:
+        """a_h."""
+        return self.forms.a.on(self.domain, [self.V, self.V])
+
+    @property
+    def fixed(self) -> tuple[Imposed, ...]:
+        """u_D on Γ0."""
+        return tuple(on_facets.imposed for on_facets in self.u_D)
+
+    @property
+    def lower(self) -> tuple[Imposed, ...]:
+        """α on Γ1."""
+        return tuple(on_facets.imposed for on_facets in self.alpha)
+
+    def chi(self) -> FloatArray:
+        """χ (1.10) by dof, this rank's cells' share."""
+        if self.forms.element == "CR" and self.forms.loaded:
+            return chi(self.load, self.edges, self.cells)
+        return self._assembled(self.forms.chi)
+
+    def of_constants(self) -> FloatArray | None:
+        """a_h(1, ·) by dof, this rank's cells' share; None where it vanishes."""
+        return None if self.forms.of_one is None else self._assembled(self.forms.of_one)
+
+    def conforming(self, cells: IntArray, index_map: Any) -> tuple[fem.Form, float]:
+        """Return a form whose matrix, times a number, is the P1 operator on this mesh.
+
+        The function of CR that belongs to the facet opposite vertex i has −d times the gradient of
+        the hat function at i. So where nothing but gradients counts the kernel of a_h in CR, at
+        work on the dofs of P1, makes d² times the matrix of P1: no form is compiled.
+        """
+        mesh, forms = self.domain.mesh, self.forms
+        if forms.of_one is None:
+            W = compat.with_dofs(self.V, cells, index_map)
+            return forms.a.on(self.domain, [W, W]), 1.0 / mesh.topology.dim**2
+        W = compat.with_dofs(function_space(mesh, "P1"), cells, index_map)
+        return forms.a_p1.on(self.domain, [W, W]), 1.0
+
+    def at_vertices(self, u: fem.Function, facets: IntArray) -> FloatArray:
+        """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
+        mesh = self.domain.mesh
+        cells, local = facet_entities(mesh, facets).T
+        return np.take_along_axis(vertex_values(u, cells), facet_corners(mesh)[local], axis=1)
+
+    def energy(self, u: fem.Function) -> float:
+        """a_h(u, u), this rank's cells' share."""
+        return float(fem.assemble_scalar(self.forms.a_of_w.on(self.domain, (), [u])))
+
+    def _assembled(self, kernel: Kernel | None) -> FloatArray:
+        nodes, block = self.V.dofmap.index_map, self.V.dofmap.index_map_bs
+        values: FloatArray = np.zeros(block * (nodes.size_local + nodes.num_ghosts))
+        if kernel is not None:
+            fem.assemble_vector(values, kernel.on(self.domain, [self.V]))
+        return values
+
+    def tidy(self) -> None:
+        """Drop what only solution and certificate needed; it is made again if asked for."""
+        for name in ("cells", "load", "edges"):
+            self.__dict__.pop(name, None)
+
+    def _sampled(
+        self, conditions: tuple[Condition, ...], datum: Callable[[Condition], object]
+    ) -> tuple[OnFacets, ...]:
+        return tuple(
+            OnFacets.of(condition, self.compiled.trace(datum(condition)), self.domain)
+            for condition in conditions
+        )
+
+
+def diffusion(data: OnMesh) -> DiffusionOnMesh:
+    """Narrow to the physics that the certificate is proved for."""
+    assert isinstance(data, DiffusionOnMesh)
+    return data

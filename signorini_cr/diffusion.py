@@ -1,0 +1,39 @@
+"""The physics of the paper: −∇·(κ∇u) = f, a scalar with contact from below."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from .data.admissible import check_data
+from .data.diffusion import DiffusionOnMesh
+from .data.moments import Compiled
+from .estimate.certificate import Certificate, certify
+from .fem.problem import Forms
+from .mesh.domain import Domain
+from .vi.solved import Solved
+
+
+class Diffusion(Forms):
+    """The forms of a problem, its data, and the certificate; a `Physics`."""
+
+    @cached_property
+    def compiled(self) -> Compiled:
+        """The data, ready for any mesh."""
+        return Compiled(self)
+
+    @property
+    def galerkin(self) -> bool:
+        """Whether quadrature sees the same on all meshes: κ is a number, and nothing is added."""
+        return self.uniform and self.of_one is None
+
+    def check(self, domain: Domain) -> None:
+        """Refuse data for which there is no solution; collective."""
+        check_data(self, domain)
+
+    def on(self, domain: Domain) -> DiffusionOnMesh:
+        """Take it to a mesh; collective."""
+        return DiffusionOnMesh(self.compiled, domain)
+
+    def certify(self, solution: Solved) -> Certificate:
+        """Bound the error of a solution, or say why that can't be done; collective."""
+        return certify(solution)

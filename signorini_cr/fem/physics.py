@@ -1,0 +1,119 @@
+"""The seam that a physics stands behind.
+
+Meshes, multigrid and the active set method know of nodes, of how many unknowns each has, of
+matrices, and of which unknowns are set or bounded. A node is a facet, or a vertex of the P1 spaces
+on coarse meshes; all nodes of a space have the same number of unknowns, its block size, and unknown
+c of node i has the number ``block * i + c``. Everything else is a physics': the space, a_h, χ, what
+is set and bounded, the P1 operator of coarse meshes, and the certificate. A physics whose bounds
+are on a combination of a facet's unknowns chooses that combination as one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from ..mesh.domain import Domain
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Imposed:
+    """What a condition asks of unknowns on its part of the boundary.
+
+    Attributes:
+        key: The data's name, for messages.
+        facets: Local indices of the part's facets, ghosts included, shape (n,).
+        components: Which unknowns of a facet it is about, shape (c,).
+        means: Their values' means over the facets, shape (n, c).
+        ends: Their values at the vertices, shape (n, d, c).
+    """
+
+    key: str
+    facets: IntArray
+    components: IntArray
+    means: FloatArray
+    ends: FloatArray
+
+
+class OnMesh(Protocol):
+    """A physics on one mesh, with its data, each sampled once."""
+
+    @property
+    def domain(self) -> Domain:
+        """Mesh and boundary parts."""
+
+    @property
+    def V(self) -> fem.FunctionSpace:
+        """The discrete space: CR, or P1, with a block of unknowns at each node."""
+
+    @property
+    def a(self) -> fem.Form:
+        """a_h."""
+
+    @property
+    def fixed(self) -> tuple[Imposed, ...]:
+        """What is set on Γ0: all unknowns of a facet."""
+
+    @property
+    def lower(self) -> tuple[Imposed, ...]:
+        """Lower bounds on Γ1: of one unknown a facet."""
+
+    def chi(self) -> FloatArray:
+        """χ by unknown, this rank's cells' share, ghosts included."""
+
+    def of_constants(self) -> FloatArray | None:
+        """a_h(1, ·) by unknown, this rank's cells' share; None where it vanishes."""
+
+    def conforming(self, cells: IntArray, index_map: Any) -> tuple[fem.Form, float]:
+        """Return a form whose matrix, times a number, is the P1 operator on this mesh.
+
+        Args:
+            cells: The vertices' nodes in each local cell, shape (cells, d + 1).
+            index_map: How the ranks share these nodes.
+        """
+
+    def at_vertices(self, u: fem.Function, facets: IntArray) -> FloatArray:
+        """Values of what is bounded at the vertices of contact facets, shape (n, d)."""
+
+    def energy(self, u: fem.Function) -> float:
+        """a_h(u, u), this rank's cells' share."""
+
+    def tidy(self) -> None:
+        """Drop what only solution and certificate needed."""
+
+
+class Physics(Protocol):
+    """What makes the physics; one object for all meshes of a sequence.
+
+    Attributes:
+        element: "CR" or "P1".
+        problem: The user's data.
+        exact: The exact solution, None if it isn't known.
+    """
+
+    element: str
+    problem: Any
+    exact: Any
+
+    @property
+    def galerkin(self) -> bool:
+        """Whether P1 operators are sure to be the Galerkin products of finer meshes' operators."""
+
+    def check(self, domain: Domain) -> None:
+        """Refuse data for which there is no solution; collective."""
+
+    def on(self, domain: Domain) -> OnMesh:
+        """Take it to a mesh."""
+
+    def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:
+        """‖u − w‖_h and ‖u − w‖ in L2, where u is known; collective."""
+
+    def certify(self, solution: Any) -> Any:
+        """Bound the error of a solution, or say why that can't be done; collective."""

@@ -1,0 +1,210 @@
+"""Formulas in a normal form, in which what cancels has gone.
+
+Differentiation finds −Δ(r^{3/2} cos(3θ/2)) as a sum of terms like r^{-5/2} x² cos(3θ/2), and says
+nothing of its being 0. Here a formula becomes a sum of products of powers of atoms: of the
+coordinates, of sums that are divided by or of which a root is taken, and of all that is not
+arithmetic. Numbers are fractions and exact. A sum P = … + c y² that is an atom lets y² be replaced
+by (P − …)/c everywhere, so that x² + y² is the one power r². The same formula comes out whatever
+the order of terms, and 0 where those relations make it 0.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, TypeAlias
+
+import ufl
+from ufl import classes
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
+from ufl.algorithms.expand_indices import expand_indices
+from ufl.corealg.traversal import unique_pre_traversal
+
+Monomial: TypeAlias = tuple[tuple[int, Fraction], ...]
+"""Atoms by number, in order, with their exponents."""
+Polynomial: TypeAlias = dict[Monomial, Fraction]
+
+MOST = 200
+"""Terms; with more of them a formula is left as it is."""
+WHOLE = 8
+"""Up to this power sums are multiplied out."""
+SIMPLE = 64
+"""Numbers that are a fraction with such a denominator, but for rounding, are taken for it."""
+
+
+class _TooLong(Exception):
+    """A sum of too many terms."""
+
+
+def simplified(expression: Any) -> Any:
+    """Carry out derivatives, and let terms cancel where this makes the formula shorter.
+
+    Args:
+        expression: A scalar.
+    """
+    plain = expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
+    reader = _Reader()
+    try:
+        reader.read(plain)  # finds the sums that are atoms
+        reader.known.clear()
+        found = reader.formula(reader.read(plain))
+    except (_TooLong, OverflowError):
+        return expression
+    return found if _size(found) < _size(plain) else expression
+
+
+def _size(expression: Any) -> int:
+    return sum(1 for _ in unique_pre_traversal(expression))
+
+
+def _fraction(value: float) -> Fraction:
+    """The number, or the simple fraction of which it is the rounded value."""
+    exact = Fraction(value)
+    simple = exact.limit_denominator(SIMPLE)
+    return simple if abs(simple - exact) <= 3e-16 * max(1.0, abs(value)) else exact
+
+
+class _Reader:
+    """Formulas as polynomials in atoms, which are numbered as they come.
+
+    Attributes:
+        known: What has been read.
+    """
+
+    def __init__(self) -> None:
+        self.known: dict[Any, Polynomial] = {}
+        self._atoms: list[Any] = []
+        self._places: dict[Any, int] = {}
+        self._squares: dict[int, Polynomial] = {}  # by atom
+        self._positive: set[int] = set()
+
+    def read(self, e: Any) -> Polynomial:
+        """The normal form."""
+        if e not in self.known:
+            self.known[e] = self._read(e)
+            if len(self.known[e]) > MOST:
+                raise _TooLong
+        return self.known[e]
+
+    def _read(self, e: Any) -> Polynomial:
+        if isinstance(e, classes.Zero):
+            return {}
+        if isinstance(e, classes.ScalarValue):
+            return {(): _fraction(float(e))}
+        operands: Any = getattr(e, "ufl_operands", ())
+        if isinstance(e, classes.Sum):
+            return _sum(*(self.read(operand) for operand in operands))
+        if isinstance(e, classes.Product):
+            return self._product(*(self.read(operand) for operand in operands))
+        if isinstance(e, classes.Division):
+            return self._product(self.read(operands[0]), self._power(operands[1], Fraction(-1)))
+        if isinstance(e, classes.Sqrt):
+            return self._power(operands[0], Fraction(1, 2))
+        if isinstance(e, classes.Power) and isinstance(operands[1], classes.ScalarValue):
+            return self._power(operands[0], _fraction(float(operands[1])))
+        return self._atom(self._key(e, operands), e)
+
+    def _key(self, e: Any, operands: Any) -> Any:
+        """What makes a function of normal forms the same as another one."""
+        if not operands or any(
+            operand.ufl_shape != () or isinstance(operand, classes.Condition)
+            for operand in operands
+        ):
+            return e
+        return type(e), tuple(frozenset(self.read(operand).items()) for operand in operands)
+
+    def _atom(self, key: Any, e: Any, power: Fraction = Fraction(1)) -> Polynomial:
+        if key not in self._places:
+            self._places[key] = len(self._atoms)
+            self._atoms.append(e)
+        return {((self._places[key], power),): Fraction(1)}
+
+    def _power(self, base: Any, p: Fraction) -> Polynomial:
+        terms = self.read(base)
+        if p.denominator == 1 and 0 <= p <= WHOLE:
+            found: Polynomial = {(): Fraction(1)}
+            for _ in range(int(p)):
+                found = self._product(found, terms)
+            return found
+        if len(terms) == 1:
+            ((monomial, factor),) = terms.items()
+            if p.denominator == 1:
+                return {tuple((i, k * p) for i, k in monomial): factor ** int(p)}
+            # a root of P is there only where P ≥ 0, and so is a root of it
+            roots = all(i in self._positive or k.denominator > 1 for i, k in monomial)
+            if factor == 1 and (roots or (len(monomial) == 1 and monomial[0][1] == 1)):
+                return {tuple((i, k * p) for i, k in monomial): Fraction(1)}
+        key = frozenset(terms.items())
+        found = self._atom(key, base, p)
+        self._note(self._places[key], terms)
+        return found
+
+    def _note(self, place: int, terms: Polynomial) -> None:
+        """Learn from a sum that is an atom: its sign, and a square that it may replace."""
+        even = all(k.denominator == 1 and k % 2 == 0 for monomial in terms for _, k in monomial)
+        if even and all(factor > 0 for factor in terms.values()):
+            self._positive.add(place)
+        squares = [
+            monomial[0][0]
+            for monomial in terms
+            if len(monomial) == 1
+            and monomial[0][1] == 2
+            and isinstance(self._atoms[monomial[0][0]], classes.Indexed)
+            and not any(
+                monomial[0][0] == i for other in terms if other != monomial for i, _ in other
+            )
+        ]
+        if squares and max(squares) not in self._squares:
+            square = max(squares)
+            factor = terms[((square, Fraction(2)),)]
+            rest = {m: -c / factor for m, c in terms.items() if m != ((square, Fraction(2)),)}
+            self._squares[square] = rest | {((place, Fraction(1)),): 1 / factor}
+
+    def _product(self, a: Polynomial, b: Polynomial) -> Polynomial:
+        found: Polynomial = {}
+        if len(a) * len(b) > MOST**2:
+            raise _TooLong
+        for (m, x), (n, y) in ((s, t) for s in a.items() for t in b.items()):
+            exponents = dict(m)
+            for i, k in n:
+                exponents[i] = exponents.get(i, Fraction(0)) + k
+            monomial = tuple(sorted((i, k) for i, k in exponents.items() if k))
+            found[monomial] = found.get(monomial, Fraction(0)) + x * y
+        return self._reduced({m: c for m, c in found.items() if c})
+
+    def _reduced(self, terms: Polynomial) -> Polynomial:
+        """Without the squares that a sum replaces."""
+        for monomial in terms:
+            for i, k in monomial:
+                if i in self._squares and k >= 2 and k.denominator == 1:
+                    left = tuple((j, e - 2 * (j == i)) for j, e in monomial)
+                    left = tuple((j, e) for j, e in left if e)
+                    more = self._product({left: terms[monomial]}, self._squares[i])
+                    return self._reduced(
+                        _sum({m: c for m, c in terms.items() if m != monomial}, more)
+                    )
+        return terms
+
+    def formula(self, terms: Polynomial) -> Any:
+        """The expression of a normal form."""
+        total = ufl.as_ufl(0.0)
+        for monomial in sorted(terms):
+            term = ufl.as_ufl(float(terms[monomial]))
+            for i, k in monomial:
+                atom = self._atoms[i]
+                if k == Fraction(1, 2):
+                    atom = ufl.sqrt(atom)
+                elif k != 1:
+                    atom = atom ** (int(k) if k.denominator == 1 else float(k))
+                term = term * atom
+            total = total + term
+        return total
+
+
+def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
+    found = dict(a)
+    for monomial, factor in b.items():
+        found[monomial] = found.get(monomial, Fraction(0)) + factor
+        if not found[monomial]:
+            del found[monomial]
+    return found

@@ -1,0 +1,159 @@
+"""A matrix that dofs can be taken out of for a while, in place.
+
+The reduced systems of the active set method leave dofs out. Extracting them costs as much as a
+dozen products with the matrix, a copy that has the identity in their rows and columns costs its
+memory. Only dofs with a bound can ever be constrained, and they are few: their rows and columns are
+kept here, and the matrix itself is changed for the length of a `with` block. Each rank writes its
+own rows and says nothing to the others when it puts them back, so that the matrix is whole after
+the block whatever fails in it, and on whichever rank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+from petsc4py import PETSc
+
+from ..garbage import release
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+def rows_of(
+    A: PETSc.Mat, numbers: npt.NDArray[np.integer]
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Some rows of A, which may be those of other ranks; collective.
+
+    PETSc has submatrices on several ranks, too, but they take a time that grows with A.
+
+    Args:
+        A: The matrix.
+        numbers: Global numbers of the rows.
+
+    Returns:
+        The rows in CSR format: where each begins, global columns, values.
+    """
+    rows = PETSc.IS().createGeneral(numbers.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+    columns = PETSc.IS().createStride(A.getSize()[1], 0, 1, PETSc.COMM_SELF)
+    (matrix,) = A.createSubMatrices(rows, columns)
+    csr: tuple[IntArray, IntArray, FloatArray] = matrix.getValuesCSR()
+    release(rows, columns, matrix)
+    return csr
+
+
+def numbers_of(A: PETSc.Mat, dofs: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """Global numbers of owned rows of A, in integers that hold them."""
+    numbers: npt.NDArray[np.integer] = dofs.astype(PETSc.IntType) + A.getOwnershipRange()[0]
+    return numbers
+
+
+class ConstrainedMatrix:
+    """A symmetric matrix A that can have the identity in the rows and columns of some dofs.
+
+    Attributes:
+        matrix: A, whole outside the blocks of `constrained`.
+        dofs: Owned dofs that can be constrained, local numbers, ascending, shape (n,).
+        diagonal: Their diagonal entries of A, shape (n,).
+    """
+
+    def __init__(self, A: PETSc.Mat, dofs: IntArray):
+        """Note the rows and columns of all dofs that may ever be constrained; collective."""
+        self.matrix, self.dofs = A, dofs
+        numbers = numbers_of(A, dofs)
+        csr = start, column, value = rows_of(A, numbers)
+        self.diagonal: FloatArray = value[column == np.repeat(numbers, np.diff(start))]
+        sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
+        self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)
+        self._product = self._rows.createVecLeft()
+        # All own rows with an entry in such a column, as the pattern is symmetric
+        near = self._marks(column)
+        near_numbers = numbers_of(A, np.flatnonzero(near))
+        start, column, value = rows_of(A, near_numbers)
+        row = np.repeat(near_numbers, np.diff(start))
+        columns, place = np.unique(column, return_inverse=True)
+        theirs = PETSc.IS().createGeneral(columns.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+        everything, self._at_columns = A.createVecRight(), PETSc.Vec().createSeq(len(columns))
+        self._to_columns = PETSc.Scatter().create(everything, theirs, self._at_columns, None)
+        everything.array[dofs] = 1.0
+        kept = np.isin(row, numbers) | self._seen(everything)[place]
+        release(theirs, everything)
+        self._row, self._column, self._value = row[kept], column[kept], value[kept]
+        self._place = place[kept]
+        # The pattern is not to change, or ranks would have to talk whenever values do
+        A.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
+
+    @contextmanager
+    def constrained(self, dofs: IntArray) -> Iterator[IntArray]:
+        """Have the identity in the rows and columns of some dofs for a block; collective at entry.
+
+        Args:
+            dofs: Owned dofs, local numbers. Others than `dofs` are left alone: a space may meet Γ0
+                where the finer one's bounds end, and far from the origin rounding reaches more.
+
+        Yields:
+            Those that are constrained, ascending.
+        """
+        chosen = self.dofs[np.isin(self.dofs, dofs)]
+        marks = self.matrix.createVecRight()
+        marks.array[chosen] = 1.0
+        of_column = self._seen(marks)[self._place]
+        of_row = marks.array_r[self._row - self.matrix.getOwnershipRange()[0]] > 0.0
+        release(marks)
+        which = np.flatnonzero(of_row | of_column)
+        if not self.matrix.getComm().tompi4py().allreduce(len(chosen)):
+            yield chosen
+            return
+        try:
+            self._write(which, (self._row == self._column)[which].astype(np.float64))
+            yield chosen
+        finally:
+            self._write(which, self._value[which])
+
+    def times(self, x: PETSc.Vec) -> FloatArray:
+        """A x in the dofs that can be constrained, shape (n,), whether or not they are."""
+        self._rows.mult(x, self._product)
+        return self._product.array_r.copy()
+
+    def magnitude(self, x: PETSc.Vec) -> FloatArray:
+        """|A| |x| in the dofs that can be constrained, shape (n,): what a row of A x is made of."""
+        rows, sizes = self._rows.duplicate(copy=True), x.duplicate()
+        start, column, value = rows.getValuesCSR()
+        rows.setValuesCSR(start, column, np.abs(value))
+        rows.assemble()
+        sizes.array[:] = np.abs(x.array_r)
+        rows.mult(sizes, self._product)
+        release(rows, sizes)
+        return self._product.array_r.copy()
+
+    def free(self) -> None:  # "destroy" is what PETSc calls a context with
+        """Free everything but the matrix."""
+        release(self._rows, self._product, self._at_columns, self._to_columns)
+
+    def _marks(self, numbers: IntArray) -> npt.NDArray[np.bool_]:
+        """Which owned dofs any rank names by their global numbers; collective."""
+        marks = self.matrix.createVecRight()
+        add = PETSc.InsertMode.ADD_VALUES
+        marks.setValues(numbers.astype(PETSc.IntType, copy=False), np.ones(len(numbers)), add)
+        marks.assemble()
+        found: npt.NDArray[np.bool_] = marks.array_r > 0.0
+        release(marks)
+        return found
+
+    def _seen(self, marks: PETSc.Vec) -> npt.NDArray[np.bool_]:
+        """The marks of the dofs whose columns this rank has entries in; collective."""
+        self._to_columns.scatter(marks, self._at_columns)
+        seen: npt.NDArray[np.bool_] = self._at_columns.array_r > 0.0
+        return seen
+
+    def _write(self, which: npt.NDArray[np.intp], values: FloatArray) -> None:
+        """Write entries of own rows, which concerns no other rank as the pattern stays."""
+        start = np.arange(len(which) + 1, dtype=PETSc.IntType)
+        local = PETSc.Mat.Option.NO_OFF_PROC_ENTRIES
+        self.matrix.setOption(local, True)
+        self.matrix.setValuesIJV(start, self._column[which], values, rowmap=self._row[which])
+        self.matrix.assemble()
+        self.matrix.setOption(local, False)

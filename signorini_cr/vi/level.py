@@ -1,0 +1,84 @@
+"""One mesh and the variational inequality (1.8) that is assembled on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from dolfinx import fem
+from petsc4py import PETSc
+
+from ..errors import InputError
+from ..fem.physics import OnMesh, Physics
+from ..mesh.domain import Domain
+from ..multigrid.hierarchy import NestedMesh
+from ..multigrid.parents import Parents
+from .pieces import Loose
+from .system import System
+
+
+@dataclass(eq=False)
+class Level:
+    """One mesh with everything that is assembled on it.
+
+    Attributes:
+        meshes: The meshes up to this one, coarsest first.
+        held: Whether every piece of the domain is known to have a Dirichlet facet, which
+            refinement keeps.
+    """
+
+    meshes: tuple[NestedMesh, ...]
+    held: bool = False
+
+    def __post_init__(self) -> None:
+        """Insist on a PETSc of real numbers in double precision."""
+        if PETSc.ScalarType is not np.float64:
+            raise InputError(f"PETSc's numbers are {PETSc.ScalarType.__name__}; float64 is needed")
+
+    @property
+    def number(self) -> int:
+        """Position in the sequence, from 0."""
+        return len(self.meshes) - 1
+
+    @property
+    def physics(self) -> Physics:
+        """What is solved, shared by all levels."""
+        return self.meshes[-1].physics
+
+    @property
+    def domain(self) -> Domain:
+        """Mesh and boundary parts."""
+        return self.meshes[-1].domain
+
+    @property
+    def V(self) -> fem.FunctionSpace:
+        """The discrete space."""
+        return self.meshes[-1].V
+
+    @property
+    def parents(self) -> Parents | None:
+        """The cells of the mesh below that hold this one's."""
+        return self.meshes[-1].parents
+
+    @property
+    def data(self) -> OnMesh:
+        """The physics on this mesh."""
+        return self.meshes[-1].data
+
+    def tidy(self) -> None:
+        """Drop what only assembly and certificate needed; for the level's owner, a solution."""
+        self.data.tidy()
+
+    @cached_property
+    def system(self) -> System:
+        """The assembled variational inequality."""
+        return System(self.data)
+
+    @cached_property
+    def loose(self) -> Loose | None:
+        """Pieces without a Dirichlet facet, None if there are none."""
+        if self.held:
+            return None
+        found = Loose.of(self.V, self.system.held)
+        return found if found.count else None

@@ -1,0 +1,87 @@
+"""Loads derived from a solution: simpler, and the same numbers."""
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+from signorini_cr import exact, solve
+from signorini_cr.data.pointwise import evaluate
+from signorini_cr.fem.problem import Forms, Problem, number
+from signorini_cr.fem.simplified import simplified
+
+MESH = exact.S1.structured(1, MPI.COMM_SELF).mesh
+X = ufl.SpatialCoordinate(MESH)
+x, y = X
+r, theta = ufl.sqrt(x**2 + y**2), ufl.atan2(y, x)
+POINTS = np.random.default_rng(0).uniform(-0.9, 0.9, (200, 3))
+
+
+def minus_laplace(u):
+    return -ufl.div(ufl.grad(u))
+
+
+HARMONIC = {
+    "r^{3/2} cos": r**1.5 * ufl.cos(1.5 * theta),
+    "the same without r": (x**2 + y**2) ** 0.75 * ufl.cos(1.5 * (np.pi / 2 - ufl.atan2(x, y))),
+    "r^{2/3}, a number that is rounded": r ** (2 / 3) * ufl.sin(2 * theta / 3),
+    "around another point": ((x - 0.3) ** 2 + y**2) ** 0.25 * ufl.sin(0.5 * ufl.atan2(y, x - 0.3)),
+    "logarithm": ufl.ln(x**2 + y**2) + 3 * x * y,
+    "inversion": x / (x**2 + y**2),
+    "no root": ufl.exp(2 * x) * ufl.sin(2 * y),
+}
+
+
+@pytest.mark.parametrize("name", HARMONIC)
+def test_harmonic_functions_have_no_load(name):
+    assert number(simplified(minus_laplace(HARMONIC[name]))) == 0.0
+
+
+def test_nearly_harmonic_functions_have_one():
+    """2.25 r^{-1/2} (1 − s²/1.5²) cos(sθ) for another s: nothing is rounded away."""
+    for s in (1.5 + 1e-9, 1.25):
+        f = simplified(minus_laplace(r**1.5 * ufl.cos(s * theta)))
+        assert number(f) is None
+        radius, angle = np.hypot(*POINTS.T[:2]), np.arctan2(POINTS[:, 1], POINTS[:, 0])
+        known = (s**2 - 1.5**2) * radius**-0.5 * np.cos(s * angle)
+        assert np.allclose(evaluate(f, POINTS)[0], known, rtol=1e-6, atol=0)
+
+
+SAME = {
+    "S1": minus_laplace((1 - x**2) * (1 - y**2) * r**1.5 * ufl.cos(1.5 * theta)),
+    "coefficient": -ufl.div((1 + x**2) * ufl.grad(r**1.5 * ufl.cos(1.5 * theta))),
+    "root of a square": minus_laplace(x**3 * ufl.sqrt(x**2)),
+    "root of a sum squared": minus_laplace(((x + y) ** 2) ** 0.5 * (x + y) ** 2),
+    "root of a product": minus_laplace(x * y * ufl.sqrt(x**2 * y**2)),
+    "two centres": minus_laplace(r * ufl.sqrt((x - 1) ** 2 + y**2)),
+    "choice": minus_laplace(ufl.conditional(x > 0, x**3, y * x**3)),
+    "square of a root": minus_laplace((2 - x - y) ** 0.5 * (2 - x - y) / (3 + x)),
+    "power of x": minus_laplace(2.0 ** (x * y)),
+    "extremes": minus_laplace(ufl.max_value(x, 0.0) ** 3 * ufl.min_value(y, x) ** 3),
+    "negative sum": minus_laplace((x**2 - 2 * y**2) ** 2 / (x**2 - 2 * y**2)),
+}
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_values_stay_the_same(name):
+    values, bounds = evaluate(SAME[name], POINTS)
+    found = evaluate(simplified(SAME[name]), POINTS)
+    assert np.all(np.abs(found[0] - values) <= 100 * (bounds + found[1]) + 1e-14)
+
+
+def test_what_gets_longer_is_left_alone():
+    for f in (minus_laplace((1 + x + y + x * y) ** 8 * ufl.sin(x)), exact.I.problem.exact(X)):
+        assert simplified(f) is f
+
+
+def test_forms_with_derived_loads():
+    """A harmonic u needs no load; the bound for S1 is that of the load written down by hand."""
+    harmonic = Problem(exact=lambda x: exact.B.problem.exact(x))
+    assert number(Forms(harmonic, MESH).f) == 0.0
+    u = exact.S1.problem.exact
+    domain = exact.S1.structured(8)
+    by_hand, derived = (
+        solve(problem, domain).certificate.bound_h1
+        for problem in (exact.S1.problem, Problem(exact=u, dirichlet=0.0))
+    )
+    assert derived == pytest.approx(by_hand, rel=0.005)
