@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from dolfinx import jit
 
 from signorini_cr.output.files import STAGE, check_writable
 from signorini_cr.output.report import FILES
@@ -89,6 +90,21 @@ def ranks_of(pids: list[int]) -> list[int]:
     return found
 
 
+def own_cache(folder: Path) -> Path:
+    """A cache folder that has all forms compiled so far, and whose damage harms nobody."""
+    cache = folder / "cache"
+    if not cache.exists():
+        forms = Path(jit.get_options()["cache_dir"])
+        (cache / "fenics").mkdir(parents=True)
+        for path in forms.glob("libffcx_*"):
+            if (forms / (path.name.split(".")[0] + ".c.cached")).exists():
+                (cache / "fenics" / path.name).symlink_to(path)
+        for path in forms.parent.iterdir():  # fonts, for one, which take seconds to list
+            if path != forms:
+                (cache / path.name).symlink_to(path)
+    return cache
+
+
 def levels_in(out: Path) -> int:
     """How many levels the report has."""
     try:
@@ -112,6 +128,7 @@ def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
         (out / name).write_text("former")
     launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
     clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "PMI" not in k}
+    clean["XDG_CACHE_HOME"] = str(own_cache(folder))
     run = subprocess.Popen(
         [*launch, sys.executable, "-m", "signorini_cr", "solve", str(case), "--out", str(out)],
         stdout=subprocess.PIPE,
