@@ -30,19 +30,22 @@ study = Study("demo_adaptive", "Meshes that adapt, and stop when the error is ce
 # The limit for a quick look is that of the other demos: each level less is a factor of 4
 size = 4 ** (8 - levels_wanted(8))
 max_dofs = max(100_000 // size, 2_000)
+VISIBLE = 4_000  # degrees of freedom of a mesh whose cells can be told apart
 
 
 def show(solutions, title):
-    """Print one row a mesh, and keep degrees of freedom and bound of each."""
-    first, rows = None, []
+    """Print one row a mesh; keep all bounds, the last solution, and the last that can be seen."""
+    first, small, rows = None, None, []
     for solution in solutions:
         record = level_record(solution)
         first = first or record
         rows.append((solution.dofs, solution.certificate.bound_h1))
+        if solution.dofs <= VISIBLE:
+            small = solution
         if len(rows) == 1:
             study.tell(f"\n{title}\n{table_header(first)}")
         study.tell(table_row(record, first))
-    return np.array(rows), solution
+    return np.array(rows), solution, small
 
 
 # %% [markdown]
@@ -67,13 +70,13 @@ CASES = {
     "hole, two contact parts": (PRESS, lambda: HOLE.mesh(0.4)),
     "critical point": (exact.S1.problem, lambda: exact.S1.mesh(0.4)),
 }
-curves, finest = {}, {}
+curves, finest, small = {}, {}, {}
 for name, (problem, mesh) in CASES.items():
-    curves[name, "adaptive"], finest[name] = show(
+    curves[name, "adaptive"], finest[name], small[name] = show(
         solve_adaptive(problem, mesh(), max_dofs=max_dofs), f"{name}, adaptive"
     )
     levels = 1 + int(np.log(max_dofs / curves[name, "adaptive"][0, 0]) / np.log(4))
-    curves[name, "uniform"], _ = show(solve_levels(problem, mesh(), levels), f"{name}, uniform")
+    curves[name, "uniform"], *_ = show(solve_levels(problem, mesh(), levels), f"{name}, uniform")
 
 # %% [markdown]
 # ## Where the error sits
@@ -86,12 +89,9 @@ for name, solution in finest.items():
     file = "adaptive-" + name.split()[0].strip(",").lower()
     plots.plot_solution(solution, study.folder / f"{file}-solution.png", name)
     study.show(f"{file}-solution.png", f"{name}: the solution.")
-    # a mesh that can be seen
-    problem, mesh = CASES[name]
-    *_, small = solve_adaptive(problem, mesh(), max_dofs=min(4_000, max_dofs))
-    plots.plot_mesh(small.domain, study.folder / f"{file}-mesh.png", name)
+    plots.plot_mesh(small[name].domain, study.folder / f"{file}-mesh.png", name)
     study.show(f"{file}-mesh.png", f"{name}: a mesh that adapted.")
-    plot_error(small, study.folder / f"{file}-error.png", name)
+    plot_error(small[name], study.folder / f"{file}-error.png", name)
     study.show(f"{file}-error.png", f"{name}: where the error sits.")
 
 

@@ -20,7 +20,7 @@ from signorini_cr.output.errorplot import plot_error
     ],
 )
 def test_demo(demo, pictures, ranks, tmp_path):
-    result = run(ranks, DEMOS / demo, tmp_path, levels=4)
+    result = run(ranks, DEMOS / demo, tmp_path, levels=3)
     assert result.returncode == 0, result.stdout[-1000:] + result.stderr[-4000:]
     for name in pictures:
         assert is_picture(tmp_path / f"{name}.png")
