@@ -99,7 +99,7 @@ def own_cache(folder: Path) -> Path:
         for path in forms.glob("libffcx_*"):
             if (forms / (path.name.split(".")[0] + ".c.cached")).exists():
                 (cache / "fenics" / path.name).symlink_to(path)
-        for path in forms.parent.iterdir():  # fonts, for one, which take seconds to list
+        for path in forms.parent.glob("*"):  # fonts, for one, which take seconds to list
             if path != forms:
                 (cache / path.name).symlink_to(path)
     return cache
