@@ -2,18 +2,19 @@
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import kills
+import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from test_cli import process
 
+from signorini_cr import memory
 from signorini_cr.app import cli
 from signorini_cr.errors import InputError
 from signorini_cr.memory import ran_out_of_memory
@@ -81,7 +82,18 @@ def test_errors_that_mean_memory() -> None:
     wrapped = RuntimeError("in a callback")
     wrapped.__cause__ = MemoryError()
     assert ran_out_of_memory(wrapped)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 1000  # kB, as memory.py has it
+
+
+@pytest.mark.serial
+def test_memory_is_that_of_the_program_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that a large one starts has held no more than a small one has."""
+    program = "from signorini_cr.memory import most_memory; print(most_memory())"
+    ballast = np.ones(40_000_000)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert 1e7 < float(done.stdout) < ballast.nbytes
+    assert memory.most_memory() > ballast.nbytes
+    monkeypatch.setattr(Path, "read_text", lambda path: "")  # no such system
+    assert memory.most_memory() > ballast.nbytes
 
 
 def test_the_report_goes_first_and_comes_last(shared_tmp_path: Path, monkeypatch) -> None:
