@@ -4,7 +4,7 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify fuzz docs test test-alone test-pair ranks test-package test-wheels lint \
+.PHONY: demo studies verify fuzz docs quick test test-alone test-pair ranks test-package test-wheels lint \
     types clean purge
 
 demo:
@@ -28,6 +28,10 @@ fuzz:
 docs:
 	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
 
+# While one works: lint, types, and the tests that take next to no time
+quick: lint types
+	$(run) $(limit) python3 -m pytest -q -m 'not slow'
+
 test: test-alone test-pair
 
 test-alone:
@@ -37,12 +41,9 @@ test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
 
 # What depends on how a mesh is shared out, on more ranks than that.
-shared = $(addprefix tests/test_,contact.py hierarchy.py multigrid.py output.py pattern.py smoothing.py \
-    solver.py studies.py)
-
 ranks:
-	$(run) $(limit) mpirun -n 3 python3 -m pytest $(shared) -k 'not rates'
-	$(run) $(limit) mpirun -n 4 python3 -m pytest $(shared) -k 'not rates'
+	$(run) $(limit) mpirun -n 3 python3 -m pytest -m ranks -k 'not rates'
+	$(run) $(limit) mpirun -n 4 python3 -m pytest -m ranks -k 'not rates'
 
 # sdist and wheel, built, installed and tried: on the DOLFINx that is there, and on that of pip
 test-package:

@@ -23,6 +23,8 @@ from signorini_cr.fem.space import facet_measures
 from signorini_cr.mesh.domain import PARTS
 from signorini_cr.mesh.families import structured
 
+pytestmark = pytest.mark.slow
+
 WORLD = MPI.COMM_WORLD
 
 

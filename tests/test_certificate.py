@@ -29,6 +29,8 @@ from signorini_cr.fem.cells import Cells
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
 
+pytestmark = pytest.mark.slow
+
 WORLD = MPI.COMM_WORLD
 GOAL = 1.45
 """What the effectivity must stay below on uniform meshes."""

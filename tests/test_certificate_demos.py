@@ -6,6 +6,8 @@ from test_demos import DEMOS, is_picture, run
 from signorini_cr import InputError, exact, solve
 from signorini_cr.output.errorplot import plot_error
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [1, 2])

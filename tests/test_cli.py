@@ -17,6 +17,8 @@ from signorini_cr import levels
 from signorini_cr.app import cli, commandline
 from signorini_cr.errors import NotConverged
 
+pytestmark = pytest.mark.slow
+
 COMM = MPI.COMM_WORLD
 LINE = 'boundary = ["contact", "dirichlet", "dirichlet", "dirichlet"]'
 CASE = f"""title = "S1"

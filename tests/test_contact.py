@@ -8,6 +8,8 @@ from mpi4py import MPI
 
 from signorini_cr import Domain, Polygon, Problem, solve
 
+pytestmark = pytest.mark.ranks
+
 RECTANGLE = [[-1.0, 0.0], [1.0, 0.0], [1.0, 1.0], [-1.0, 1.0]]
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 DEMOS = Path(__file__).parent.parent / "demos"
 SECONDS = 600
 

@@ -17,6 +17,8 @@ from signorini_cr.data.ranges import Deviation, Pieces, means
 from signorini_cr.fem.cells import Cells
 from signorini_cr.mesh.families import structured
 
+pytestmark = pytest.mark.slow
+
 WORLD = MPI.COMM_WORLD
 
 FORMULAS = [

@@ -21,6 +21,8 @@ from signorini_cr.memory import ran_out_of_memory
 from signorini_cr.output import files
 from signorini_cr.output.report import FILES
 
+pytestmark = pytest.mark.slow
+
 COMM = MPI.COMM_WORLD
 
 

@@ -15,6 +15,8 @@ from signorini_cr.levels import solve_levels
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain, Polygon
 from signorini_cr.mesh.refinement import refine, refine_marked
 
+pytestmark = pytest.mark.ranks
+
 COMM = MPI.COMM_WORLD
 SHAPES = {
     "rectangle": Polygon(

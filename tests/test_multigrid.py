@@ -36,6 +36,8 @@ from signorini_cr.vi.level import Level
 from signorini_cr.vi.nested import nested_start
 from signorini_cr.vi.solver import solve_vi
 
+pytestmark = [pytest.mark.slow, pytest.mark.ranks]
+
 # Obtuse corners, a hole, and contact in three pieces that meet in a corner and at the hole
 CROOKED = Polygon(
     [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],

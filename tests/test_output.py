@@ -26,6 +26,8 @@ from signorini_cr.output import report as output
 from signorini_cr.output.files import check_writable, write_files
 from signorini_cr.output.vtu import write_vtu
 
+pytestmark = pytest.mark.ranks
+
 WORLD = MPI.COMM_WORLD
 
 LEVEL = {

@@ -14,6 +14,8 @@ from signorini_cr.mesh.refinement import refine
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.pattern import empty_matrix
 
+pytestmark = pytest.mark.ranks
+
 WORLD = MPI.COMM_WORLD
 TRIANGLE = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"])
 

@@ -18,6 +18,8 @@ from signorini_cr.fem.space import function_space
 from signorini_cr.output import canvas
 from signorini_cr.output.raster import raster
 
+pytestmark = pytest.mark.slow
+
 image = pytest.importorskip("matplotlib.image")
 WORLD = MPI.COMM_WORLD
 

@@ -22,6 +22,8 @@ from signorini_cr.fem.problem import Forms, Problem
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import Domain, Polygon, read_gmsh
 
+pytestmark = pytest.mark.slow
+
 COMM = MPI.COMM_WORLD
 RECTANGLE = np.array([(-1, 0), (1, 0), (1, 1), (-1, 1)], dtype=np.float64)
 ALL_ROUND = ("contact", "dirichlet", "dirichlet", "dirichlet")

@@ -22,6 +22,8 @@ from signorini_cr.compat import cell_nodes
 from signorini_cr.estimate import companion
 from signorini_cr.estimate.certificate import certify
 
+pytestmark = pytest.mark.slow
+
 WORLD = MPI.COMM_WORLD
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 

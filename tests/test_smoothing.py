@@ -14,6 +14,8 @@ from signorini_cr.multigrid.smoothing import OVER_RELAXATION, GaussSeidel
 from signorini_cr.multigrid.transfer import inclusion
 from signorini_cr.vi.level import Level
 
+pytestmark = pytest.mark.ranks
+
 # Corners of five degrees: large entries, many of them positive
 FLAT = Polygon([[0, 0], [5, 0], [5, 0.4]], ["contact", "dirichlet", "neumann"])
 

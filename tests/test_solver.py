@@ -11,6 +11,8 @@ from signorini_cr import InputError, NotConverged, Polygon, Problem, exact, solv
 from signorini_cr.fem.space import closure_dofs, function_space
 from signorini_cr.mesh.domain import CONTACT
 
+pytestmark = pytest.mark.ranks
+
 SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 PROBLEM = Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0]))
 

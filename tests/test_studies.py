@@ -11,6 +11,8 @@ from signorini_cr import Problem, exact, norms, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 
+pytestmark = [pytest.mark.slow, pytest.mark.ranks]
+
 COMM = MPI.COMM_WORLD
 
 

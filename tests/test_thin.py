@@ -18,6 +18,8 @@ from signorini_cr.multigrid import bottom
 from signorini_cr.options import AMG
 from signorini_cr.vi.level import Level
 
+pytestmark = pytest.mark.slow
+
 comm = MPI.COMM_WORLD
 
 CORNERS = np.array([[0, 0], [3, -0.4], [3.6, 1.1], [0.2, 2.0]])

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parent.parent / "verification"
 sys.path.insert(0, str(FOLDER))
 
