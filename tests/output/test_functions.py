@@ -7,50 +7,18 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, io
-from dolfinx.mesh import (
-    compute_midpoints,
-    create_rectangle,
-    create_unit_cube,
-    exterior_facet_indices,
-    meshtags,
-)
+from dolfinx.mesh import compute_midpoints
+from helpers import on_a_slope, slope
 from mpi4py import MPI
-
-from signorini_cr import Domain, Problem, Solution, solve, solve_levels
 
 pytestmark = pytest.mark.ranks
 
 WORLD = MPI.COMM_WORLD
 
 
-def domain(mesh):
-    """Γ1 where the last coordinate is 0, Γ0 elsewhere."""
-    d = mesh.topology.dim
-    mesh.topology.create_connectivity(d - 1, d)
-    facets = exterior_facet_indices(mesh.topology)
-    below = compute_midpoints(mesh, d - 1, facets)[:, d - 1] < 1e-12
-    tags = meshtags(mesh, d - 1, facets, np.where(below, 1, 2).astype(np.int32))
-    return Domain.from_tags(mesh, tags, contact=1, dirichlet=2)
-
-
-def obstacle(x):
-    return 0.05 * x[0]
-
-
-def solved(dim: int, element: str = "CR") -> Solution:
-    """Pulled up at the left and pressed down at the right; in the plane on a refined mesh."""
-    middle = 0.5 if dim == 3 else 0.0
-    problem = Problem(f=lambda x: 4.0 * (middle - x[0]), obstacle=obstacle, dirichlet=obstacle)
-    if dim == 3:
-        return solve(problem, domain(create_unit_cube(WORLD, 3, 3, 3)), element)
-    mesh = create_rectangle(WORLD, [[-1.0, 0.0], [1.0, 1.0]], [8, 4])
-    *_, finest = solve_levels(problem, domain(mesh), 2, element)
-    return finest
-
-
 @pytest.fixture(scope="module", params=[2, 3])
 def solution(request):
-    return solved(request.param)
+    return on_a_slope(request.param)
 
 
 def integral(form) -> float:
@@ -74,7 +42,7 @@ def test_u_is_the_affine_function_with_the_cr_dofs_at_the_facets_midpoints(solut
 
 
 def test_a_conforming_solution_is_itself():
-    solution = solved(2, "P1")
+    solution = on_a_slope(2, element="P1")
     functions = solution.functions()
     # without a certificate there is neither an indicator nor a companion
     assert list(functions) == ["u", "pressure", "contact", "obstacle"]
@@ -98,7 +66,7 @@ def test_the_functions_on_the_contact_boundary_integrate_to_its_figures(solution
     # values stand on the facets that they are of: α is affine, its means those at the middles
     number = mesh.topology.index_map(d).size_local
     middles = compute_midpoints(mesh, d, np.arange(number, dtype=np.int32))
-    assert alpha.x.array[:number] == pytest.approx(obstacle(middles.T), abs=1e-13)
+    assert alpha.x.array[:number] == pytest.approx(slope(middles.T), abs=1e-13)
     assert integral(abs(pressure) * (1 - state) * ufl.dx) == 0.0
 
 

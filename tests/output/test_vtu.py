@@ -13,16 +13,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from dolfinx import fem
-from dolfinx.mesh import (
-    compute_midpoints,
-    create_rectangle,
-    create_unit_cube,
-    exterior_facet_indices,
-    meshtags,
-)
+from dolfinx.mesh import create_rectangle, create_unit_cube
+from helpers import on_a_slope, slope
 from mpi4py import MPI
 
-from signorini_cr import Domain, Problem, Solution, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.fem.space import function_space
 from signorini_cr.output.vtu import _encoded, write_solution, write_vtu
@@ -147,32 +141,9 @@ def read(request):
     return call
 
 
-def domain(mesh) -> Domain:
-    """Γ1 where the last coordinate is 0, Γ0 elsewhere."""
-    d = mesh.topology.dim
-    mesh.topology.create_connectivity(d - 1, d)
-    facets = exterior_facet_indices(mesh.topology)
-    below = compute_midpoints(mesh, d - 1, facets)[:, d - 1] < 1e-12
-    tags = meshtags(mesh, d - 1, facets, np.where(below, 1, 2).astype(np.int32))
-    return Domain.from_tags(mesh, tags, contact=1, dirichlet=2)
-
-
-def obstacle(x):
-    return 0.05 * x[0]
-
-
-def solved(dim: int, comm: MPI.Comm = WORLD) -> Solution:
-    problem = Problem(f=lambda x: 4.0 * (0.4 - x[0]), obstacle=obstacle, dirichlet=obstacle)
-    if dim == 3:
-        return solve(problem, domain(create_unit_cube(comm, 3, 3, 3)))
-    mesh = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [8, 4])
-    *_, finest = solve_levels(problem, domain(mesh), 2)
-    return finest
-
-
 @pytest.fixture(scope="module", params=[2, 3])
 def solution(request):
-    return solved(request.param)
+    return on_a_slope(request.param)
 
 
 def everyone(array):
@@ -203,14 +174,14 @@ def test_readers_find_the_fields_of_the_solution(read, solution, shared_tmp_path
     assert len(ends) == contact.number
     assert np.sort(ends, axis=1) == pytest.approx(np.sort(everyone(contact.vertices), axis=1))
     assert found.on_points[below, "u"].mean(axis=1) == pytest.approx(everyone(contact.u))
-    gaps = np.sort(found.on_points[below, "u"] - obstacle(ends.T).T, axis=1)
+    gaps = np.sort(found.on_points[below, "u"] - slope(ends.T).T, axis=1)
     assert gaps == pytest.approx(np.sort(everyone(contact.gap_at_vertices), axis=1), abs=1e-14)
     for name in ("pressure", "contact", "obstacle"):
         wanted = everyone(getattr(contact, {"contact": "active"}.get(name, name)))
         assert np.array_equal(found.on_cells[below, name], wanted)
     assert np.all(found.on_cells[below, "indicator"] == 0.0)
     # v is in K: not below the obstacle, with which it agrees where there is contact
-    above = found.on_points[below, "companion"] - obstacle(ends.T).T
+    above = found.on_points[below, "companion"] - slope(ends.T).T
     assert above.min() > -1e-13
     edges = ends[:, 1:] - ends[:, :1]
     measure = np.sqrt(np.linalg.det(edges @ edges.transpose(0, 2, 1))) / (d - 1)
@@ -219,9 +190,9 @@ def test_readers_find_the_fields_of_the_solution(read, solution, shared_tmp_path
 
 
 def test_one_rank_writes_what_all_ranks_write(shared_tmp_path):
-    write_solution(solved(2), shared_tmp_path / "all.vtu")
+    write_solution(on_a_slope(2), shared_tmp_path / "all.vtu")
     alone = shared_tmp_path / f"alone-{WORLD.rank}.vtu"
-    write_solution(solved(2, MPI.COMM_SELF), alone)
+    write_solution(on_a_slope(2, MPI.COMM_SELF), alone)
     ours, mine = by_hand(shared_tmp_path / "all.vtu"), by_hand(alone)
 
     def sorted_by_place(found: Grid, kind: int) -> tuple:

@@ -1,11 +1,10 @@
 """PETSc's options on the command line of a script."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from helpers import start
 from petsc4py import PETSc
 
 from signorini_cr.options import PREFIX, take
@@ -40,16 +39,8 @@ def test_words_under_the_prefix_become_options(database):
 
 
 def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    script = folder / "my.py"
-    script.write_text(SCRIPT)
-    return subprocess.run(
-        [sys.executable, script, *words],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-        env=dict(os.environ),
-    )
+    (folder / "my.py").write_text(SCRIPT)
+    return start(folder / "my.py", *words)
 
 
 @pytest.mark.serial
