@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 
 from petsc4py import PETSc
 
@@ -91,7 +92,7 @@ def take(words: Sequence[str]) -> None:
     """
     given = {
         word: None if re.match("--?[a-zA-Z]", after) else after
-        for word, after in zip(words, [*words[1:], "-none"], strict=True)
+        for word, after in pairwise([*words, "-none"])
         if word.startswith(f"-{PREFIX}")
     }
     database = PETSc.Options()

@@ -108,13 +108,14 @@ def on_a_slope(dim: int, comm: MPI.Comm = MPI.COMM_WORLD, element: str = "CR") -
     In the plane it is on a refined mesh, in space on a cube.
     """
     if dim == 3:
-        mesh, levels = create_unit_cube(comm, 3, 3, 3), 1
+        mesh, levels, middle = create_unit_cube(comm, 3, 3, 3), 1, 0.4
     else:
         mesh, levels = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [8, 4]), 2
+        middle = 0.0
     mesh.topology.create_connectivity(dim - 1, dim)
     facets = exterior_facet_indices(mesh.topology)
     below = compute_midpoints(mesh, dim - 1, facets)[:, dim - 1] < 1e-12
     tags = meshtags(mesh, dim - 1, facets, np.where(below, 1, 2).astype(np.int32))
-    problem = Problem(f=lambda x: 4.0 * (0.4 - x[0]), obstacle=slope, dirichlet=slope)
+    problem = Problem(f=lambda x: 4.0 * (middle - x[0]), obstacle=slope, dirichlet=slope)
     *_, finest = solve_levels(problem, Domain.from_tags(mesh, tags), levels, element)
     return finest

@@ -206,8 +206,8 @@ def write_output(
         if solution.contact.number:
             writers["contact.png"] = lambda path: plots.plot_contact(solution, path, title)
         if plots.convergence_series(records):
-            writers["convergence.png"] = lambda path: on_root(
-                comm, plots.plot_convergence, records, path, title
+            writers["convergence.png"] = lambda path: plots.drawn(
+                comm, lambda: plots.plot_convergence(records, path, title)
             )
     write_files(folder, writers, removed=FILES, comm=comm)
     return list(writers)

@@ -45,7 +45,7 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.serial
 def test_options_of_a_script_reach_the_solver(tmp_path):
-    plain = run(tmp_path, "--out", "folder")
+    plain = run(tmp_path)
     assert (plain.returncode, plain.stderr) == (0, "")
     told = run(tmp_path, "--out", "folder", "-signorini_snes_monitor")
     steps = int(plain.stdout.split()[1])
