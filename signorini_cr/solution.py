@@ -50,6 +50,12 @@ class Solution:
         bound = known and known.bound_h1
         return line + (">" if bound is None else f", error at most {bound:.3g}>")
 
+    def _repr_html_(self) -> str:
+        """A table and a picture, for notebooks; of the certificate what has been made."""
+        from . import notebook  # by the front door, as what draws stands above the solution
+
+        return str(notebook.as_html(self))
+
     @property
     def domain(self) -> Domain:
         """Mesh and boundary parts."""

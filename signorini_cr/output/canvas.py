@@ -49,10 +49,10 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def as_png(figure: Figure) -> bytes:
+def as_png(figure: Figure | SubFigure) -> bytes:
     """The bytes of a PNG."""
     file = io.BytesIO()
-    figure.savefig(file, format="png")
+    figure.canvas.print_figure(file, format="png")
     return file.getvalue()
 
 
