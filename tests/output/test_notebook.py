@@ -1,10 +1,11 @@
 """What a notebook shows of a solution."""
 
 import base64
+import json
 from xml.etree import ElementTree
 
 import pytest
-from helpers import on_a_slope
+from helpers import DEMOS, on_a_slope
 from mpi4py import MPI
 
 from signorini_cr import plots
@@ -43,3 +44,36 @@ def test_it_says_why_there_is_no_bound():
     solution = on_a_slope(2, element="P1")
     reason = solution.certificate.reason
     assert f"none: {reason}" in solution._repr_html_()
+
+
+NOTEBOOK = DEMOS / "slope.ipynb"
+
+
+@pytest.mark.serial
+def test_the_cells_of_the_notebook_run():
+    """As plain Python, where there is no Jupyter; they end in assertions of their own."""
+    pytest.importorskip("matplotlib")
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    names = {"__name__": "__main__"}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            assert (cell["outputs"], cell["execution_count"]) == ([], None)
+            exec("".join(cell["source"]), names)
+    assert names["finest"].certificate.bound_h1 <= 0.05 < names["certificate"].bound_h1
+
+
+@pytest.mark.serial
+def test_jupyter_runs_the_notebook_and_shows_what_it_promises(monkeypatch):
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    nbformat.validate(notebook)
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # Jupyter's own
+    nbclient.NotebookClient(notebook, timeout=200).execute()
+    shown = [
+        set(output.get("data", {})) | {output.get("name", "")}
+        for cell in notebook.cells
+        for output in cell.get("outputs", ())
+    ]
+    assert sum("text/html" in each for each in shown) == 1  # the solution
+    assert sum("image/png" in each for each in shown) == 2  # along Γ1, and on two Axes
+    assert not any("stderr" in each for each in shown)
