@@ -354,15 +354,16 @@ def _sweep(
     for part in blocks(cells.number):
         k = pick(kappa, part)
         diagonal[part] = k * cells.trace(part)
-        slope[:, part] = k * cells.apply(excess[:, part], part)
+        np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
         energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
     near = np.unique(np.concatenate([side.cells for side in bumped]))
     flow, height = slope[:, near], bumps[cells.facets[:, near]]
     change = diagonal[near] * height + 2.0 * pick(kappa, near) * _across(cells, height, near)
     slope[:, near] = flow - change
     energy -= 4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
+    held = np.flatnonzero(~free)
     down = cells.over_facets(slope)
-    down *= free
+    down[held] = 0.0
     weight = cells.over_facets(np.tile(diagonal, (len(excess), 1)))
     weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
     owned = slice(cells.owned_facets())
@@ -373,9 +374,12 @@ def _sweep(
             break
         for part in blocks(cells.number):
             k, step = pick(kappa, part), way[cells.facets[:, part]]
-            slope[:, part] = diagonal[part] * step + 2.0 * k * _across(cells, step, part)
+            across = _across(cells, step, part)
+            across *= 2.0 * k
+            step *= diagonal[part]
+            np.add(step, across, out=slope[:, part])
         image = cells.over_facets(slope)
-        image *= free
+        image[held] = 0.0
         length = square / cells.total(way[owned] @ image[owned])[0]
         bumps += length * way
         image *= length
@@ -403,8 +407,10 @@ def _promise(
     slope, diagonal = np.empty_like(excess), np.empty_like(excess)
     for part in blocks(cells.number):
         k, height = pick(kappa, part), bumps[cells.facets[:, part]]
-        slope[:, part] = k * cells.apply(excess[:, part] - 4 / 3 * height, part)
-        diagonal[:, part] = k * cells.squares(part)
+        height *= -4 / 3
+        height += excess[:, part]
+        np.multiply(k, cells.apply(height, part), out=slope[:, part])
+        np.multiply(k, cells.squares(part), out=diagonal[:, part])
     owned = slice(cells.owned_vertices())
     down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
     return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])

@@ -77,7 +77,8 @@ def equilibrate(
         np.negative(shares, out=excess[:, part])
         slopes = cells.apply(w[:, part], part)
         steepness[part] = dot_rows(w[:, part], slopes)
-        fluxes[:, part] = -d * pick(kappa, part) * slopes - shares
+        slopes *= -d * pick(kappa, part)
+        np.subtract(slopes, shares, out=fluxes[:, part])
     on_neumann, through = edge.side, edge.shares.sum(axis=0)
     for i, share in enumerate(edge.to_cells()):
         # the facet itself gets all of it further down

@@ -240,14 +240,15 @@ def _exact(
     s, c_sum = sum_rows(P), sum_rows(c)
     z = c + W
     Sc, Sz = cells.apply(c, part), cells.apply(z, part)
-    bb, vv = dot_rows(c, Sc), dot_rows(z, Sz)
+    if height is None:
+        bb, vv, on_facets = dot_rows(c, Sc), dot_rows(z, Sz), c
+    else:
+        squares, bent = bump_squares(cells, height, part), 8 / 3 * height
+        bb, vv = (dot_rows(a - bent, Sa) + squares for a, Sa in ((c, Sc), (z, Sz)))
+        c_sum -= 2.0 * sum_rows(height)
+        on_facets = c - 0.5 * bent
     # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
-    pb = (s * c_sum - dot_rows(P, c)) / d - s * c_sum / (d + 1)
-    if height is not None:
-        squares = bump_squares(cells, height, part)
-        bb += squares - 8 / 3 * dot_rows(height, Sc)
-        vv += squares - 8 / 3 * dot_rows(height, Sz)
-        pb += 2 / 3 * dot_rows(P, height) - s * sum_rows(height) / 3
+    pb = (s * c_sum / (d + 1) - dot_rows(P, on_facets)) / d
     return field_squares(cells, P, part) / k, k * bb, pb, k * vv
 
 
