@@ -9,7 +9,8 @@ from pathlib import Path
 from petsc4py import PETSc
 
 _PETSC_ERR_MEM = 55
-_WORDS = ("std::bad_alloc", "Cannot allocate memory")
+# The last one stands in what the other ranks are told of a rank's error, see errors.fail_together
+_WORDS = ("std::bad_alloc", "Cannot allocate memory", "MemoryError")
 
 
 def ran_out_of_memory(error: BaseException | None) -> bool:
