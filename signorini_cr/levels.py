@@ -125,7 +125,7 @@ def solve_physics(
 ) -> Iterator[Solution]:
     """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`."""
     physics.check(domain)
-    hierarchy, seconds = Hierarchy(physics, domain), {"mesh": 0.0}
+    hierarchy, seconds = Hierarchy(physics, domain), {"mesh": domain.seconds}
     level, coarser, before = Level(hierarchy.meshes), None, None
     while True:
         solution = _solve(level, hierarchy, (coarser, before), monitor, seconds)

@@ -176,7 +176,13 @@ def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypat
 
 
 @pytest.mark.serial
-def test_an_interruption_inside_a_callback_is_one(tmp_path: Path, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize(
+    "number, word, expected",
+    [(signal.SIGINT, "interrupted", 130), (signal.SIGTERM, "terminated", 143)],
+)
+def test_an_interruption_inside_a_callback_is_one(
+    number: signal.Signals, word: str, expected: int, tmp_path: Path, monkeypatch, capsys
+) -> None:
     """In the midst of PETSc, which makes an error of its own of it; two levels are done."""
     (tmp_path / "case.toml").write_text(kills.CASE)
     step = cli.Screen.step
@@ -184,16 +190,17 @@ def test_an_interruption_inside_a_callback_is_one(tmp_path: Path, monkeypatch, c
     def interrupted(self: cli.Screen, text: str) -> None:
         step(self, text)
         if "level 2" in text:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
     monkeypatch.setattr(cli.Screen, "step", interrupted)
     out = tmp_path / "out"
     status = cli.main(["solve", str(tmp_path / "case.toml"), "--out", str(out), "-q"])
     words = " ".join(capsys.readouterr().err.split())
-    assert status == cli.INTERRUPTED
-    assert words == f"signorini-cr: interrupted; levels 0 to 1 are finished and kept in {out}"
+    assert status == expected
+    assert words == f"signorini-cr: {word}; levels 0 to 1 are finished and kept in {out}"
     assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 @pytest.mark.serial
