@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .. import __version__
 from .commandline import (
     UsageError,
     launched,
@@ -29,6 +30,7 @@ from .screen import Screen, wrapped
 if TYPE_CHECKING:
     from ..errors import NotConverged
     from ..mesh.domain import Domain
+    from ..restart import Restart
     from ..solution import Solution
     from .problemfile import ProblemFile
 
@@ -45,9 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status, the same on every rank.
     """
+    began = time.perf_counter()
     screen = Screen(launched()[0] == 0)
     try:
         args = read_arguments(sys.argv[1:] if argv is None else argv)
+        args.began = began
     except SystemExit:  # --help and --version have answered
         screen.flush()
         return DONE
@@ -185,26 +189,33 @@ def _solve_levels(
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged
     from ..output import report as output
+    from ..restart import Restart
 
     case, domain = _read(args, screen, comm)
     element = args.element.upper()
+    said = _said(args, case, comm)
+    restart = _resumed(folder, said, records, comm) if args.resume else None
+    for record in records:
+        _tell(record, records[0], screen)
     finest: Solution | None = None
     failure: NotConverged | None = None
     try:
-        for solution in _solutions(case, domain, element, screen):
+        for solution in _solutions(args, case, domain, restart, screen):
+            if solution.level.number < len(records):  # the one that it goes on from
+                finest = solution
+                continue
             _ = solution.errors, solution.certificate  # the report reads what is there
             record = output.level_record(solution, records[-1] if records else None)
             report = output.make_report(case.title, element, comm, [*records, record], False)
             with _named("--out"):
-                output.write_levels(folder, report, solution)
+                restart = Restart.of(solution, finest and finest.u, case.mode == "adaptive")
+                output.write_levels(folder, report, solution, restart, said)
             records.append(record)
             finest = solution
             if screen.verbose:
                 taken = solution.iterations.preconditioner
                 screen.line(wrapped(taken, "  linear systems: "))
-            if len(records) == 1:
-                screen.line(output.table_header(records[0]))
-            screen.line(output.table_row(records[-1], records[0]))
+            _tell(record, records[0], screen)
     except NotConverged as error:
         failure = error
     failure = failure or _above_tolerance(case, records)
@@ -212,7 +223,7 @@ def _solve_levels(
     if finest is not None:
         report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
-            names = output.write_output(folder, report, finest)
+            names = output.write_output(folder, report, finest, resumable=True)
         screen.line("")
         screen.text(_facts(records[-1]))
         if (reason := records[-1]["bound_reason"]) is not None:
@@ -268,8 +279,64 @@ def _read(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemF
     return case, domain
 
 
+def _said(args: argparse.Namespace, case: ProblemFile, comm: Any) -> dict[str, Any]:
+    """All that the levels depend on, by the name the user knows it by; collective."""
+    import hashlib
+
+    from petsc4py import PETSc
+
+    from ..errors import on_root
+    from ..options import PREFIX
+
+    said = {**case.said, "--element": args.element, "signorini_cr": __version__}
+    for name, value in sorted(PETSc.Options(PREFIX).getAll().items()):
+        said[f"-{PREFIX}{name}"] = value
+    if isinstance(case.domain, Path):
+        content = on_root(comm, case.domain.read_bytes)
+        said["domain.mesh, the file"] = hashlib.sha256(content).hexdigest()[:16]
+    return said
+
+
+def _resumed(
+    folder: Path, said: dict[str, Any], records: list[dict[str, Any]], comm: Any
+) -> Restart | None:
+    """Where a run goes on; fills in the records of the levels before; collective."""
+    from ..errors import InputError
+    from ..output.checkpoint import read_checkpoint
+    from .keys import shown
+
+    with _named("--resume"):
+        found = read_checkpoint(folder, comm)
+        if found is None:
+            return None
+        restart, facts = found
+        for key in sorted({*said, *facts["said"]}):
+            was, now = (each.get(key) for each in (facts["said"], said))
+            if was != now:
+                was, now = ("not given" if each is None else shown(each) for each in (was, now))
+                raise InputError(
+                    f"{folder} has levels of another run: {key} was {was} and is {now}; the same"
+                    " is needed, or another --out"
+                )
+    records += facts["levels"]
+    return restart
+
+
+def _tell(record: dict[str, Any], first: dict[str, Any], screen: Screen) -> None:
+    """Print the row of a level, and the head before the first."""
+    from ..output import report as output
+
+    if record is first:
+        screen.line(output.table_header(first))
+    screen.line(output.table_row(record, first))
+
+
 def _solutions(
-    case: ProblemFile, domain: Domain, element: str, screen: Screen
+    args: argparse.Namespace,
+    case: ProblemFile,
+    domain: Domain,
+    restart: Restart | None,
+    screen: Screen,
 ) -> Iterator[Solution]:
     from .. import levels
     from ..adaptive import solve_adaptive
@@ -279,8 +346,19 @@ def _solutions(
         screen.step(f"  level {level}  {facts}")
 
     screen.progress("level 0")
+    max_time, element = args.max_time, args.element.upper()
+    if max_time is not None:
+        max_time += args.began - time.perf_counter()
     if case.mode == "uniform":
-        yield from levels.solve_levels(case.problem, domain, case.levels, element, monitor)
+        yield from levels.solve_levels(
+            case.problem,
+            domain,
+            case.levels,
+            element,
+            monitor,
+            max_time=max_time,
+            restart=restart,
+        )
     else:
         yield from solve_adaptive(
             case.problem,
@@ -290,6 +368,8 @@ def _solutions(
             max_dofs=case.max_dofs,
             element=element,
             monitor=monitor,
+            max_time=max_time,
+            restart=restart,
         )
 
 

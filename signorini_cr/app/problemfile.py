@@ -42,6 +42,8 @@ from .reference import SECTIONS, allowed
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 MAX_DOFS = 1_000_000
+ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
+"""Keys that say where a run ends, and nothing else."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 MOST_CELLS = 1e9
@@ -62,6 +64,7 @@ class ProblemFile:
         levels: Number of meshes, the coarsest included.
         tolerance: Adaptive refinement stops when the certified bound is below it.
         max_dofs: Adaptive refinement stops before a mesh with more degrees of freedom.
+        said: All that levels depend on, by key, as it was written.
     """
 
     title: str
@@ -73,6 +76,7 @@ class ProblemFile:
     levels: int
     tolerance: float
     max_dofs: int
+    said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Make or read the coarsest mesh; collective."""
@@ -152,6 +156,12 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         tolerance=tolerance,
         max_dofs=max_dofs,
+        said={
+            f"{name}.{key}": value
+            for name, section in sections.items()
+            for key, value in section.items()
+            if f"{name}.{key}" not in ENDS
+        },
     )
 
 

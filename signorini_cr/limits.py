@@ -1,0 +1,73 @@
+"""Whether another level fits into the time and the memory there are, by what those before took."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+from .errors import NotConverged
+from .memory import most_memory, shortage
+from .solution import Solution
+
+BYTES = 800.0
+"""Peak memory that a dof more takes, with all coarser meshes and the certificate."""
+TELLING = 100_000
+"""Dofs that two levels must be apart for their peaks to tell more than that."""
+
+
+class _Taken(NamedTuple):
+    """What a level took: its dofs, seconds, and the most bytes this rank has held until its end."""
+
+    dofs: int
+    seconds: float
+    peak: float
+
+
+class Limits:
+    """What the levels of a sequence may take.
+
+    Args:
+        max_time: Wall time in seconds from now on, None for any.
+    """
+
+    def __init__(self, max_time: float | None = None):
+        """Begin to count."""
+        self._max_time = max_time
+        self._began = time.perf_counter()
+        self._passed = 0.0
+        self._before: _Taken | None = None
+
+    def admit(self, solution: Solution, dofs: int) -> None:
+        """Look, when a level is done, whether the next one fits; collective.
+
+        Time and peak memory are taken to grow with the dofs as between the last two levels, time
+        not to fall and memory not to grow more slowly than usual.
+
+        Args:
+            solution: Of the level that is done.
+            dofs: Of the next one.
+
+        Raises:
+            NotConverged: It does not; the message has the figures.
+        """
+        comm, n = solution.domain.mesh.comm, solution.dofs
+        passed = comm.allreduce(time.perf_counter() - self._began, op=MPI.MAX)
+        last = _Taken(n, passed - self._passed, most_memory())
+        before = self._before or last
+        self._before, self._passed = last, passed
+        more, grown = dofs - n, max(n - before.dofs, 1)
+        seconds = last.seconds + max(last.seconds - before.seconds, 0.0) * more / grown
+        growth = BYTES * solution.u.function_space.dofmap.index_map.size_local / n
+        if grown >= TELLING:
+            growth = max(growth, (last.peak - before.peak) / grown)
+        words = shortage(comm, growth * more)
+        if self._max_time is not None and passed + seconds > self._max_time:
+            left = max(self._max_time - passed, 0.0)
+            words = f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"
+        if words is not None:
+            raise NotConverged(
+                f"its {dofs} degrees of freedom would take about {words}",
+                solution.level.number + 1,
+            )
