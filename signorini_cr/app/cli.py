@@ -301,9 +301,10 @@ def _resumed(
     folder: Path, said: dict[str, Any], records: list[dict[str, Any]], comm: Any
 ) -> Restart | None:
     """Where a run goes on; fills in the records of the levels before; collective."""
+    import json
+
     from ..errors import InputError
     from ..output.checkpoint import read_checkpoint
-    from .keys import shown
 
     with _named("--resume"):
         found = read_checkpoint(folder, comm)
@@ -313,7 +314,9 @@ def _resumed(
         for key in sorted({*said, *facts["said"]}):
             was, now = (each.get(key) for each in (facts["said"], said))
             if was != now:
-                was, now = ("not given" if each is None else shown(each) for each in (was, now))
+                was, now = (
+                    "not given" if each is None else json.dumps(each) for each in (was, now)
+                )
                 raise InputError(
                     f"{folder} has levels of another run: {key} was {was} and is {now}; the same"
                     " is needed, or another --out"

@@ -7,15 +7,15 @@ import resource
 from collections.abc import Callable
 from pathlib import Path
 
+import helpers
 import numpy as np
 import pytest
 from mpi4py import MPI
 
-from signorini_cr import Problem, limits, memory, solve_adaptive, solve_levels
+from signorini_cr import Domain, Polygon, Problem, limits, memory, solve_adaptive, solve_levels
 from signorini_cr.app import cli
 from signorini_cr.errors import InputError, NotConverged
-from signorini_cr.mesh.families import rectangle
-from signorini_cr.output import checkpoint
+from signorini_cr.output import checkpoint, plots
 from signorini_cr.restart import Restart
 
 COMM = MPI.COMM_WORLD
@@ -28,15 +28,21 @@ f = -3
 obstacle = "0.1*x - 0.2"
 [refine]
 mode = "MODE"
-levels = 5
+levels = 4
 """
 MODES = ("uniform", "adaptive")
+
+
+def rectangle(size: float) -> Domain:
+    parts = ("contact", "dirichlet", "dirichlet", "dirichlet")
+    return Polygon(np.array([[-1, 0], [1, 0], [1, 1], [-1, 1]]), parts).mesh(size)
 
 
 @pytest.fixture
 def case(shared_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Write case.toml into the folder of the test, which is the current one."""
     monkeypatch.chdir(shared_tmp_path)
+    monkeypatch.setattr(plots, "can_draw", lambda comm: False)  # which takes longest
 
     def write(mode: str = "uniform", old: str = "", new: str = "") -> None:
         if COMM.rank == 0:
@@ -60,8 +66,9 @@ def report(out: str = "out") -> dict:
 def assert_same(one: dict, other: dict) -> None:
     """All figures, but for iterations and seconds; contact forces are known to 1e-7."""
     for a, b in zip(one["levels"], other["levels"], strict=True):
-        for key in ("level", "cells", "dofs", "h", "energy", "bound_h1", "error_h1"):
-            assert a[key] == (b[key] if b[key] is None else pytest.approx(b[key], rel=1e-9)), key
+        for key, close in {"cells": 0.0, "dofs": 0.0, "h": 1e-15, "energy": 1e-9}.items():
+            assert a[key] == pytest.approx(b[key], rel=close), key
+        assert (a["bound_h1"] or 0) == pytest.approx(b["bound_h1"] or 0, rel=1e-7)
         for key in ("facets", "active"):
             assert a["contact"][key] == b["contact"][key]
         assert a["contact"]["length"] == pytest.approx(b["contact"]["length"], rel=1e-12)
@@ -74,15 +81,14 @@ def assert_same(one: dict, other: dict) -> None:
 def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(mode: str, case, capfd) -> None:
     case(mode)
     assert solved(out="whole") == 0
-    assert solved("--levels", 3) == 0
+    assert solved("--levels", 2) == 0
     kept = report()["levels"]
-    assert len(kept) == 3
+    assert len(kept) == 2
     assert solved("--resume") == 0
-    assert report()["levels"][:3] == kept
+    assert report()["levels"][:2] == kept
     assert_same(report(), report("whole"))
     assert report()["complete"] is True
-    names = {name for name in os.listdir("whole")}
-    assert set(os.listdir("out")) == names
+    assert set(os.listdir("out")) == set(os.listdir("whole"))
     before = report()
     assert solved("--resume") == 0  # nothing is left to do
     assert report() == before
@@ -90,19 +96,15 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(mode: str, case, capf
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("mode", MODES)
-def test_on_another_number_of_ranks(mode: str, case) -> None:
-    from test_cli import process
-
+@pytest.mark.parametrize("mode, first, then", [("uniform", 1, 2), ("adaptive", 2, 1)])
+def test_on_another_number_of_ranks(mode: str, first: int, then: int, case) -> None:
     case(mode)
     assert solved(out="whole") == 0
-    for first, then in ((1, 2), (2, 1)):
-        out = f"{first}-{then}"
-        done = process("solve", "case.toml", "--out", out, "--levels", "3", ranks=first)
-        assert done.returncode == 0, done.stderr
-        done = process("solve", "case.toml", "--out", out, "--resume", ranks=then)
-        assert done.returncode == 0, done.stderr
-        assert_same(report(out), report("whole"))
+    done = helpers.command("solve", "case.toml", "--out", "out", "--levels", "3", ranks=first)
+    assert done.returncode == 0, done.stderr
+    done = helpers.command("solve", "case.toml", "--out", "out", "--resume", ranks=then)
+    assert done.returncode == 0, done.stderr
+    assert_same(report(), report("whole"))
 
 
 def test_p1_is_resumed_as_well(case) -> None:
@@ -124,8 +126,8 @@ def test_where_there_is_nothing_a_resumed_run_begins(case) -> None:
     [
         ("f = -3", "f = -2", [], "data.f was -3 and is -2"),
         ("size = 0.5", "size = 0.4", [], "domain.size was 0.5 and is 0.4"),
-        ("uniform", "adaptive", [], "refine.mode was 'uniform' and is 'adaptive'"),
-        ("", "", ["--element", "p1"], "--element was 'cr' and is 'p1'"),
+        ("uniform", "adaptive", [], 'refine.mode was "uniform" and is "adaptive"'),
+        ("", "", ["--element", "p1"], '--element was "cr" and is "p1"'),
         ("[refine]", "g = 1\n[refine]", [], "data.g was not given and is 1"),
     ],
 )
@@ -138,7 +140,7 @@ def test_another_problem_is_refused(old, new, words, told, case, capfd) -> None:
     error = " ".join(capfd.readouterr().err.split())
     if COMM.rank == 0:
         assert "case.toml: --resume: out has levels of another run:" in error
-        assert told.replace("'", '"') in error
+        assert told in error
     assert Path("out", "report.json").read_bytes() == before
 
 
@@ -156,15 +158,15 @@ def test_a_damaged_file_is_refused(damage: bytes, case, capfd) -> None:
 
 def test_another_mesh_is_noticed() -> None:
     problem = Problem(f=-3.0, obstacle=-0.2)
-    (solution,) = solve_levels(problem, rectangle(4), 1)
+    (solution,) = solve_levels(problem, rectangle(0.5), 1)
     restart = COMM.bcast(Restart.of(solution, None, adaptive=False))
     with pytest.raises(InputError, match="the mesh is not the one"):
-        next(solve_levels(problem, rectangle(5), 2, restart=restart))
+        next(solve_levels(problem, rectangle(0.4), 2, restart=restart))
 
 
 def test_from_python_the_steps_are_those_of_a_run_in_one_piece() -> None:
     """One more Newton step on the mesh it goes on from, at most; the same on those above."""
-    problem, domain = Problem(f=-3.0, obstacle=lambda x: 0.1 * x[0] - 0.2), rectangle(4)
+    problem, domain = Problem(f=-3.0, obstacle=lambda x: 0.1 * x[0] - 0.2), rectangle(0.5)
     whole = list(solve_adaptive(problem, domain, levels=6))
     restart = COMM.bcast(Restart.of(whole[3], whole[2].u, adaptive=True))
     rest = list(solve_adaptive(problem, domain, levels=6, restart=restart))
@@ -204,9 +206,9 @@ def test_a_level_that_would_end_too_late_is_not_begun(mode: str, case, monkeypat
     assert_same({"levels": report()["levels"]}, {"levels": report("whole")["levels"][:-1]})
     if COMM.rank == 0:
         error = " ".join(capfd.readouterr().err.split())
-        assert "case.toml: stopped on level 4: its" in error
+        assert "case.toml: stopped on level 3: its" in error
         assert "of --max-time there are" in error
-        assert "levels 0 to 3 are finished and kept in out" in error
+        assert "levels 0 to 2 are finished and kept in out" in error
     assert report()["complete"] is False
     now = 0.0
     assert solved("--resume", "--max-time", 10 * sum(dofs)) == 0
@@ -253,7 +255,7 @@ def test_a_level_that_memory_does_not_hold_is_refused(case, monkeypatch, capfd) 
     levels = report()["levels"]
     dofs = [each["dofs"] for each in levels]
     assert 2e5 * 3 * dofs[-1] > 1e8  # and that of the level before was not
-    assert len(dofs) < 5
+    assert len(dofs) < 4
     if COMM.rank == 0:
         error = " ".join(capfd.readouterr().err.split())
         assert f"stopped on level {len(dofs)}: its {4 * dofs[-1]} degrees of freedom would" in error
