@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from .errors import NotConverged
 from .memory import most_memory, shortage
-from .solution import Solution
+from .vi.solved import Solved
 
 BYTES = 800.0
 """Peak memory that a dof more takes, with all coarser meshes and the certificate."""
@@ -39,7 +39,7 @@ class Limits:
         self._passed = 0.0
         self._before: _Taken | None = None
 
-    def admit(self, solution: Solution, dofs: int) -> None:
+    def admit(self, solution: Solved, dofs: int) -> None:
         """Look, when a level is done, whether the next one fits; collective.
 
         Time and peak memory are taken to grow with the dofs as between the last two levels, time
@@ -52,14 +52,15 @@ class Limits:
         Raises:
             NotConverged: It does not; the message has the figures.
         """
-        comm, n = solution.domain.mesh.comm, solution.dofs
+        comm, dofmap = solution.domain.mesh.comm, solution.u.function_space.dofmap
+        n = dofmap.index_map.size_global * dofmap.index_map_bs
         passed = comm.allreduce(time.perf_counter() - self._began, op=MPI.MAX)
         last = _Taken(n, passed - self._passed, most_memory())
         before = self._before or last
         self._before, self._passed = last, passed
         more, grown = dofs - n, max(n - before.dofs, 1)
         seconds = last.seconds + max(last.seconds - before.seconds, 0.0) * more / grown
-        growth = BYTES * solution.u.function_space.dofmap.index_map.size_local / n
+        growth = BYTES * dofmap.index_map.size_local * dofmap.index_map_bs / n
         if grown >= TELLING:
             growth = max(growth, (last.peak - before.peak) / grown)
         words = shortage(comm, growth * more)

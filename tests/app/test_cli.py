@@ -472,7 +472,7 @@ def _at_once(*_, **__):
 
 @pytest.mark.serial
 def test_the_unexpected_is_told_as_such(write, monkeypatch) -> None:
-    monkeypatch.setattr(levels, "solve_levels", lambda *_: 1 / 0)
+    monkeypatch.setattr(levels, "solve_levels", lambda *_, **__: 1 / 0)
     status, _, err = run("solve", write(CASE), "--out", "out")
     assert status == cli.FAULT
     assert "ZeroDivisionError" in err and "signorini-cr: unexpected error" in err
@@ -480,7 +480,7 @@ def test_the_unexpected_is_told_as_such(write, monkeypatch) -> None:
 
 @pytest.mark.serial
 def test_ctrl_c(write, monkeypatch) -> None:
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(levels, "solve_levels", interrupt)

@@ -229,11 +229,10 @@ def test_time_grows_as_between_the_last_two_levels(monkeypatch) -> None:
         """Of a solution what is looked at."""
 
         def __init__(self, number: int, dofs: int) -> None:
-            self.dofs, self.h = dofs, 1.0
             self.level = type("Level", (), {"number": number})
             self.domain = type("Domain", (), {"mesh": type("Mesh", (), {"comm": COMM})})
-            index_map = type("Map", (), {"size_local": dofs})
-            dofmap = type("Dofmap", (), {"index_map": index_map})
+            index_map = type("Map", (), {"size_local": dofs, "size_global": dofs})
+            dofmap = type("Dofmap", (), {"index_map": index_map, "index_map_bs": 1})
             self.u = type("U", (), {"function_space": type("V", (), {"dofmap": dofmap})})
 
     monkeypatch.setattr(limits, "time", Clock)
