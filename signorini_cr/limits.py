@@ -13,7 +13,7 @@ from .vi.solved import Solved
 
 BYTES = 800.0
 """Peak memory that a dof more takes, with all coarser meshes and the certificate."""
-TELLING = 100_000
+TELLING = 20_000
 """Dofs that two levels must be apart for their peaks to tell more than that."""
 
 

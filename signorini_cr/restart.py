@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -43,31 +42,28 @@ class Restart:
     u: tuple[tuple[Places, FloatArray], ...]
 
     @classmethod
-    def of(cls, solution: Solution, below: fem.Function | None, adaptive: bool) -> Restart:
+    def of(cls, solution: Solution, below: Restart | None, adaptive: bool) -> Restart:
         """Take what there is on all ranks to rank 0; collective.
 
         Args:
             solution: On the last mesh.
-            below: u_h on the mesh below, None on the coarsest.
+            below: The same for the mesh below, None on the coarsest.
             adaptive: Whether meshes were refined in parts.
 
         Returns:
             Nothing but empty arrays on the other ranks.
         """
-        comm, meshes = solution.domain.mesh.comm, solution.level.meshes
-        added: list[Places | None] = [None] * (len(meshes) - 1)
+        comm, V = solution.domain.mesh.comm, solution.u.function_space
+        size = V.dofmap.index_map.size_local
+        at, values = _places(V)[:size], solution.u.x.array[:size]
+        here = _gathered(at, comm), _gathered(values, comm)
+        if below is None:
+            return cls((), (here,))
+        added = None
         if adaptive:
-            owned = [_corners(each.domain.mesh) for each in meshes]
-            for k, (coarse, fine) in enumerate(pairwise(owned)):
-                added[k] = np.unique(_gathered(np.setdiff1d(fine, coarse), comm))
-        u = []
-        for function in (solution.u, below):
-            if function is not None:
-                V = function.function_space
-                size = V.dofmap.index_map.size_local
-                at, values = _places(V)[:size], function.x.array[:size]
-                u.append((_gathered(at, comm), _gathered(values, comm)))
-        return cls(tuple(added), tuple(u))
+            coarse, fine = (_nodes(each.domain.mesh) for each in solution.level.meshes[-2:])
+            added = _gathered(np.setdiff1d(fine, coarse), comm)
+        return cls((*below.added, added), (here, below.u[0]))
 
     def meshes(self, domain: Domain) -> Iterator[tuple[Domain, Int32Array]]:
         """Refine as it was done before; collective.
@@ -105,8 +101,13 @@ class Restart:
 
 def _corners(mesh: Mesh) -> Places:
     """The corners of this rank's cells, shape (cells, 3)."""
-    x = mesh.geometry.x[compat.cell_nodes(mesh)]
-    return x[..., 0] + 1j * x[..., 1]
+    return _nodes(mesh)[compat.cell_nodes(mesh)]
+
+
+def _nodes(mesh: Mesh) -> Places:
+    """The vertices of this rank's cells."""
+    x = mesh.geometry.x
+    return x[:, 0] + 1j * x[:, 1]
 
 
 def _places(V: fem.FunctionSpace) -> Places:
@@ -130,5 +131,8 @@ def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
 
 
 def _gathered(values: npt.NDArray, comm: MPI.Comm) -> npt.NDArray:
+    """All ranks' values on rank 0, nothing elsewhere; collective."""
+    if comm.size == 1:
+        return values
     parts = comm.gather(values)
     return values[:0] if parts is None else np.concatenate(parts)

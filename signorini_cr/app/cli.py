@@ -208,7 +208,7 @@ def _solve_levels(
             record = output.level_record(solution, records[-1] if records else None)
             report = output.make_report(case.title, element, comm, [*records, record], False)
             with _named("--out"):
-                restart = Restart.of(solution, finest and finest.u, case.mode == "adaptive")
+                restart = Restart.of(solution, restart, case.mode == "adaptive")
                 output.write_levels(folder, report, solution, restart, said)
             records.append(record)
             finest = solution

@@ -168,7 +168,10 @@ def test_from_python_the_steps_are_those_of_a_run_in_one_piece() -> None:
     """One more Newton step on the mesh it goes on from, at most; the same on those above."""
     problem, domain = Problem(f=-3.0, obstacle=lambda x: 0.1 * x[0] - 0.2), rectangle(0.5)
     whole = list(solve_adaptive(problem, domain, levels=6))
-    restart = COMM.bcast(Restart.of(whole[3], whole[2].u, adaptive=True))
+    restart = None
+    for each in whole[:4]:
+        restart = Restart.of(each, restart, adaptive=True)
+    restart = COMM.bcast(restart)
     rest = list(solve_adaptive(problem, domain, levels=6, restart=restart))
     assert [each.level.number for each in rest] == [3, 4, 5]
     assert rest[0].iterations.newton <= 1
