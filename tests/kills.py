@@ -177,7 +177,8 @@ def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
             faults.append(f"nothing is said of what is kept: {said[-600:]}")
     if levels > 0 and random.random() < 0.3:
         again = [*solve, "--resume", "--levels", str(levels + 1), "-q"]
-        more_run = subprocess.run(again, capture_output=True, text=True, env=clean, timeout=60)
+        # a minute longer where a killed one has left a form half compiled
+        more_run = subprocess.run(again, capture_output=True, text=True, env=clean, timeout=180)
         if more_run.returncode or levels_in(out) < levels + 1:
             faults.append(f"not resumed, status {more_run.returncode}: {more_run.stderr[-600:]}")
     return End(f"{ranks} {number.name} {target}", run.returncode, levels, faults + more_faults)
