@@ -324,6 +324,8 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "FILE", "--levels", "-2"], ["--levels", "1 or more", "found -2"]),
         (["solve", "FILE", "--levels", "two"], ["--levels", "whole number", "found two"]),
         (["solve", "FILE", "--levels"], ["--levels"]),
+        (["solve", "FILE", "--max-time", "0"], ["--max-time", "above 0", "found 0"]),
+        (["solve", "FILE", "--max-time", "1h"], ["--max-time", "seconds", "found 1h"]),
         (["solve", "FILE", "--out="], ["--out", "folder"]),
         (["solve", "FILE", "--element", "p2"], ["--element", "cr", "p1"]),
         (["check", "FILE", "--levels", "2"], ["no option --levels"]),
