@@ -68,6 +68,7 @@ def solve_adaptive(
         raise InputError(f"levels is {levels}; it must be 1 or more")
 
     limits = Limits(max_time)
+    limits.begin(domain, element, restart)
 
     def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
         certificate = solution.certificate

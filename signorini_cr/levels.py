@@ -92,6 +92,7 @@ def solve_levels(
         check_refinable(domain.mesh)
 
     limits = Limits(max_time)
+    limits.begin(domain, element, restart)
 
     def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
         if solution.level.number + 1 >= levels:

@@ -9,6 +9,8 @@ from mpi4py import MPI
 
 from .errors import NotConverged
 from .memory import most_memory, shortage
+from .mesh.domain import Domain
+from .restart import Restart
 from .vi.solved import Solved
 
 BYTES = 800.0
@@ -39,6 +41,23 @@ class Limits:
         self._passed = 0.0
         self._before: _Taken | None = None
 
+    def begin(self, domain: Domain, element: str, restart: Restart | None) -> None:
+        """Look whether memory holds the first level to be solved; collective.
+
+        Args:
+            domain: The coarsest mesh.
+            element: "CR" or "P1".
+            restart: Where to go on, if it is not the coarsest mesh.
+
+        Raises:
+            NotConverged: It does not.
+        """
+        comm, topology, number = domain.mesh.comm, domain.mesh.topology, 0
+        dofs = topology.index_map(0 if element == "P1" else topology.dim - 1).size_global
+        if restart is not None:
+            number, dofs = len(restart.added), len(restart.u[0][0])
+        _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
+
     def admit(self, solution: Solved, dofs: int) -> None:
         """Look, when a level is done, whether the next one fits; collective.
 
@@ -67,8 +86,10 @@ class Limits:
         if self._max_time is not None and passed + seconds > self._max_time:
             left = max(self._max_time - passed, 0.0)
             words = f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"
-        if words is not None:
-            raise NotConverged(
-                f"its {dofs} degrees of freedom would take about {words}",
-                solution.level.number + 1,
-            )
+        _refuse(solution.level.number + 1, dofs, words)
+
+
+def _refuse(number: int, dofs: int, words: str | None) -> None:
+    """Raise NotConverged if a level would take too much of something."""
+    if words is not None:
+        raise NotConverged(f"its {dofs} degrees of freedom would take about {words}", number)

@@ -264,6 +264,20 @@ def test_a_level_that_memory_does_not_hold_is_refused(case, monkeypatch, capfd) 
         assert "GB more memory, and there are 0.1 GB" in error
 
 
+@pytest.mark.parametrize("element, dim", [("CR", 1), ("P1", 0)])
+def test_so_is_a_first_level(element: str, dim: int, monkeypatch) -> None:
+    """After a restart it is the last one that was solved; one byte is left."""
+    problem, domain = Problem(f=-3.0, obstacle=-0.2), rectangle(0.5)
+    coarse, fine = solve_levels(problem, domain, 2, element)
+    restart = Restart.of(fine, Restart.of(coarse, None, False), False)
+    monkeypatch.setattr(memory, "_spare", lambda: 1.0)
+    dofs = domain.mesh.topology.index_map(dim).size_global
+    for start, number, count in ((None, 0, dofs), (COMM.bcast(restart), 1, fine.dofs)):
+        with pytest.raises(NotConverged, match=f"its {count} degrees of freedom") as caught:
+            next(solve_levels(problem, domain, 2, element, restart=start))
+        assert caught.value.level == number
+
+
 @pytest.mark.serial
 def test_what_is_left(monkeypatch, tmp_path: Path) -> None:
     """Of the address space, of the machine, and of cgroups of both versions, caches added."""
