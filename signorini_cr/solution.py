@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 
 import numpy as np
 from dolfinx import fem
@@ -56,9 +57,8 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """A table and a picture, for notebooks; of the certificate what has been made."""
-        from . import notebook  # by the front door, as what draws stands above the solution
-
-        return str(notebook.as_html(self))
+        # through the package's public names, as what draws stands above the solution
+        return str(import_module("signorini_cr").notebook.as_html(self))
 
     @property
     def domain(self) -> Domain:

@@ -110,6 +110,11 @@ class Certificate:
         y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 
+    @property
+    def companion_at_vertices(self) -> FloatArray | None:
+        """The companion v at the mesh's vertices, ghosts included, shape (vertices,)."""
+        return None if self._made is None else self._made.vertices
+
     @cached_property
     def companion(self) -> fem.Function | None:
         """The companion v; collective.
