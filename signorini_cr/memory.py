@@ -13,6 +13,7 @@ from petsc4py import PETSc
 CGROUPS = Path("/sys/fs/cgroup")
 
 _PETSC_ERR_MEM = 55
+# The last one stands in what the other ranks are told of a rank's error, see errors.fail_together
 _WORDS = ("std::bad_alloc", "Cannot allocate memory", "MemoryError")
 
 
