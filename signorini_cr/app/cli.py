@@ -7,6 +7,7 @@ misspelt option answer at once.
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -114,7 +115,10 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
             return BAD_INPUT
     except (Exception, KeyboardInterrupt) as error:
         if asked or isinstance(error, KeyboardInterrupt):
-            return _stopped_by(asked)
+            status = _stopped_by(asked)
+            if launched()[1] > 1:  # the others would wait for it, and it for them when MPI ends
+                os._exit(status)
+            return status
         raise
     try:
         from ..errors import InputError, NotConverged
@@ -133,7 +137,7 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         if asked or isinstance(error, KeyboardInterrupt):
             status = _stopped_by(asked)
             if not screen.root:  # which tells and ends all, if it was asked and can
-                time.sleep(1.0 + 0.5 * min(comm.rank, 4))
+                time.sleep(0.3 * min(1 + comm.rank, 5))
                 screen.root = True
             word = "terminated" if status == TERMINATED else "interrupted"
             screen.complain(f"{word}{kept and f'; {kept}'}")
