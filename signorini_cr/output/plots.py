@@ -143,8 +143,8 @@ def plot_solution(
             vmin=limits[0],
             vmax=limits[1],
         )
-        heights = MaxNLocator(9).tick_values(*limits)
-        inner = heights[(heights > limits[0]) & (heights < limits[1])]
+        heights = np.asarray(MaxNLocator(9).tick_values(*limits))
+        inner: FloatArray = heights[(heights > limits[0]) & (heights < limits[1])]
         rows, columns = ((np.arange(n) + 0.5) / n for n in image.shape)
         size = box[1] - box[0]
         x, y = box[0, 0] + columns * size[0], box[0, 1] + rows * size[1]
@@ -154,7 +154,7 @@ def plot_solution(
         draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
         if len(free):
             outlined = [Stroke(linewidth=5.5, foreground="black"), Normal()]
-            style = {"color": "white", "linewidth": 3.5, "path_effects": outlined}
+            style: dict[str, Any] = {"color": "white", "linewidth": 3.5, "path_effects": outlined}
             draw_lines(axes, chains(free), zorder=3, **style)
             axes.plot([], [], label="no contact", **style)
         if len(touching):
@@ -167,7 +167,7 @@ def plot_solution(
                       label="contact begins or ends")  # fmt: skip
         beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
         bar = figure.colorbar(shown, cax=beside)
-        bar.set_ticks(inner if len(inner) else list(limits))
+        bar.set_ticks(list(inner) if len(inner) else list(limits))
         for height in inner:
             bar.ax.axhline(height, color="white", linewidth=0.8, alpha=0.7)
         bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=8, ha="left", va="center")

@@ -46,6 +46,7 @@ FILES = (
     "solution.png",
     "contact.png",
     "convergence.png",
+    "report.html",
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 
