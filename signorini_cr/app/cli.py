@@ -193,6 +193,7 @@ def _solve_levels(
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged
     from ..output import report as output
+    from ..output.tables import LEGEND
     from ..restart import Restart
 
     case, domain = _read(args, screen, comm)
@@ -228,7 +229,10 @@ def _solve_levels(
         report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
+            if args.html:
+                names += _write_page(args, comm, folder, report)
         screen.line("")
+        screen.text(LEGEND)
         screen.text(_facts(records[-1]))
         if (reason := records[-1]["bound_reason"]) is not None:
             screen.text(f"no bound of the error: {reason}")
@@ -378,6 +382,21 @@ def _solutions(
             max_time=max_time,
             restart=restart,
         )
+
+
+def _write_page(args: argparse.Namespace, comm: Any, folder: Path, report: Any) -> list[str]:
+    """The run as one page; collective."""
+    from ..errors import on_root
+    from ..output.files import write_files, write_text
+    from ..output.page import run_page
+
+    def make() -> str:
+        source = args.file.read_text(encoding="utf-8")
+        return run_page(folder, source, report, args.words, _facts(report["levels"][-1]))
+
+    name = "report.html"
+    write_files(folder, {name: lambda path: on_root(comm, write_text, path, make)}, comm=comm)
+    return [name]
 
 
 def _facts(record: dict[str, Any]) -> str:
