@@ -21,6 +21,7 @@ from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
+import helpers
 import numpy as np
 from dolfinx import jit
 
@@ -127,14 +128,12 @@ def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
     for name in FILES:
         (out / name).write_text("former")
     launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
-    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "PMI" not in k}
-    clean["XDG_CACHE_HOME"] = str(own_cache(folder))
     run = subprocess.Popen(
         [*launch, sys.executable, "-m", "signorini_cr", "solve", str(case), "--out", str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=clean,
+        env=helpers.clean_environment(XDG_CACHE_HOME=str(own_cache(folder))),
         start_new_session=True,
     )
     began = time.monotonic()

@@ -14,12 +14,12 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from helpers import MESHES
 
 from signorini_cr.errors import InputError
 from signorini_cr.mesh.domain import PARTS
 from signorini_cr.mesh.gmshmesh import Triangulation, read
 
-MESHES = Path(__file__).parent.parent / "meshes"
 NUMBERS = (
     "0 -1 1 2 3 7 48 49 50 nan inf -inf 1e308 1e99 1e30 -5 0.5 1e-300 2147483648 "
     "9223372036854775807 99999999999999999999 1_0 0x10 +4 1e3 -0 abc 1e 4.1 15 92"

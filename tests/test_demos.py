@@ -3,78 +3,79 @@
 A demo ends in assertions of its own, so that its exit status says whether its numbers are right.
 """
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from helpers import DEMOS, is_picture, script, start
+from mpi4py import MPI
+
+from signorini_cr import InputError, exact, solve
+from signorini_cr.output.errorplot import plot_error
 
 pytestmark = pytest.mark.slow
 
-DEMOS = Path(__file__).parent.parent / "demos"
-SECONDS = 600
+
+COMM = MPI.COMM_WORLD
 
 
-def run(ranks, *arguments, levels=5):
-    """Start a demo under mpirun, free of what this process's own MPI left in the environment."""
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if not re.match(r"(PMIX|PMI_|PRTE_(?!MCA)|OMPI_(?!MCA|ALLOW))", name)
-    }
-    environment["SIGNORINI_DEMO_LEVELS"] = str(levels)
-    return subprocess.run(
-        ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=SECONDS,
-        check=False,
-    )
+@pytest.fixture(scope="module")
+def studies(tmp_path_factory):
+    """Every demo of the theory in one go, as docs/studies.md is made."""
+    folder = COMM.bcast(tmp_path_factory.mktemp("studies"))
+    status, printed = script(DEMOS, folder, SIGNORINI_DEMO_LEVELS="5")
+    assert status == 0
+    return folder, COMM.bcast(printed)
 
 
-@pytest.mark.serial
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_demo_s1(ranks, tmp_path):
-    result = run(ranks, DEMOS / "demo_s1.py", tmp_path)
-    assert result.returncode == 0, result.stderr
-    # One row per level, whatever the number of ranks
-    rows = [line.split() for line in result.stdout.splitlines() if re.match(r"\s+\d+ ", line)]
-    assert [int(row[0]) for row in rows] == [0, 1, 2, 3, 4]
-    for name in ("solution", "contact", "convergence"):
-        assert is_picture(tmp_path / f"s1-{name}.png")
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_all_studies(ranks, tmp_path):
-    """Every demo in one go, as docs/studies.md is made; the page shows all the pictures."""
-    result = run(ranks, DEMOS, tmp_path)
-    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
-    page = (tmp_path / "studies.md").read_text(encoding="utf-8")
+def test_the_page_shows_all_that_the_studies_drew(studies):
+    folder, _ = studies
+    page = (folder / "studies.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"!\[[^]]*\]\(studies/([^)]*\.png)\)", page))
-    assert shown == {path.name for path in (tmp_path / "studies").iterdir()}
-    assert all(is_picture(tmp_path / "studies" / name) for name in shown)
-    scripts = {path.name for path in DEMOS.glob("demo_*.py")}
-    listed = {name for name in scripts if f"demos/{name}" in page}
+    assert shown == {path.name for path in (folder / "studies").iterdir()}
+    assert all(is_picture(folder / "studies" / name) for name in shown)
+    listed = {path.name for path in DEMOS.glob("demo_*.py") if f"demos/{path.name}" in page}
     assert {"demo_s1.py", "demo_theorem_31.py", "demo_estimate.py"} <= listed
     assert len(shown) >= len(listed)
 
 
-def is_picture(path):
-    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+def test_the_first_demo_prints_a_row_a_level(studies):
+    folder, printed = studies
+    first = printed.split("demo_s1: ")[0].splitlines()
+    rows = [line.split() for line in first if re.match(r"\s+\d+ ", line)]
+    assert [int(row[0]) for row in rows] == [0, 1, 2, 3, 4]
+    drawn = {path.name for path in (folder / "studies").glob("s1-*.png")}
+    assert drawn == {f"s1-{name}.png" for name in ("solution", "contact", "convergence")}
+
+
+@pytest.mark.parametrize(
+    ("demo", "pictures"),
+    [
+        ("demo_certificate.py", {"certificate"}),
+        (
+            "demo_adaptive.py",
+            {"adaptive-l-shape-error", "adaptive-hole-mesh", "adaptive-convergence"},
+        ),
+    ],
+)
+def test_demos_of_the_certificate(demo, pictures, shared_tmp_path):
+    assert script(DEMOS / demo, shared_tmp_path, SIGNORINI_DEMO_LEVELS="3")[0] == 0
+    assert {path.stem for path in shared_tmp_path.glob("*.png") if is_picture(path)} >= pictures
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("name", ["demo_theorem_31"])  # and those of test_certificate_demos.py
-def test_demos_on_their_own(name, ranks, tmp_path):
-    result = run(ranks, DEMOS / f"{name}.py", tmp_path, levels=4)
-    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-4000:]
-    pictures = list(tmp_path.glob("*.png"))
-    assert pictures and all(is_picture(path) for path in pictures)
+def test_a_demo_starts_as_its_users_start_it(tmp_path):
+    done = start(DEMOS / "demo_facet_sets.py", tmp_path, ranks=2, SIGNORINI_DEMO_LEVELS="4")
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    assert "written: " in done.stdout
+
+
+def test_picture_of_the_error(shared_tmp_path):
+    domain = exact.S1.structured(6)
+    plot_error(solve(exact.S1.problem, domain), shared_tmp_path / "error.png", "S1")
+    assert is_picture(shared_tmp_path / "error.png")
+    with pytest.raises(InputError, match="no bound to draw"):
+        plot_error(solve(exact.S1.problem, domain, "P1"), shared_tmp_path / "none.png")
 
 
 @pytest.mark.serial

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import CellType, create_unit_square
+from helpers import MESHES
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
@@ -41,7 +42,6 @@ ENDS: Counter[str] = Counter()
 """How the examples of a long run ended."""
 SECONDS = 20.0
 """Nothing that is drawn here takes a second; this is for machines that are busy."""
-MESHES = Path(__file__).parent.parent / "meshes"
 
 
 # Expressions

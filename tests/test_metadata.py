@@ -1,13 +1,11 @@
 """What is told of the program in several files is the same in all of them."""
 
 import re
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
 import signorini_cr
-
-ROOT = Path(__file__).parent.parent
 
 
 @pytest.mark.serial

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
+from helpers import ROOT
 from mpi4py import MPI
 
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, KEYS, page
 
-ROOT = Path(__file__).parent.parent
 BASE = {
     "domain": {
         "vertices": "vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]",

@@ -7,12 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import helpers
 import kills
 import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from test_cli import process
 
 from signorini_cr import memory
 from signorini_cr.app import cli
@@ -62,7 +62,7 @@ def test_where_memory_ends_the_levels_before_are_kept(ranks, lone, tmp_path: Pat
     (tmp_path / "case.toml").write_text(kills.CASE)
     (tmp_path / "run.py").write_text(LIMITED.replace("LONE_RANK", repr(lone)))
     argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = process(*argv, ranks=ranks, program=[tmp_path / "run.py"])
+    done = helpers.start(tmp_path / "run.py", *argv, ranks=ranks)
     assert done.returncode == cli.NOT_CONVERGED, done.stderr
     words = " ".join(done.stderr.split())
     level = int(words.split("stopped on level ")[1].split(":")[0])

@@ -5,6 +5,7 @@ from pathlib import Path
 import mesh_mutations
 import numpy as np
 import pytest
+from helpers import MESHES
 
 from signorini_cr.errors import InputError
 from signorini_cr.mesh import mshfile
@@ -55,7 +56,7 @@ def test_the_four_formats_say_the_same(texts, tmp_path: Path) -> None:
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_a_line_cut_in_two_is_named(name: str, share: float, tmp_path: Path) -> None:
     """Such a file made gmsh fault, which no program survives."""
-    lines = (mesh_mutations.MESHES / name).read_text().split("\n")
+    lines = (MESHES / name).read_text().split("\n")
     begin, end = lines.index("$Nodes"), lines.index("$EndNodes")
     at = max(range(begin, end), key=lambda i: len(lines[i]))
     cut = int(share * len(lines[at]))

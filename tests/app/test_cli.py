@@ -7,9 +7,10 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
+import helpers
 import pytest
 from mpi4py import MPI
 
@@ -514,19 +515,6 @@ def test_petsc_takes_them(write) -> None:
     options.delValue("signorini_cr_probe")
 
 
-def process(
-    *argv: str | Path, ranks: int = 1, program: Sequence[str | Path] = (), **options
-) -> subprocess.CompletedProcess[str]:
-    """The command as users start it, or a program in its place."""
-    launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
-    command = [*launch, sys.executable, *(program or ("-m", "signorini_cr")), *map(str, argv)]
-    # Not the variables of an MPI that runs these tests
-    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "PMI" not in k}
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, env=clean, **options
-    )
-
-
 @pytest.mark.serial
 def test_help_answers_without_the_heavy_libraries() -> None:
     program = (
@@ -543,13 +531,13 @@ def test_help_answers_without_the_heavy_libraries() -> None:
     for word in ("--out DIR", "--levels N", "cr|p1", "--quiet", "PETSc", "FILE-out"):
         assert word in done.stdout
     assert max(map(len, done.stdout.split("\n"))) <= 80
-    assert process("--version").stdout.startswith("signorini-cr 0.")
+    assert helpers.command("--version").stdout.startswith("signorini-cr 0.")
 
 
 @pytest.mark.serial
 def test_on_two_ranks_mistakes_are_told_once(tmp_path: Path) -> None:
     for argv in (["solve", "x.toml", "--level", "3"], ["solve", tmp_path / "none.toml"]):
-        done = process(*argv, ranks=2)
+        done = helpers.command(*argv, ranks=2)
         assert done.returncode == 2
         assert done.stderr.count("signorini-cr: ") == 1 and "Traceback" not in done.stderr
 
@@ -563,8 +551,8 @@ def test_a_rank_that_fails_alone_ends_the_run(tmp_path: Path) -> None:
         "    if not self.root:\n        raise RuntimeError('here')\n\n"
         "cli.Screen.step = step\nsys.exit(cli.main())\n"
     )
-    case, program = tmp_path / "case.toml", [tmp_path / "run.py"]
-    done = process("solve", case, "--out", tmp_path / "out", ranks=2, program=program)
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = helpers.start(tmp_path / "run.py", *argv, ranks=2)
     assert done.returncode == 1
     assert "RuntimeError: here" in done.stderr
     assert "signorini-cr: unexpected error on rank 1, see above" in done.stderr
@@ -577,7 +565,7 @@ def test_on_two_ranks_the_figures_are_the_same(tmp_path: Path) -> None:
     energies = []
     for ranks in (1, 2):
         out = tmp_path / str(ranks)
-        done = process("solve", tmp_path / "case.toml", "--out", out, ranks=ranks)
+        done = helpers.command("solve", tmp_path / "case.toml", "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
         energies.append(
             [r["energy"] for r in json.loads((out / "report.json").read_text())["levels"]]
@@ -589,7 +577,7 @@ def test_on_two_ranks_the_figures_are_the_same(tmp_path: Path) -> None:
 def test_without_out_the_results_lie_in_the_current_folder(tmp_path: Path) -> None:
     (tmp_path / "case.toml").write_text(CASE)
     (tmp_path / "work").mkdir()
-    done = process("solve", "../case.toml", "--quiet", cwd=tmp_path / "work")
+    done = helpers.command("solve", "../case.toml", "--quiet", cwd=tmp_path / "work")
     assert (done.returncode, done.stdout) == (0, "")
     assert (tmp_path / "work" / "case-out" / "report.json").exists()
 
@@ -599,13 +587,13 @@ def test_names_that_are_no_text(tmp_path: Path, monkeypatch) -> None:
     """Results in a folder the terminal can't spell, a problem file in a foreign encoding."""
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     (tmp_path / "case.toml").write_text(CASE)
-    done = process("solve", "case.toml", "--out", "Γ", cwd=tmp_path)
+    done = helpers.command("solve", "case.toml", "--out", "Γ", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\\u0393" in done.stdout
     assert (tmp_path / "Γ" / "report.json").exists()
     name = os.fsdecode(b"\xe4.toml")
     (tmp_path / name).write_text(CASE)
-    done = process("solve", name, cwd=tmp_path)
+    done = helpers.command("solve", name, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("signorini-cr: \\udce4.toml: this is no text in UTF-8")
 

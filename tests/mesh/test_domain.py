@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import cpp, fem
+from helpers import MESHES
 from mpi4py import MPI
 
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
@@ -17,7 +18,6 @@ from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain,
 from signorini_cr.mesh.partition import bisect
 
 COMM = MPI.COMM_WORLD
-MESHES = Path(__file__).parent.parent / "meshes"
 RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
 LABELS = ["contact", "dirichlet", "neumann", "dirichlet"]
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]

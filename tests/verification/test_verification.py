@@ -1,19 +1,17 @@
 """The verification suite runs, passes, fails when it must, and its references stand."""
 
-import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
+import helpers
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 pytestmark = pytest.mark.slow
 
-FOLDER = Path(__file__).parent.parent / "verification"
+FOLDER = helpers.ROOT / "verification"
 sys.path.insert(0, str(FOLDER))
 
 import bounds  # noqa: E402
@@ -105,30 +103,12 @@ def test_a_tenth_of_a_force_is_seen():
     assert verdict.error < 1e-5 and verdict.proper
 
 
-def run(ranks, *arguments):
-    """Start the suite under mpirun, free of what this process's own MPI left."""
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if not re.match(r"(PMIX|PMI_|PRTE_(?!MCA)|OMPI_(?!MCA|ALLOW))", name)
-    }
-    return subprocess.run(
-        ["mpirun", "-n", str(ranks), sys.executable, str(FOLDER), *map(str, arguments)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_quick_suite_passes(ranks, tmp_path):
-    out = tmp_path / "table.md"
-    result = run(ranks, "--quick", "--out", out, "--only", "forces", "random", "bounds", "thin")
+def test_quick_suite_passes(shared_tmp_path):
+    out = shared_tmp_path / "table.md"
+    names = "forces random bounds thin".split()
+    status, printed = helpers.script(FOLDER, "--quick", "--out", out, "--only", *names)
     text = out.read_text()
-    assert result.returncode == 0, text + result.stderr
+    assert status == 0, text + printed
     assert "**no**" not in text
     for title in ("Contact forces", "Random problems", "Bounds and energies", "Thin cells"):
         assert title in text
@@ -148,7 +128,7 @@ def test_no_bound_is_below_the_error_however_loose():
 def test_suite_fails_when_the_solver_stops_early(tmp_path):
     out = tmp_path / "table.md"
     options = ("-signorini_snes_atol", "1e-2", "-signorini_ksp_rtol", "0.3")
-    result = run(1, "--quick", "--only", "forces", "--out", out, *options)
+    result = helpers.start(FOLDER, "--quick", "--only", "forces", "--out", out, *options)
     assert result.returncode == 1
     assert "forces wrong" in out.read_text() or "refused" in out.read_text()
 

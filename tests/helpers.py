@@ -1,0 +1,87 @@
+"""What tests share: folders of the checkout, and processes started as users start them."""
+
+import contextlib
+import io
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+
+ROOT = Path(__file__).parent.parent
+DEMOS = ROOT / "demos"
+MESHES = ROOT / "meshes"
+
+
+def clean_environment(**more: str) -> dict[str, str]:
+    """The environment without what the MPI of this process left in it."""
+    left = re.compile(r"PMIX|PMI_|MPI_LOCALRANKID|PRTE_(?!MCA)|OMPI_(?!MCA|ALLOW)")
+    return {name: value for name, value in os.environ.items() if not left.match(name)} | more
+
+
+def start(
+    *arguments: str | Path,
+    ranks: int = 1,
+    seconds: float = 240,
+    cwd: Path | None = None,
+    **more: str,
+) -> subprocess.CompletedProcess[str]:
+    """Run this Python with such arguments, under mpirun unless one rank is asked for.
+
+    Args:
+        arguments: Script and its arguments, or `-m` and a module.
+        ranks: How many processes.
+        seconds: How long it may take.
+        cwd: Where it starts.
+        more: Variables of its environment.
+    """
+    launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    return subprocess.run(
+        [*launch, sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=seconds,
+        env=clean_environment(**more),
+        cwd=cwd,
+        check=False,
+    )
+
+
+def command(*arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Start `signorini-cr` as users do; `options` are those of `start`."""
+    return start("-m", "signorini_cr", *arguments, **options)
+
+
+def script(path: Path, *arguments: str | Path, **variables: str) -> tuple[int, str]:
+    """Run a program on the ranks of this process, as under mpirun; collective.
+
+    Args:
+        path: A script, or a folder with a `__main__.py`.
+        arguments: What stands behind it on the command line.
+        variables: Variables of its environment.
+
+    Returns:
+        Its exit status, and what this rank printed.
+    """
+    printed, status = io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(sys, "argv", [str(path), *map(str, arguments)])
+        patch.syspath_prepend(path if path.is_dir() else path.parent)
+        for name, value in variables.items():
+            patch.setenv(name, value)
+        try:
+            runpy.run_path(str(path), run_name="__main__")
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 1 if end.code else 0
+    MPI.COMM_WORLD.Barrier()  # whoever writes has written
+    return status, printed.getvalue()
+
+
+def is_picture(path: Path) -> bool:
+    """Whether it is a PNG with something on it."""
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
