@@ -26,7 +26,7 @@ import numpy as np
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "signorini_cr"
 TESTS = {
-    "estimate": "estimate data/test_enclosure.py",
+    "estimate": "estimate/test_terms.py estimate data/test_enclosure.py",
     "vi": "vi fem/test_conditions.py",
     "multigrid": "multigrid vi/test_thin.py",
 }
@@ -176,6 +176,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", metavar="FILE:LINE", nargs="*", help="the mutants of these lines")
     parser.add_argument("--tests", nargs="*", help="what to run instead of the street's tests")
+    parser.add_argument("--all", action="store_true", help="print those that are noticed as well")
     arguments = parser.parse_args()
     at = PACKAGE / arguments.what
     files = sorted(at.glob("*.py")) if at.is_dir() else [at]
@@ -196,8 +197,8 @@ def main() -> None:
         what, mutated = load(*place)
         end = end_of(mutated, tests, limit)
         ends[end] += 1
-        if end == "passed":
-            print(f"survives: {what}", flush=True)
+        if end == "passed" or arguments.all:
+            print(f"{end}: {what}", flush=True)
     noticed, number = ends["failed"] + ends["timeout"], ends.total()
     print(f"{noticed} of {number} mutants noticed, {noticed / number:.1%}; {len(pool)} there are")
 
