@@ -16,6 +16,7 @@ from signorini_cr.compat import cell_nodes
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import cusps
 from signorini_cr.estimate.certificate import certify
+from signorini_cr.estimate.force import _weight, force_bounds
 from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
@@ -43,16 +44,21 @@ class Pointwise:
         hats = np.column_stack([1 - reference.sum(axis=1), reference])
         return np.einsum("pi,nik->knp", hats, self.corners)
 
-    def __call__(self, function, reference, which=slice(None)):
-        """Values, shape (n, p, values), and gradients, shape (n, p, d, values)."""
+    def field(self, function):
+        """A function's dofs in each cell, and their element; collective."""
         shape = function.ufl_shape
         W = fem.functionspace(self.mesh, ("DG", 2 if shape else 3, shape))
         broken = fem.Function(W)
         broken.interpolate(function)
-        local = broken.x.array.reshape(-1, *(shape or (1,)))[W.dofmap.list[: self.number]][which]
-        table = W.element.basix_element.tabulate(1, reference)[..., 0]
-        values = np.einsum("pa,nab->npb", table[0], local)
-        slopes = np.einsum("nik,kpa,nab->npib", self.inverse[which], table[1:], local)
+        local = broken.x.array.reshape(-1, *(shape or (1,)))[W.dofmap.list[: self.number]]
+        return W.element.basix_element, local
+
+    def __call__(self, field, reference, which=slice(None)):
+        """Values, shape (n, p, values), and gradients, shape (n, p, d, values)."""
+        element, local = field
+        table = element.tabulate(1, reference)[..., 0]
+        values = np.einsum("pa,nab->npb", table[0], local[which])
+        slopes = np.einsum("nik,kpa,nab->npib", self.inverse[which], table[1:], local[which])
         return values, slopes
 
     def facets(self, domain, part):
@@ -66,16 +72,19 @@ class Pointwise:
         return [(cell, to_facets.links(cell).tolist().index(facet)) for cell, facet in own]
 
 
-def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=False):
+def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=False, phi=None):
     """What the certificate should say where f and g are affine and κ is constant on the cells.
 
-    Each cell has at most one facet on Γg. With `carried` the flux balances all of f and g.
+    Each cell has at most one facet on Γg. With `carried` the flux balances all of f and g. Where f
+    and g are constant κ may vary within cells. The force is bounded with the weight φ.
     """
     mesh = solution.domain.mesh
     at, d = Pointwise(mesh), mesh.topology.dim
-    reference, weights = basix.make_quadrature(getattr(basix.CellType, mesh.topology.cell_name()), 8)
+    reference, weights = basix.make_quadrature(
+        getattr(basix.CellType, mesh.topology.cell_name()), 8
+    )
     weights = weights / weights.sum()
-    fields = solution.u, certificate.flux, certificate.companion
+    fields = [at.field(one) for one in (solution.u, certificate.flux, certificate.companion)]
 
     def integral(values):
         return at.volume * (values @ weights)
@@ -84,11 +93,11 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
         return one(x) if callable(one) else np.full(x.shape[1:], float(one))
 
     x = at.points(reference)
-    k = data(kappa, at.corners.mean(axis=1).T)
+    K = data(kappa, x)
+    k = K.mean(axis=1)
     (_, du), (y, dy), (_, dv) = (at(one, reference) for one in fields)
     u, v = (at(one, reference)[0][..., 0] for one in (fields[0], fields[2]))
-    p = y - k[:, None, None] * du[..., 0]
-    b = k[:, None, None] * (dv - du)[..., 0]
+    p, b = y - K[..., None] * du[..., 0], K[..., None] * (dv - du)[..., 0]
     rest = data(f, x)
     rest = rest - (rest @ weights)[:, None]
     # y − κ∇u_h = slope x + steady is the gradient of a quadratic, up to what y has beyond
@@ -101,12 +110,17 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
 
     everywhere = np.arange(at.number)[:, None]
     poincare = 1 / 3.8317059702 if d == 2 else 1 / np.pi
-    pp, bb, pb = (integral((s * t).sum(axis=2)) / k for s, t in ((p, p), (b, b), (p, b)))
+    pp, bb, pb = (integral((s * t).sum(axis=2) / K) for s, t in ((p, p), (b, b), (p, b)))
     of_f = poincare * at.h * np.sqrt(integral(rest**2))
     of_flux = integral(rest * potential(everywhere, x)) / k
     of_companion = integral(rest * (v - u))
-    energy = integral(k[:, None] * (dv**2).sum(axis=(2, 3)) / 2 - data(f, x) * v)
-    on_edge, contact = np.zeros((2, at.number))
+    energy = integral(K * (dv**2).sum(axis=(2, 3)) / 2 - data(f, x) * v)
+    on_edge, contact, force = np.zeros((3, at.number))
+    if phi is not None:
+        phi = at.field(phi)
+        weight, slopes = (one[..., 0] for one in at(phi, reference))
+        force = 0.5 * integral(((b - p) * slopes).sum(axis=2) - rest * weight)
+        steep = integral(K * (slopes**2).sum(axis=2))
     points, facet_weights = basix.make_quadrature(
         basix.CellType.interval if d == 2 else basix.CellType.triangle, 8
     )
@@ -123,16 +137,20 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
             if part == CONTACT:
                 above = v_F[:, 0] - data(obstacle, where)[0]
                 contact[cell] += measure * facet_weights @ ((y_F @ normal) * above)
+                force[cell] += measure * facet_weights @ (y_F @ normal)
             elif g is not None:
                 values = data(g, where)[0]
                 off = values - facet_weights @ values
                 c = poincare * at.h[cell]
                 c = np.sqrt(measure / at.volume[cell] * c * (c + 2 * at.h[cell] / d))
                 on_edge[cell] = c * np.sqrt(measure * facet_weights @ off**2)
-                phi = potential(np.array([[cell]]), where)[0] / k[cell]
-                of_flux[cell] += measure * facet_weights @ (off * phi)
+                rise = potential(np.array([[cell]]), where)[0] / k[cell]
+                of_flux[cell] += measure * facet_weights @ (off * rise)
                 change = measure * facet_weights @ (off * (v_F - u_F)[:, 0])
                 of_companion[cell] += change if d == 2 else 0.0
+                if phi is not None:
+                    weight_F = at(phi, hats, [cell])[0][0, :, 0]
+                    force[cell] -= 0.5 * measure * facet_weights @ (off * weight_F)
                 energy[cell] -= measure * facet_weights @ (values * v_F[:, 0])
     loose, load = 0.0, (of_f + on_edge) ** 2 / k
     if carried:
@@ -143,11 +161,13 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
     far = pp + bb + load + 2 * of_flux - 2 * (pb + of_companion)
     near = pp + bb + load + 2 * of_flux + 2 * (pb + of_companion)
     total = dict(far=far, near=near, contact=contact, pp=pp, bb=bb, load=load, energy=energy)
-    total |= dict(neumann=on_edge**2 / k, of_gradients=near / k)
+    total |= dict(neumann=on_edge**2 / k, of_gradients=near / K.min(axis=1), force=force)
+    if phi is not None:
+        total |= dict(steep=steep)
     total = {name: WORLD.allreduce(values.sum()) for name, values in total.items()}
     far, near = np.sqrt(total["far"]) + loose, np.sqrt(total["near"])
     radius = loose / 2 + np.sqrt(far**2 / 4 + total["contact"])
-    least = WORLD.allreduce(k.min(initial=np.inf), op=MPI.MIN)
+    least = WORLD.allreduce(K.min(initial=np.inf), op=MPI.MIN)
     return SimpleNamespace(
         bound=near / 2 + radius,
         bound_h1=np.sqrt(total["of_gradients"]) / 2 + radius / np.sqrt(least),
@@ -162,7 +182,8 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
             "boundary": 0.0,
         },
         indicators=pp + bb + of_f**2 / k + on_edge**2 / k + contact,
-        reach=radius + loose,
+        force=total["force"],
+        reach=(radius + loose) * np.sqrt(total.get("steep", 0.0)),
     )
 
 
@@ -290,11 +311,64 @@ def test_a_cubic_solution_on_thin_cells(monkeypatch):
     agrees(certificate, again(solution, certificate, 1.0, f, 0.0, -9.0, carried=True), 1e-6)
 
 
+def test_a_coefficient_that_varies():
+    """What quadrature may miss is added, and is little."""
+    kappa = lambda x: 2 + x[0] * x[1] / 5  # noqa: E731
+    solution = solve(Problem(f=-30.0, obstacle=bowl, coefficient=kappa), square(8))
+    certificate = certify(solution)
+    found = again(solution, certificate, kappa, -30.0, 0.0)
+    for name in ("flux", "companion", "contact"):
+        assert np.isclose(certificate.parts[name], found.parts[name], rtol=1e-6)
+    for name in ("bound_energy_norm", "bound_h1", "bound_companion"):
+        value, low = getattr(certificate, name), getattr(found, name.replace("_energy_norm", ""))
+        assert low <= value * (1 + 1e-9) and value <= 1.01 * low
+    (low, high), width = certificate.energy, np.ptp(found.energy)
+    assert found.energy[0] - 0.02 * width <= low <= found.energy[0]
+    assert found.energy[1] <= high <= found.energy[1] + 0.02 * width
+
+
+@pytest.mark.parametrize("noise", [1e-3, 0.1])
+def test_what_a_solver_leaves_is_carried_away(noise):
+    """Afterwards y balances the load as if it had been solved."""
+    solution = solve(Problem(f=-12.0, obstacle=bowl), square(8))
+    u, fixed = solution.u, solution.level.system.dirichlet
+    rng = np.random.default_rng(2)
+    change = noise * rng.standard_normal(u.function_space.dofmap.index_map.size_local)
+    u.x.array[: len(change)] += change
+    u.x.array[fixed] = 0.0
+    u.x.scatter_forward()
+    certificate = certify(solution)
+    at, y = Pointwise(solution.domain.mesh), certificate.flux
+    _, dy = at(at.field(y), np.full((1, 2), 1 / 3))
+    assert np.allclose(dy[:, 0].trace(axis1=1, axis2=2), 12.0, atol=1e-9)
+    found = again(solution, certificate, 1.0, -12.0, 0.0)
+    assert np.isclose(certificate.bound_h1, found.bound_h1, rtol=1e-7)
+    assert certificate.parts["solver"] > noise
+    assert np.allclose(certificate.energy, found.energy, rtol=1e-7)
+
+
+def test_force():
+    polygon = Polygon(
+        [[0, 0], [1, 0], [1, 1], [0.5, 1.5], [0, 1]],
+        ("contact", "neumann", "dirichlet", "dirichlet", "neumann"),
+    )
+    data = {"f": lambda x: -9 + 3 * x[0], "g": lambda x: 0.4 - x[1]}
+    problem = Problem(**data, obstacle=bowl, coefficient=2.0)
+    solution = solve(problem, polygon.mesh(0.12))
+    certificate = solution.certificate
+    found = again(solution, certificate, 2.0, *data.values(), phi=_weight(solution))
+    agrees(certificate, found)
+    low, high = force_bounds(solution)
+    assert np.isclose((low + high) / 2, found.force, rtol=1e-6)
+    assert np.isclose((high - low) / 2, found.reach, rtol=1e-6)
+
+
+@pytest.mark.serial
 def test_tetrahedra():
     mesh = create_box(MPI.COMM_SELF, [(0, 0, 0), (1, 1, 1)], (2, 3, 2))
     mesh.topology.create_connectivity(2, 3)
     facets = exterior_facet_indices(mesh.topology)
-    x, y, z = compute_midpoints(mesh, 2, facets).T
+    _, y, z = compute_midpoints(mesh, 2, facets).T
     parts = np.where(z < 1e-9, CONTACT, np.where(y > 1 - 1e-9, NEUMANN, DIRICHLET))
     domain = Domain.from_tags(mesh, meshtags(mesh, 2, facets, parts.astype(np.int32)))
     data = {"f": lambda x: 3 + x[0] - 9 * x[2], "g": lambda x: x[0] - 2 * x[2]}
@@ -305,4 +379,3 @@ def test_tetrahedra():
     solution = SimpleNamespace(level=level, u=u, element="CR", domain=domain)
     certificate = certify(solution)
     agrees(certificate, again(solution, certificate, 2.0, *data.values(), -9.0))
-
