@@ -10,6 +10,8 @@ from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
 from signorini_cr.data.diffusion import diffusion
+from signorini_cr.estimate import certificate
+from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
 from signorini_cr.estimate.lifting import Cubic, lift
@@ -322,3 +324,107 @@ def test_what_children_lack_is_spread_over_their_parents():
     fluxes, _ = _carry(coarse, left)
     square_ = field_squares(coarse, fluxes, slice(0, coarse.number)) / kappa
     assert np.isclose(found, truth + np.sqrt(WORLD.allreduce(square_.sum())), rtol=1e-9)
+
+
+# ---- sums of what is known by its size alone
+
+
+def some_cells(seed):
+    """A mesh, and random data on its cells."""
+    domain = square(2, comm=MPI.COMM_SELF)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng = np.random.default_rng(seed)
+    kappa = SimpleNamespace(
+        low=rng.uniform(0.5, 1, cells.number), high=rng.uniform(1, 3, cells.number)
+    )
+    kappa.mean = (kappa.low + kappa.high) / 2
+    rows = dict(
+        zip(
+            ("indicators", "steepness", "middle", "across"),
+            rng.uniform(size=(4, cells.number)),
+            strict=True,
+        )
+    )
+    return cells, rng, kappa, Sums(**rows)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("known", [0, 1, 2])
+def test_what_a_lifting_changes(known):
+    """By Cauchy and Schwarz, cell by cell; a corner's cell has two liftings."""
+    cells, rng, kappa, sums = some_cells(1)
+    before = {name: getattr(sums, name).copy() for name in ("indicators", "middle", "across")}
+    at, slope, size = np.array([1, 4, 4]), rng.uniform(size=3), rng.uniform(size=3)
+    variance = rng.uniform(size=cells.number) if known else None
+    rough = rng.uniform(size=cells.number) if known > 1 else None
+    load = SimpleNamespace(mean=-rng.uniform(size=cells.number), variance=variance)
+    certain = SimpleNamespace(load=load, rough=rough)
+    v = SimpleNamespace(lift=(at, slope, size))
+    found = certificate._lifted(cells, kappa, certain, v, sums)
+    square_, change, far, near = 0.0, 0.0, 0.0, 0.0
+    for cell, which in ((1, [0]), (4, [1, 2])):
+        steep = np.sqrt(kappa.high[cell]) * slope[which].sum()
+        volume = cells.volume[cell]
+        norm = np.sqrt(volume) * np.sqrt(
+            load.mean[cell] ** 2 + (0.0 if variance is None else variance[cell])
+        )
+        norm += 0.0 if rough is None else rough[cell]
+        square_ += steep**2
+        change += np.sqrt(sums.steepness[cell]) * steep + steep**2 / 2 + norm * size[which].sum()
+        far += 2 * np.sqrt(before["across"][cell]) * steep + steep**2
+        more = 2 * np.sqrt(before["middle"][cell]) * steep + steep**2
+        near += more
+        assert np.isclose(sums.middle[cell], before["middle"][cell] + more)
+        assert np.isclose(sums.indicators[cell], before["indicators"][cell] + steep**2)
+    assert np.allclose(found, (square_, change, far, near))
+    assert np.array_equal(sums.middle[[0, 2, 3]], before["middle"][[0, 2, 3]])
+    none = SimpleNamespace(lift=(at[:0], slope[:0], size[:0]))
+    assert certificate._lifted(cells, kappa, certain, none, sums) == (0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.serial
+def test_rounding():
+    """As large as values times the hat functions' gradients, and as h‖f‖; of whatever sign."""
+    cells, rng, kappa, _ = some_cells(2)
+    none = SimpleNamespace(beyond=None)
+    for sign in (1, -1):
+        w = sign * np.array([[3.0], [1.0], [2.0]]) * np.ones(cells.number)
+        load = SimpleNamespace(mean=np.zeros(cells.number), variance=None)
+        of_hats = -2 * cells.stiffness.sum(axis=0)
+        found = certificate._rounding(cells, kappa, w, load, none)
+        expected = np.sqrt(np.sum(kappa.high * of_hats * 9.0))
+        assert np.isclose(found, 64 * 2.0**-52 * expected)
+    load = SimpleNamespace(mean=-np.ones(cells.number), variance=np.full(cells.number, 4.0))
+    expected = cells.lengths.max(axis=0) * cells.volume * 9.0 / kappa.low
+    found = certificate._rounding(cells, kappa, 0 * w, load, none)
+    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()))
+    heights = rng.normal(size=len(cells.exterior))
+    load.mean[:], load.variance = 0.0, None
+    flux = SimpleNamespace(beyond=Beyond(heights, None))
+    expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.low
+    found = certificate._rounding(cells, kappa, 0 * w, load, flux)
+    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()))
+
+
+def test_size_of_the_bound():
+    """‖p‖; where that is nothing, as u_h jumps without a flux, the jumps."""
+    solution = solve(Problem(f=-12.0), square(4))
+    data = diffusion(solution.level.data)
+    cells, kappa = data.cells, SimpleNamespace(mean=np.array(2.0))
+    w = certificate.vertex_rows(solution.u.x.array, cells)
+    slopes = np.ones(cells.number)
+    flux = SimpleNamespace(excess=np.random.default_rng(WORLD.rank).normal(size=w.shape))
+    squares = field_squares(cells, flux.excess, slice(0, cells.number)) / 2
+    truth = np.sqrt(WORLD.allreduce(squares.sum()))
+    assert np.isclose(certificate._size(cells, kappa, w, flux, slopes), truth)
+    flux.excess[:] = 0.0
+    found = certificate._size(cells, kappa, w, flux, slopes)
+    index_map = cells.domain.mesh.topology.index_map(0)
+    sums, count = np.zeros((2, index_map.size_local + index_map.num_ghosts))
+    np.add.at(sums, cells.vertices, w)
+    np.add.at(count, cells.vertices, 1.0)
+    mean = cells.share(sums, 0) / np.maximum(cells.share(count, 0), 1.0)
+    change = mean[cells.vertices] - w
+    jumps = 2.0 * (change * cells.apply(change, slice(0, cells.number))).sum()
+    assert np.isclose(found, np.sqrt(WORLD.allreduce(jumps))) and found > 1e-3
+    assert certificate._size(cells, kappa, 0 * w, flux, slopes) < 1e-6
