@@ -1,5 +1,6 @@
 """Pieces of the certificate by quadrature of another kind: liftings, cusps, what is carried."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,8 @@ from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
 from signorini_cr.data.diffusion import diffusion
-from signorini_cr.estimate import certificate
+from signorini_cr.data.loads import Segments
+from signorini_cr.estimate import certificate, flux
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
@@ -171,8 +173,8 @@ def test_integrals_of_cusps(where):
     rows = [np.zeros(number) for _ in range(4)]
     names = ("indicators", "steepness", "middle", "across")
     sums = Sums(**dict(zip(names, rows, strict=True)))
-    flux = SimpleNamespace(excess=P, beyond=None)
-    assert cusp.add(cells, w, load, kappa, flux, (excess, bumps), sums) == 0.0
+    fluxes = SimpleNamespace(excess=P, beyond=None)
+    assert cusp.add(cells, w, load, kappa, fluxes, (excess, bumps), sums) == 0.0
     gains, means = cusp.gains(cells, excess, bumps), cusp.means
     of_hats, of_bumps = cusp.pulls(cells)
     steepness, energy, crosses = np.zeros((3, number))
@@ -208,7 +210,7 @@ def test_integrals_of_cusps(where):
     for row in (sums.middle, sums.across):
         row[:] = 0.0
     load.variance = variance
-    slack = cusp.add(cells, w, load, kappa, flux, (excess, bumps), sums)
+    slack = cusp.add(cells, w, load, kappa, fluxes, (excess, bumps), sums)
     truth = 0.0
     for cell, _, _, slope, weights, *_ in by_duffy(cells, cusp):
         h = np.linalg.norm(x[cell] - np.roll(x[cell], 1, axis=0), axis=1).max()
@@ -400,9 +402,9 @@ def test_rounding():
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()))
     heights = rng.normal(size=len(cells.exterior))
     load.mean[:], load.variance = 0.0, None
-    flux = SimpleNamespace(beyond=Beyond(heights, None))
+    fluxes = SimpleNamespace(beyond=Beyond(heights, None))
     expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.low
-    found = certificate._rounding(cells, kappa, 0 * w, load, flux)
+    found = certificate._rounding(cells, kappa, 0 * w, load, fluxes)
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()))
 
 
@@ -413,12 +415,12 @@ def test_size_of_the_bound():
     cells, kappa = data.cells, SimpleNamespace(mean=np.array(2.0))
     w = certificate.vertex_rows(solution.u.x.array, cells)
     slopes = np.ones(cells.number)
-    flux = SimpleNamespace(excess=np.random.default_rng(WORLD.rank).normal(size=w.shape))
-    squares = field_squares(cells, flux.excess, slice(0, cells.number)) / 2
+    fluxes = SimpleNamespace(excess=np.random.default_rng(WORLD.rank).normal(size=w.shape))
+    squares = field_squares(cells, fluxes.excess, slice(0, cells.number)) / 2
     truth = np.sqrt(WORLD.allreduce(squares.sum()))
-    assert np.isclose(certificate._size(cells, kappa, w, flux, slopes), truth)
-    flux.excess[:] = 0.0
-    found = certificate._size(cells, kappa, w, flux, slopes)
+    assert np.isclose(certificate._size(cells, kappa, w, fluxes, slopes), truth)
+    fluxes.excess[:] = 0.0
+    found = certificate._size(cells, kappa, w, fluxes, slopes)
     index_map = cells.domain.mesh.topology.index_map(0)
     sums, count = np.zeros((2, index_map.size_local + index_map.num_ghosts))
     np.add.at(sums, cells.vertices, w)
@@ -427,4 +429,110 @@ def test_size_of_the_bound():
     change = mean[cells.vertices] - w
     jumps = 2.0 * (change * cells.apply(change, slice(0, cells.number))).sum()
     assert np.isclose(found, np.sqrt(WORLD.allreduce(jumps))) and found > 1e-3
-    assert certificate._size(cells, kappa, 0 * w, flux, slopes) < 1e-6
+    assert certificate._size(cells, kappa, 0 * w, fluxes, slopes) < 1e-6
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("of_f", [False, True])
+@pytest.mark.parametrize("of_g", [False, True])
+def test_what_quadrature_misses(of_f, of_g):
+    """Means times what is missed, and Poincaré's inequality for what is left, on cells and facets.
+
+    On a facet c = ((|F|/|T|) C h (C h + h))^{1/2}, C h Poincaré's constant of the triangle.
+    """
+    problem = Problem(f=1.0, g=lambda x: 0.4 - x[1])
+    sides = ("contact", "neumann", "dirichlet", "neumann")
+    level = solve(problem, square(3, sides, MPI.COMM_SELF)).level
+    data = diffusion(level.data)
+    cells, (edge,) = data.cells, data.edges
+    rng = np.random.default_rng(4)
+    n, number = len(edge.measure), cells.number
+    kappa = SimpleNamespace(low=rng.uniform(0.5, 1, number))
+    segments = Segments.of(edge, cells, kappa.low, 1.0)
+    missed, rough = (rng.uniform(size=n) * of_g for _ in range(2))
+    segments = replace(segments, missed=missed, rough=rough)
+    zero = np.zeros(number)
+    of_cells = (rng.uniform(size=number), rng.uniform(size=number)) if of_f else (None, None)
+    certain = SimpleNamespace(missed=of_cells[0], rough=of_cells[1])
+    steepness = rng.uniform(size=number)
+    bumps = rng.normal(size=len(cells.exterior))
+    vertices = rng.normal(size=cells.vertices.max() + 1)
+    at, means = np.array([2, 5]), np.array([0.3, -0.4])
+    v = SimpleNamespace(vertices=vertices, bumps=bumps, cusps=SimpleNamespace(at=at, means=means))
+    sums = SimpleNamespace(steepness=steepness)
+    loose, change = certificate._hidden(level, cells, kappa, certain, segments, v, sums, np.inf)
+    poincare = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702
+    total, squares, energy = zero.copy(), 0.0, 0.0
+    if of_f:
+        total += of_cells[0]
+        left = poincare / np.sqrt(kappa.low) * of_cells[1]
+        squares = np.sum(left**2)
+        mean = np.abs(vertices[cells.vertices].mean(axis=0))
+        mean += np.abs(bumps[cells.facets]).sum(axis=0) / 3
+        mean[at] += np.abs(means)
+        energy += np.sum(mean * of_cells[0] + left * np.sqrt(steepness))
+    by_cell = {}
+    for facet, (cell, local) in enumerate(zip(edge.side.cells, edge.side.local, strict=True)):
+        total[cell] += missed[facet]
+        c, h = poincare[cell], cells.lengths[:, cell].max() ** 0.5
+        c = np.sqrt(edge.measure[facet] / cells.volume[cell] * c * (c + h))
+        by_cell[cell] = by_cell.get(cell, 0.0) + c * rough[facet]
+        a, b = vertices[cells.vertices[cells.others[local], cell]]
+        bump = abs(bumps[cells.facets[local, cell]])
+        energy += (abs(a + b) / 2 + bump) * missed[facet]
+        energy += (abs(a - b) + 2 * bump) * np.sqrt(edge.measure[facet]) * rough[facet]
+    of_edge = np.sqrt(sum(value**2 / kappa.low[cell] for cell, value in by_cell.items()))
+    expected = np.sqrt(squares) + of_edge + unbalanced(level, cells, total, kappa.low, np.inf)
+    if not (of_f or of_g):
+        assert (loose, change) == (0.0, 0.0)
+    else:
+        assert np.isclose(loose, expected) and np.isclose(change, energy)
+
+
+def test_the_smallest_field_of_a_given_divergence(monkeypatch):
+    """Conjugate gradients to the end: orthogonal to all that have no divergence."""
+    monkeypatch.setattr(flux, "STEPS", 200)
+    domain = square(3, ("contact", "neumann", "dirichlet", "neumann"))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng = np.random.default_rng(WORLD.rank)
+    left, kappa = rng.normal(size=cells.number), rng.uniform(1, 3, cells.number)
+
+    def square_of(fluxes):
+        squares = field_squares(cells, fluxes, slice(0, cells.number)) / kappa
+        return WORLD.allreduce(squares.sum())
+
+    smallest = flux._diffused(cells, left, kappa)
+    assert np.allclose(smallest.sum(axis=0), -left, atol=1e-8)
+    jumps, free = cells.over_facets(smallest), cells.exterior.copy()
+    free[cells.share(_marks(cells)) > 0] = False
+    assert np.allclose(jumps[~cells.exterior], 0.0) and np.allclose(jumps[free], 0.0)
+    some, _ = _carry(cells, left)
+    least, other, apart = (square_of(one) for one in (smallest, some, some - smallest))
+    assert least < other and np.isclose(other, least + apart, rtol=1e-7)
+    # A few steps, and what is left carried as a walk does, are between the two
+    monkeypatch.setattr(flux, "STEPS", 3)
+    found = flux._carried(cells, left, kappa, 0.0)
+    assert np.sqrt(least) < found < np.sqrt(other)
+    assert np.isclose(flux._carried(cells, left, kappa, np.inf), np.sqrt(other))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1e9])
+def test_what_is_worth_carrying(size):
+    """Not what is small against the bound; else y gets a field that balances it."""
+    domain = square(3, ("contact", "neumann", "dirichlet", "neumann"))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    left = np.random.default_rng(WORLD.rank).normal(size=cells.number)
+    y = SimpleNamespace(excess=np.ones((3, cells.number)), left=left.copy())
+    kappa = np.array(2.0)
+    found = flux.balance(cells, y, kappa, size, 1e3)
+    if size == 1e9:
+        assert found == 0.0 and np.array_equal(y.left, left) and np.all(y.excess == 1.0)
+        return
+    fluxes, _ = _carry(cells, left)
+    norm = field_squares(cells, fluxes, slice(0, cells.number)).sum() / 2
+    assert np.isclose(found, np.sqrt(WORLD.allreduce(norm)))
+    assert np.allclose(y.left, 0.0, atol=1e-12) and np.allclose(y.excess, 1.0 + fluxes)
+    # no more than it costs otherwise
+    y.left = left.copy()
+    assert flux.balance(cells, y, kappa, 0.0, found * 0.99) == 0.0
+    assert flux.balance(cells, y, kappa, 0.0, found * 1.01) > 0.0
