@@ -510,7 +510,7 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     least, other, apart = (square_of(one) for one in (smallest, some, some - smallest))
     assert least < other and np.isclose(other, least + apart, rtol=1e-7)
     # A few steps, and what is left carried as a walk does, are between the two
-    monkeypatch.setattr(flux, "STEPS", 3)
+    monkeypatch.setattr(flux, "STEPS", 10)
     found = flux._carried(cells, left, kappa, 0.0)
     assert np.sqrt(least) < found < np.sqrt(other)
     assert np.isclose(flux._carried(cells, left, kappa, np.inf), np.sqrt(other))
