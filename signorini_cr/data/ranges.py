@@ -796,11 +796,13 @@ def _extents(cells: Cells) -> Range:
     low, high = np.empty((2, mesh.geometry.dim, cells.number))
     points = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
     for part in blocks(cells.number):
-        corners = points.take(nodes[part], axis=1)
-        low[:, part], high[:, part] = corners[..., 0], corners[..., 0]
-        for corner in corners.transpose(2, 0, 1)[1:]:
-            np.minimum(low[:, part], corner, out=low[:, part])
-            np.maximum(high[:, part], corner, out=high[:, part])
+        first, *others = np.ascontiguousarray(nodes[part].T, dtype=np.intp)
+        for x, least, most in zip(points, low[:, part], high[:, part], strict=True):
+            least[:] = most[:] = x.take(first)
+            for node in others:
+                corner = x.take(node)
+                np.minimum(least, corner, out=least)
+                np.maximum(most, corner, out=most)
     return low, high
 
 

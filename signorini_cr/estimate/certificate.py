@@ -21,7 +21,7 @@ from ..arrays import FloatArray
 from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient
-from ..fem.cells import Cells, dot_rows, pick, poincare, sum_rows
+from ..fem.cells import Cells, pick, poincare, sum_rows
 from ..jit import compiled
 from .beyond import Beyond
 from .companion import Companion, companion, on_facet
@@ -193,7 +193,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
-    slopes = dot_rows(w, cells.apply(w, slice(0, cells.number)))
+    slopes = cells.slopes(w)
     contact_side = alpha.side(cells)
     gap = u.x.array[contact_side.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
@@ -214,7 +214,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     carried = balance(cells, flux, kappa.low, size, left)
     if carried:
         left = unbalanced(level, cells, flux.left, kappa.low, size)
-    excess = field_squares(cells, flux.excess, slice(0, cells.number))
+    excess = field_squares(cells, flux.excess)
     kappa.enclose(cells, slopes, excess, size)
     if solution.element != "CR":
         conforming = solution.u.function_space.dofmap.list[: cells.number]
@@ -326,7 +326,7 @@ def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux, slopes: F
 
     Where that is next to nothing, as without a load, the jumps of u_h tell.
     """
-    squares = field_squares(cells, flux.excess, slice(0, cells.number)) / kappa.mean
+    squares = field_squares(cells, flux.excess) / kappa.mean
     square, scale, number = cells.total(np.sum(squares), np.sum(kappa.mean * slopes), cells.number)
     if square < 0.05 * scale / number:
         index_map = cells.domain.mesh.topology.index_map(0)
@@ -336,7 +336,7 @@ def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux, slopes: F
             for values in (w.ravel(), None)
         )
         change = (total / np.maximum(count, 1.0))[cells.vertices] - w
-        jumps = kappa.mean * dot_rows(change, cells.apply(change, slice(0, cells.number)))
+        jumps = kappa.mean * cells.slopes(change)
         square += float(cells.total(np.sum(np.maximum(jumps, 0.0)))[0])
     return float(np.sqrt(max(square, 1e-16 * scale, 1e-200)))
 
@@ -352,7 +352,7 @@ def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux:
     is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
     with ω, of which y may have the curl.
     """
-    values = np.abs(w).max(axis=0)
+    values = np.maximum(w.max(axis=0), -w.min(axis=0))
     trace = cells.trace(slice(0, cells.number))
     square = kappa.high * trace * values**2
     of_load = np.abs(load.mean)

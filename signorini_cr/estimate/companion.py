@@ -346,18 +346,18 @@ def _sweep(
     Returns:
         E, and what it would fall by if each height were put right as if it were alone.
     """
-    slope, diagonal = np.empty_like(excess), np.empty_like(excess)
+    slope, diagonal = np.empty_like(excess), np.empty(cells.number)
     energy = 0.0
     for part in blocks(cells.number):
         k, height = pick(kappa, part), bumps[cells.facets[:, part]]
-        diagonal[:, part] = k * cells.trace(part)
+        diagonal[part] = k * cells.trace(part)
         flow = k * cells.apply(excess[:, part], part)
-        slope[:, part] = flow - diagonal[:, part] * height - 2.0 * k * _across(cells, height, part)
+        slope[:, part] = flow - diagonal[part] * height - 2.0 * k * _across(cells, height, part)
         energy += float(np.sum(dot_rows(excess[:, part], flow)))
         energy -= 4 / 3 * float(np.sum(dot_rows(height, flow + slope[:, part])))
     down = cells.over_facets(slope)
     down *= free
-    weight = cells.over_facets(diagonal)
+    weight = cells.over_facets(np.tile(diagonal, (len(excess), 1)))
     weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
     owned = slice(cells.owned_facets())
     way = down / weight
@@ -367,7 +367,7 @@ def _sweep(
             break
         for part in blocks(cells.number):
             k, step = pick(kappa, part), way[cells.facets[:, part]]
-            slope[:, part] = diagonal[:, part] * step + 2.0 * k * _across(cells, step, part)
+            slope[:, part] = diagonal[part] * step + 2.0 * k * _across(cells, step, part)
         image = cells.over_facets(slope)
         image *= free
         length = square / cells.total(way[owned] @ image[owned])[0]

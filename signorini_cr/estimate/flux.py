@@ -156,7 +156,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     fluxes, all_reached = _carry(cells, flux.left)
     if not all_reached:
         return 0.0
-    squares = field_squares(cells, fluxes, slice(0, cells.number)) / kappa_min
+    squares = field_squares(cells, fluxes) / kappa_min
     square = cells.total(np.sum(squares))[0]
     if not np.sqrt(size**2 + square) - size < bound:
         return 0.0
@@ -205,7 +205,7 @@ def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float)
     """
 
     def norm(fluxes: FloatArray) -> float:
-        squares = field_squares(cells, fluxes, slice(0, cells.number))
+        squares = field_squares(cells, fluxes)
         return float(np.sqrt(cells.total(np.sum(squares / kappa_min))[0]))
 
     fluxes, all_reached = _carry(cells, left)
@@ -262,11 +262,18 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     return fluxes
 
 
-def field_squares(cells: Cells, fluxes: FloatArray, part: slice | IndexArray) -> FloatArray:
+def field_squares(
+    cells: Cells, fluxes: FloatArray, part: slice | IndexArray | None = None
+) -> FloatArray:
     """‖p‖²_T of the field with the given fluxes out of the cell, shape (cells in the part,).
 
     p = (s (x − x_T) − Σ a_i X_i) / (d |T|) with s the sum of the fluxes and a_i = flux_i − s/(d+1).
     """
+    if part is None:
+        out = np.empty(cells.number)
+        for part in blocks(cells.number):
+            out[part] = field_squares(cells, fluxes[:, part], part)
+        return out
     d = cells.tdim
     s = sum_rows(fluxes)
     a = fluxes - s / (d + 1)
