@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import basix
 import numpy as np
 import pytest
 import ufl
@@ -12,11 +13,13 @@ from mpi4py import MPI
 from signorini_cr import Polygon, Problem, solve, solve_levels
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Segments
-from signorini_cr.estimate import certificate, flux
+from signorini_cr.estimate import certificate, companion, cubic, flux, gap
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
 from signorini_cr.estimate.lifting import Cubic, lift
+from signorini_cr.estimate.nearest import Slopes, nearest
+from signorini_cr.estimate.shapes import best_heights, quadrature
 from signorini_cr.estimate.sums import Sums
 from signorini_cr.fem.cells import Cells, corner_points
 from signorini_cr.mesh.families import structured
@@ -536,3 +539,149 @@ def test_what_is_worth_carrying(size):
     y.left = left.copy()
     assert flux.balance(cells, y, kappa, 0.0, found * 0.99) == 0.0
     assert flux.balance(cells, y, kappa, 0.0, found * 1.01) > 0.0
+
+
+# ---- minima
+
+
+def local_matrices(cells, matrix):
+    """The matrix as a whole, by facet dof."""
+    whole = np.zeros((len(cells.exterior),) * 2)
+    for i in range(3):
+        for j in range(3):
+            np.add.at(whole, (cells.facets[i], cells.facets[j]), matrix[i, j])
+    return whole
+
+
+@pytest.mark.serial
+def test_conjugate_gradients_for_heights():
+    cells, rng, _, _ = some_cells(3)
+    a = rng.normal(size=(3, 3, cells.number))
+    matrix, pull = np.einsum("ikn,jkn->ijn", a, a), rng.normal(size=(3, cells.number))
+    free = rng.uniform(size=len(cells.exterior)) < 0.7
+    found = best_heights(cells, matrix, pull, free)
+    whole = local_matrices(cells, matrix)[np.ix_(free, free)]
+    right = np.zeros(len(free))
+    np.add.at(right, cells.facets, pull)
+    assert np.allclose(found[free], np.linalg.solve(whole, right[free]))
+    assert not found[~free].any()
+
+
+@pytest.mark.parametrize("kappa", [1.0, "random"])
+def test_nearest_function_of_degree_two(kappa):
+    """E no longer falls in any value that is free, and what is not free has stayed."""
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng = np.random.default_rng(WORLD.rank)
+    kappa = np.array(kappa) if kappa == 1.0 else rng.uniform(1, 3, cells.number)
+    excess, bumps = rng.normal(size=(3, cells.number)), np.zeros(len(cells.exterior))
+    index_map = domain.mesh.topology.index_map(0)
+    vertices = index_map.size_local + index_map.num_ghosts
+    on_rim = np.zeros(vertices)
+    for side in cells.sides.values():
+        on_rim[side.ends] = 1.0
+    loose, free = cells.share(on_rim, 0) == 0.0, ~cells.exterior
+    before = Slopes.of(cells, kappa, excess, bumps)
+    values, heights = nearest(cells, kappa, before, loose, free)
+    assert not values[~loose].any() and not heights[~free].any()
+    after = Slopes.of(cells, kappa, excess + values[cells.vertices], bumps + heights)
+    scale = np.abs(before.vertices).max()
+    assert np.abs(cells.over_vertices(after.vertices)[loose]).max() < 1e-6 * scale
+    assert np.abs(cells.over_facets(after.facets)[free]).max() < 1e-6 * scale
+    assert WORLD.allreduce(after.energies.sum()) < 0.9 * WORLD.allreduce(before.energies.sum())
+
+
+@pytest.mark.serial
+def test_energy_of_a_function_of_degree_two():
+    """E, its derivatives by differences, and the sweeps that make it less."""
+    cells, rng, kappa, _ = some_cells(5)
+    kappa, excess = kappa.mean, rng.normal(size=(3, cells.number))
+    bumps = rng.normal(size=len(cells.exterior))
+
+    def energy(excess, bumps):
+        x = cells.domain.mesh.geometry.x[cells.domain.mesh.geometry.dofmap[: cells.number], :2]
+        total = np.zeros(cells.number)
+        points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
+        for cell in range(cells.number):
+            inverse = np.linalg.inv(x[cell, 1:] - x[cell, :1]).T
+            gradients = np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])
+            for at, weight in zip(points, weights, strict=True):
+                hat = np.array([1 - at.sum(), *at])
+                slope = excess[:, cell] @ gradients
+                for i, (j, k) in enumerate(cells.others):
+                    bump = 4 * (hat[j] * gradients[k] + hat[k] * gradients[j])
+                    slope = slope + bumps[cells.facets[i, cell]] * bump
+                total[cell] += 2 * weight * cells.volume[cell] * kappa[cell] * slope @ slope
+        return total
+
+    slopes = Slopes.of(cells, kappa, excess, bumps)
+    assert np.allclose(slopes.energies, energy(excess, bumps))
+    for i in range(3):
+        step = np.zeros_like(excess)
+        step[i] = 1.0
+        change = energy(excess + step, bumps) - energy(excess - step, bumps)
+        assert np.allclose(slopes.vertices[i], -change / 4)
+    free = rng.uniform(size=len(bumps)) < 0.8
+    whole = Slopes.of(cells, kappa, excess, bumps).energies.sum()
+    falls = np.zeros(len(bumps))
+    np.add.at(falls, cells.facets, slopes.facets)
+    traces = kappa * cells.trace(slice(0, cells.number))
+    curvature = 4 / 3 * cells.over_facets(np.tile(traces, (3, 1)))
+    found, promise = companion._sweep(cells, kappa, excess, bumps.copy(), free, 0)
+    assert np.isclose(found, whole)
+    assert np.isclose(promise, np.sum(falls[free] ** 2 / curvature[free]))
+    # In as many steps as there are heights it finds the least
+    best = bumps.copy()
+    found, promise = companion._sweep(cells, kappa, excess, best, free, 60)
+    after = Slopes.of(cells, kappa, excess, best)
+    assert np.isclose(found, after.energies.sum()) and promise < 1e-12
+    assert np.abs(cells.over_facets(after.facets)[free]).max() < 1e-6
+    assert np.array_equal(best[~free], bumps[~free])
+    # What each vertex promises, alone
+    loose = rng.uniform(size=cells.vertices.max() + 1) < 0.5
+    falls = cells.over_vertices(slopes.vertices)
+    curvature = cells.over_vertices(kappa * cells.squares(slice(0, cells.number)))
+    found = companion._promise(cells, kappa, excess, bumps, loose)
+    assert np.isclose(found, np.sum(falls[loose] ** 2 / curvature[loose]))
+
+
+@pytest.mark.serial
+def test_cubic_functions_fit_best():
+    """No height of an inner facet can be changed for the better."""
+    domain = square(3, comm=MPI.COMM_SELF)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng = np.random.default_rng(6)
+    kappa = rng.uniform(1, 3, cells.number)
+    v = companion.Companion(
+        None, rng.normal(size=len(cells.exterior)), rng.normal(size=(3, cells.number)),
+        None, None, None, None, None, np.zeros(len(cells.exterior)),
+    )  # fmt: skip
+    hats, weights = quadrature()
+
+    def energy(thirds):
+        slopes = replace(v, thirds=thirds).slopes(cells, slice(0, cells.number))
+        rows = [slopes(hat) for hat in hats[:, :, None]]
+        squares = [(row * cells.apply(row, slice(0, cells.number))).sum(axis=0) for row in rows]
+        return np.sum(kappa * (weights @ squares))
+
+    found = cubic._fitted(cells, kappa, v)
+    least = energy(found)
+    assert least < energy(0 * found) and not found[cells.exterior].any()
+    for facet in np.flatnonzero(~cells.exterior):
+        for step in (1e-3, -1e-3):
+            moved = found.copy()
+            moved[facet] += step
+            assert energy(moved) > least
+
+
+@pytest.mark.serial
+def test_twist():
+    """max |1/κ − 1/κ_T| times ‖y − κ_T∇u_h‖ and ‖κ_T∇u_h‖."""
+    cells, rng, kappa, _ = some_cells(7)
+    P, w = rng.normal(size=(2, 3, cells.number))
+    everywhere = slice(0, cells.number)
+    field = np.sqrt(field_squares(cells, P, everywhere))
+    slope = np.sqrt((w * cells.apply(w, everywhere)).sum(axis=0))
+    spread = np.maximum(1 / kappa.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.high)
+    found = gap._twist(cells, kappa, everywhere, P, w)
+    assert np.allclose(found, spread * (field + kappa.mean * slope))

@@ -297,6 +297,23 @@ def test_thin_cells(monkeypatch):
     agrees(certificate, found, 1e-6)
 
 
+def test_data_that_are_not_affine_on_thin_cells(monkeypatch):
+    """What f and g have beyond affine functions is bounded, and is little."""
+    monkeypatch.setattr(cusps, "HOLDS", np.inf)
+    data = {
+        "f": lambda x: 1 + x[0] / 25 - 2 * x[1] + x[1] ** 2,
+        "g": lambda x: 0.3 + x[1] ** 2 / 4,
+    }
+    solution = solve(Problem(**data, obstacle=-0.001), sheared(8))
+    certificate = certify(solution)
+    assert certificate._made.thirds is not None
+    found = again(solution, certificate, 1.0, *data.values(), -0.001, carried=True)
+    assert found.bound < certificate.bound_h1 < 1.1 * found.bound
+    (low, high), width = certificate.energy, np.ptp(found.energy)
+    assert found.energy[1] <= high <= found.energy[1] + 1e-3 * width
+    assert low <= found.energy[0] <= low + 0.05 * width
+
+
 def test_a_cubic_solution_on_thin_cells(monkeypatch):
     """Its values on the boundary need no lifting."""
     monkeypatch.setattr(cusps, "HOLDS", np.inf)
