@@ -42,6 +42,8 @@ NEGATED |= {ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: 
 NEGATED |= {ast.In: ast.NotIn, ast.NotIn: ast.In}
 NAMES = {"min": "max", "minimum": "maximum", "any": "all", "low": "high"}
 NAMES |= {new: old for old, new in NAMES.items()}
+ELSEWHERE = ("scatter_forward()", "destroy()")
+"""What only other ranks or the memory would notice is not dropped."""
 Mutant = tuple[int, str, Callable[[], None]]
 """Line, what is changed, and the change."""
 
@@ -111,7 +113,7 @@ def _in_place(
             yield f"{text} -> {_text(operand)}", put(operand)
         case ast.Call(func=ast.Attribute(attr="abs" | "sqrt") | ast.Name(id="abs"), args=[inner]):
             yield f"{text} -> {_text(inner)}", put(inner)
-        case ast.AugAssign() | ast.Expr(value=ast.Call()):
+        case ast.AugAssign() | ast.Expr(value=ast.Call()) if not text.endswith(ELSEWHERE):
             yield f"{text} dropped", put(ast.Pass())
         case ast.Assign(targets=[ast.Subscript() | ast.Attribute()]):
             yield f"{text} dropped", put(ast.Pass())

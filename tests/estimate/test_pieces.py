@@ -685,3 +685,24 @@ def test_twist():
     spread = np.maximum(1 / kappa.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.high)
     found = gap._twist(cells, kappa, everywhere, P, w)
     assert np.allclose(found, spread * (field + kappa.mean * slope))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("few", [False, True])
+def test_slack_of_quadrature(few):
+    """The smaller one of two bounds, for both signs; few is missed of rows that cancel."""
+    rng = np.random.default_rng(8)
+    pp, bb, vv, yy, *at_z = rng.uniform(1, 2, size=(8, 5))
+    pb = 0.99 * (pp + bb) / 2 if few else rng.uniform(-0.5, 0.5, size=5)
+    errors = rng.uniform(size=(7, 5)) * (1e-3 if few else 1.0)
+    R, t, W, inverse_W, strip_low, strip_high, _ = errors
+    found = gap._with_slack(np.stack([pp, bb, pb, vv, yy, *at_z]), errors, 2, 9)
+    assert np.array_equal(found[:4], (pp, bb, pb, vv))
+    for row, sign, zz, steep in ((4, -2, *at_z[:2]), (5, 2, *at_z[2:])):
+        for i in range(5):
+            square = pp[i] + bb[i] + sign * pb[i]
+            products = 2 * (inverse_W[i] * yy[i] + W[i] * zz[i])
+            norm = (1 + t[i]) * (square**0.5 + 2 * R[i] * steep[i] ** 0.5) ** 2 - square
+            strips = 2 * 9 * (strip_low[i] * yy[i] + strip_high[i] * zz[i])
+            assert np.isclose(found[row, i], min(products, norm + strips))
+    assert np.allclose(found[6], W * at_z[0])

@@ -290,10 +290,10 @@ def test_thin_cells(monkeypatch):
     """f and g are carried as a whole."""
     monkeypatch.setattr(cusps, "HOLDS", np.inf)
     data = {"f": lambda x: 1 + x[0] / 25 - 2 * x[1], "g": lambda x: 0.3 + x[1] / 4}
-    solution = solve(Problem(**data, obstacle=-0.001), sheared(8))
+    solution = solve(Problem(**data, obstacle=-0.001, coefficient=2.0), sheared(8))
     certificate = certify(solution)
     assert certificate._made.beyond is not None and certificate._made.cusps is None
-    found = again(solution, certificate, 1.0, *data.values(), -0.001, carried=True)
+    found = again(solution, certificate, 2.0, *data.values(), -0.001, carried=True)
     agrees(certificate, found, 1e-6)
 
 
@@ -304,14 +304,14 @@ def test_data_that_are_not_affine_on_thin_cells(monkeypatch):
         "f": lambda x: 1 + x[0] / 25 - 2 * x[1] + x[1] ** 2,
         "g": lambda x: 0.3 + x[1] ** 2 / 4,
     }
-    solution = solve(Problem(**data, obstacle=-0.001), sheared(8))
+    solution = solve(Problem(**data, obstacle=-0.001, coefficient=2.0), sheared(8))
     certificate = certify(solution)
     assert certificate._made.thirds is not None
-    found = again(solution, certificate, 1.0, *data.values(), -0.001, carried=True)
-    assert found.bound < certificate.bound_h1 < 1.1 * found.bound
+    found = again(solution, certificate, 2.0, *data.values(), -0.001, carried=True)
+    assert found.bound < certificate.bound_energy_norm < 1.1 * found.bound
     (low, high), width = certificate.energy, np.ptp(found.energy)
     assert found.energy[1] <= high <= found.energy[1] + 1e-3 * width
-    assert low <= found.energy[0] <= low + 0.05 * width
+    assert low <= found.energy[0] <= low + 0.2 * width
 
 
 def test_a_cubic_solution_on_thin_cells(monkeypatch):
