@@ -706,3 +706,10 @@ def test_slack_of_quadrature(few):
             strips = 2 * 9 * (strip_low[i] * yy[i] + strip_high[i] * zz[i])
             assert np.isclose(found[row, i], min(products, norm + strips))
     assert np.allclose(found[6], W * at_z[0])
+
+
+@pytest.mark.serial
+def test_a_line_about_a_certificate():
+    found = certificate.Certificate(1.25, 1.5, 2.0, (-3.0, -2.5))
+    assert repr(found) == "<Certificate: error at most 1.25, energy in [-3, -2.5]>"
+    assert repr(certificate.Certificate(reason="so")) == "<Certificate: no bound, so>"
