@@ -17,7 +17,7 @@ from signorini_cr.estimate import certificate, companion, cubic, flux, gap
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
-from signorini_cr.estimate.lifting import Cubic, lift
+from signorini_cr.estimate.lifting import Cubic, Lift, lift
 from signorini_cr.estimate.nearest import Slopes, nearest
 from signorini_cr.estimate.shapes import best_heights, quadrature
 from signorini_cr.estimate.sums import Sums
@@ -713,3 +713,83 @@ def test_a_line_about_a_certificate():
     found = certificate.Certificate(1.25, 1.5, 2.0, (-3.0, -2.5))
     assert repr(found) == "<Certificate: error at most 1.25, energy in [-3, -2.5]>"
     assert repr(certificate.Certificate(reason="so")) == "<Certificate: no bound, so>"
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("more", [False, True])
+def test_what_the_gap_is_made_of_at_points(more):
+    """|p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and |∇z|²/κ for z = v and 2u_h − v."""
+    cells, rng, kappa, _ = some_cells(9)
+    P, w, excess, rise = rng.normal(size=(4, 3, cells.number))
+    bumps, thirds, heights = rng.normal(size=(3, len(cells.exterior)))
+    rise -= rise.mean(axis=0)
+    beyond = Beyond(heights, rise) if more else None
+    v = companion.Companion(
+        None, bumps, excess, None, None, None, None, None, thirds if more else None
+    )
+    y = SimpleNamespace(excess=P, beyond=beyond)
+    k = rng.uniform(1, 2, size=(4, cells.number))
+    hats, weights = rng.dirichlet(np.ones(3), 4), rng.dirichlet(np.ones(4))
+    points = zip(k, weights, hats, strict=True)
+    found = gap._at_points(cells, kappa.mean, slice(0, cells.number), y, v, w, points)
+    mesh = cells.domain.mesh
+    x = mesh.geometry.x[mesh.geometry.dofmap[: cells.number], :2]
+    for cell in range(cells.number):
+        inverse = np.linalg.inv(x[cell, 1:] - x[cell, :1]).T
+        gradients = np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])
+        volume, mean, expected = cells.volume[cell], kappa.mean[cell], 0.0
+        du = w[:, cell] @ gradients
+        for hat, weight, at in zip(hats, weights, k[:, cell], strict=True):
+            place = hat @ x[cell]
+            field = mean * du + (place * P[:, cell].sum() - P[:, cell] @ x[cell]) / (2 * volume)
+            dv = du + excess[:, cell] @ gradients
+            for i, (a, b) in enumerate(cells.others):
+                facet = cells.facets[i, cell]
+                bump = 4 * (hat[a] * gradients[b] + hat[b] * gradients[a])
+                dv = dv + bumps[facet] * bump
+                if more:
+                    field = field + heights[facet] * np.array([bump[1], -bump[0]])
+                    both = hat[a] * gradients[b] + hat[b] * gradients[a]
+                    cubic_ = both * (hat[a] - hat[b]) + hat[a] * hat[b] * (
+                        gradients[a] - gradients[b]
+                    )
+                    dv = dv + cells.ways[i, cell] * thirds[facet] * cubic_
+                    edge = (rise[b, cell] - rise[a, cell]) * (x[cell, b] - x[cell, a])
+                    field = field + edge * hat[a] * hat[b] / 3
+            p, b = field - at * du, at * (dv - du)
+            row = [p @ p / at, b @ b / at, p @ b / at, at * dv @ dv, field @ field]
+            for dz in (dv, 2 * du - dv):
+                row += [dz @ dz, dz @ dz / at]
+            expected = expected + weight * volume * np.array(row)
+        assert np.allclose(found[:, cell], expected)
+
+
+@pytest.mark.serial
+def test_contact_term_with_liftings(monkeypatch):
+    """∫_F (y·n)(v + ℓ − α): by means of v and its bump, what ℓ adds, and α from below."""
+    level = solve(Problem(f=-12.0), square(3, comm=MPI.COMM_SELF)).level
+    data = diffusion(level.data)
+    cells, rng = data.cells, np.random.default_rng(11)
+    u_D, alpha = (one.seen_from(cells) for (one,) in (data.u_D, data.alpha))
+    sides = {False: u_D.side(cells), True: alpha.side(cells)}
+    lifts = {
+        kind: Lift(*rng.uniform(size=(4, len(side.cells))), reason="α" if kind else None)
+        for kind, side in sides.items()
+    }
+    monkeypatch.setattr(companion, "_lift", lambda *arguments: lifts[arguments[-1]])
+    bumps = rng.normal(size=len(cells.exterior))
+    v = rng.normal(size=cells.vertices.max() + 1) + 1.0
+    through = rng.uniform(size=3) * [1, 1, 0]
+    y = SimpleNamespace(contact=through)
+    boundary = companion.Boundary(u_D, alpha, 1.0, 1e-3)
+    contact, (at, steep, area), reasons = boundary.lifted(cells, y, v, bumps, 0 * bumps)
+    side, found = sides[True], lifts[True]
+    for i in range(3):
+        a, b = v[side.ends[:, i]]
+        above = (a + b) / 2 + 2 / 3 * bumps[side.dofs[i]] - found.least[i]
+        above += found.beyond[i] / np.ptp(corner_points(cells, side)[1][:, i, 0])
+        assert np.isclose(contact[i], through[i] * max(above, 0.0))
+    assert np.array_equal(at, np.concatenate([sides[kind].cells for kind in (False, True)]))
+    assert np.array_equal(steep, np.concatenate([lifts[kind].steep for kind in (False, True)]))
+    assert np.array_equal(area, np.concatenate([lifts[kind].area for kind in (False, True)]))
+    assert reasons == [None, "α"]
