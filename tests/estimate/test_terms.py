@@ -422,6 +422,13 @@ def test_force():
     low, high = force_bounds(solution)
     assert np.isclose((low + high) / 2, found.force, rtol=1e-6)
     assert np.isclose((high - low) / 2, found.reach, rtol=1e-6)
+    # A cusp pulls at a cell's vertices: half of ∫ κ∇ψ·∇φ
+    pull = SimpleNamespace(at=np.array([0]), pulls=lambda _: (np.full((3, 1), 0.02), None))
+    object.__setattr__(certificate._made, "cusps", pull)
+    phi = _weight(solution)
+    change = 0.01 * phi.x.array[phi.function_space.dofmap.list[0]].sum()
+    middle = sum(force_bounds(solution)) / 2
+    assert np.isclose(middle, found.force + WORLD.allreduce(change), rtol=1e-6)
 
 
 @pytest.mark.serial
