@@ -4,8 +4,10 @@ run = ./container/run
 # A rank that fails can leave the others waiting; no run goes without an end.
 limit = timeout --kill-after=20 1500
 
-.PHONY: demo studies verify fuzz docs quick test test-alone test-pair coverage mutants ranks test-package test-wheels lint \
-    types clean purge
+readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
+
+.PHONY: demo studies verify fuzz docs quick test test-alone test-pair coverage mutants ranks readers \
+    test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -58,6 +60,11 @@ mutants:
 ranks:
 	$(run) $(limit) mpirun -n 3 python3 -m pytest -m ranks -k 'not rates'
 	$(run) $(limit) mpirun -n 4 python3 -m pytest -m ranks -k 'not rates'
+
+# What is left for others, read by others: meshio, VTK, PyVista, Jupyter; -p fails without one.
+readers:
+	$(run) $(limit) $(readers) tests/output/test_vtu.py tests/output/test_notebook.py
+	$(run) $(limit) mpirun -n 2 $(readers) tests/output/test_vtu.py
 
 # sdist and wheel, built, installed and tried: on the DOLFINx that is there, and on that of pip
 test-package:

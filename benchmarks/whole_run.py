@@ -121,7 +121,7 @@ def run(meshes: int, folder: str, began: float) -> None:
         (levels, "_solve", VI),
         (solution, "certify", CERTIFICATES),
         (problem.Forms, "errors", ERRORS),
-        (output, "write_vtu", FIELD),
+        (output, "write_solution", FIELD),
         (output, "write_output", OUTPUT),
     ):
         clock.watch(owner, attribute, name)

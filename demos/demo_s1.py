@@ -24,7 +24,6 @@ import numpy as np
 from study import Study, comm, levels_wanted
 
 from signorini_cr import exact, plots, solve_levels
-from signorini_cr.errors import on_root
 from signorini_cr.output.report import level_record, table_header, table_row
 from signorini_cr.output.tables import markdown_table
 
@@ -57,7 +56,7 @@ study.show("s1-solution.png", "u_h of S1 on the finest mesh, in contact for x < 
 plots.plot_contact(solution, study.folder / "s1-contact.png", "S1")
 study.show("s1-contact.png", "S1: u_h and the pressure along Γ1.")
 rates = study.folder / "s1-convergence.png"
-on_root(comm, lambda: plots.plot_convergence(records, rates, "S1"))
+plots.drawn(comm, lambda: plots.plot_convergence(records, rates, "S1"))
 study.show("s1-convergence.png", "S1: the errors fall like h and like h².")
 
 # %% [markdown]

@@ -54,6 +54,7 @@ _MODULES = {
     "theory": "verification.theory",
     "families": "mesh.families",
     "plots": "output.plots",
+    "notebook": "output.notebook",
     "force": "estimate.force",
 }
 __all__ = [  # noqa: RUF022, in the order in which one meets them

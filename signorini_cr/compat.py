@@ -8,7 +8,7 @@ import basix
 import numpy as np
 import ufl
 from dolfinx import cpp, fem
-from dolfinx.mesh import CellType, Mesh
+from dolfinx.mesh import CellType, Mesh, create_submesh
 from mpi4py import MPI
 
 from .arrays import FloatArray, Int32Array, Int64Array
@@ -21,6 +21,24 @@ def cell_nodes(mesh: Mesh) -> Int32Array:
     """Rows of `mesh.geometry.x` for every local cell, shape (cells, nodes)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+
+
+def submesh(mesh: Mesh, dim: int, entities: Int32Array) -> tuple[Mesh, Int32Array]:
+    """The mesh that some entities of a mesh make up; collective.
+
+    Args:
+        mesh: The mesh.
+        dim: Dimension of the entities.
+        entities: Their local indices; owned ones, ascending.
+
+    Returns:
+        The mesh, and the entity that each cell owned by this rank was.
+    """
+    made, parents, *_ = create_submesh(mesh, dim, entities)
+    cells = np.arange(made.topology.index_map(dim).size_local, dtype=np.int32)
+    if hasattr(parents, "sub_topology_to_topology"):  # since 0.10
+        return made, parents.sub_topology_to_topology(cells, False)
+    return made, parents[cells]
 
 
 def coordinate_map(mesh: Mesh) -> Any:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 
 from petsc4py import PETSc
 
@@ -79,6 +82,27 @@ SMALL_FACTORS: dict[str, object] = {
     "redundant_pc_factor_zeropivot": 1e-300,
 }
 """Factors at the bottom of the cycle, on every rank."""
+
+
+def take(words: Sequence[str]) -> None:
+    """Take the options under the prefix from a command line that PETSc has not seen.
+
+    They are options of this program, whoever else reads that line. What is set already is left as
+    it is. As with PETSc, the word behind an option is its value if it is no option itself.
+    """
+    given = {
+        word: None if re.match("--?[a-zA-Z]", after) else after
+        for word, after in pairwise([*words, "-none"])
+        if word.startswith(f"-{PREFIX}")
+    }
+    database = PETSc.Options()
+    for word, value in given.items():
+        if not database.hasName(word):
+            database.setValue(word, value)
+
+
+# A script's own, which it need not hand to petsc4py.init
+take(sys.argv[1:])
 
 
 def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:

@@ -10,6 +10,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from .estimate.certificate import Certificate
+from .fem import fields
 from .fem.problem import Problem
 from .mesh.domain import Domain
 from .vi.contact import Contact
@@ -48,6 +49,12 @@ class Solution:
         )
         bound = known and known.bound_h1
         return line + (">" if bound is None else f", error at most {bound:.3g}>")
+
+    def _repr_html_(self) -> str:
+        """A table and a picture, for notebooks; of the certificate what has been made."""
+        from . import notebook  # by the front door, as what draws stands above the solution
+
+        return str(notebook.as_html(self))
 
     @property
     def domain(self) -> Domain:
@@ -101,3 +108,34 @@ class Solution:
             return certificate
         finally:
             self.level.tidy()
+
+    def u_dg(self) -> fem.Function:
+        """u_h as a discontinuous P1 function, which DOLFINx's writers draw right; collective."""
+        return fields.discontinuous(self.u)
+
+    def functions(self) -> dict[str, fem.Function]:
+        """All there is to draw, in spaces that DOLFINx's writers draw right; collective.
+
+        The certificate is made if it has not been asked for before.
+
+        Returns:
+            By name: `u`, from `u_dg`; `indicator`, constant on each cell, the square root of its
+            share in `Certificate.indicators`; `companion`, continuous and of degree 1 to 3, from
+            `Certificate.companion`; on a mesh of Γ1's facets, and constant on each, `pressure`
+            λ_h, `contact`, 1 where there is contact and 0 elsewhere, and `obstacle`, the bound
+            of u_h there. What a certificate without a bound lacks is left out.
+        """
+        mesh, contact, certificate = self.domain.mesh, self.contact, self.certificate
+        found = {"u": self.u_dg()}
+        if certificate.indicators is not None:
+            shares = np.sqrt(certificate.indicators)
+            found["indicator"] = fields.on_cells(mesh, shares, "indicator")
+        if certificate.companion is not None:
+            found["companion"] = certificate.companion
+            found["companion"].name = "companion"
+        columns = {
+            "pressure": contact.pressure,
+            "contact": contact.active,
+            "obstacle": contact.obstacle,
+        }
+        return found | fields.on_facets(mesh, contact.facets, columns)

@@ -10,8 +10,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_rectangle,
+    create_unit_cube,
+    exterior_facet_indices,
+    meshtags,
+)
 from mpi4py import MPI
+
+from signorini_cr import Domain, Problem, Solution, solve_levels
 
 ROOT = Path(__file__).parent.parent
 DEMOS = ROOT / "demos"
@@ -85,3 +95,27 @@ def script(path: Path, *arguments: str | Path, **variables: str) -> tuple[int, s
 def is_picture(path: Path) -> bool:
     """Whether it is a PNG with something on it."""
     return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+
+
+def slope(x: Any) -> Any:
+    """The obstacle, and u on Γ0, of `on_a_slope`."""
+    return 0.05 * x[0]
+
+
+def on_a_slope(dim: int, comm: MPI.Comm = MPI.COMM_WORLD, element: str = "CR") -> Solution:
+    """A solution whose contact is on a part of Γ1, where the last coordinate is 0; collective.
+
+    In the plane it is on a refined mesh, in space on a cube.
+    """
+    if dim == 3:
+        mesh, levels, middle = create_unit_cube(comm, 3, 3, 3), 1, 0.4
+    else:
+        mesh, levels = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [8, 4]), 2
+        middle = 0.0
+    mesh.topology.create_connectivity(dim - 1, dim)
+    facets = exterior_facet_indices(mesh.topology)
+    below = compute_midpoints(mesh, dim - 1, facets)[:, dim - 1] < 1e-12
+    tags = meshtags(mesh, dim - 1, facets, np.where(below, 1, 2).astype(np.int32))
+    problem = Problem(f=lambda x: 4.0 * (middle - x[0]), obstacle=slope, dirichlet=slope)
+    *_, finest = solve_levels(problem, Domain.from_tags(mesh, tags), levels, element)
+    return finest

@@ -22,7 +22,7 @@ from ..fem.problem import Forms, Problem
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
-from .keys import (
+from .readers import (
     array,
     get,
     insist_known,

@@ -145,9 +145,11 @@ class Certain:
             quadratic, cubic = deviation(Enclosure(boxes), half, hats=points)
             return np.stack([cubic, quadratic**2])
 
-        reach = 4.0 * poincare(cells.tdim) ** 2 * cells.diameter2 * cells.volume / low
         goal = SHARE * size
-        weights = np.stack([2.0 * cells.volume / np.sqrt(low) / goal, reach / goal**2])
+        weights = np.empty((2, cells.number))
+        np.multiply(2.0 / (np.sqrt(low) * goal), cells.volume, out=weights[0])
+        np.multiply((2.0 * poincare(cells.tdim) / goal) ** 2 / low, cells.diameter2, out=weights[1])
+        weights[1] *= cells.volume
         try:
             found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
         except Unknown as error:

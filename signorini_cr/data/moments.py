@@ -153,7 +153,7 @@ class Coefficient:
             self.reason = "the coefficient's computable lower bound is not positive"
 
     def enclose(self, cells: Cells, steepness: FloatArray, excess: FloatArray, size: float) -> None:
-        """Enclose κ where it varies; collective.
+        """Enclose a κ that varies within cells; collective.
 
         The errors in `cut` are R, t, W, W', the strips' part of the cell times 1/κ and κ there,
         and R²: κ is within R of a quadratic polynomial and W of a cubic one, κ⁻¹ is within W' of a
@@ -165,8 +165,7 @@ class Coefficient:
             excess: ‖y − κ_T ∇u_h‖² on each cell, shape (cells,).
             size: Of the bound, to which what quadrature misses should be small.
         """
-        if self.values is None:
-            return
+        assert self.values is not None
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
             at = Enclosure(boxes)

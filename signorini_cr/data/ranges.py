@@ -558,7 +558,7 @@ def cut(
             every = len(pending) == n
             ends = (low, high) if every else (low[:, pending], high[:, pending])
             boxes, half, place = _groups(*ends, level)
-            there = errors(boxes, half).take(place, axis=1)
+            there = np.stack([row[place] for row in errors(boxes, half)])
             if every:
                 found, factors = there, weights
             else:
@@ -798,9 +798,9 @@ def _extents(cells: Cells) -> Range:
     for part in blocks(cells.number):
         first, *others = np.ascontiguousarray(nodes[part].T, dtype=np.intp)
         for x, least, most in zip(points, low[:, part], high[:, part], strict=True):
-            least[:] = most[:] = x.take(first)
+            least[:] = most[:] = x[first]
             for node in others:
-                corner = x.take(node)
+                corner = x[node]
                 np.minimum(least, corner, out=least)
                 np.maximum(most, corner, out=most)
     return low, high
@@ -812,16 +812,21 @@ def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, Float
     Returns:
         The boxes, upper bounds of half the extents of their cells, and each cell's box.
     """
-    exponent = np.frexp((high - low) * (1 - _FEW))[1]  # a power of two may have been rounded up
-    size = np.ldexp(1.0, exponent + level)
-    place = np.floor(0.5 * (low + high) / size).astype(np.int64)
-    numbers = _numbers([*exponent.astype(np.int64), *place])
+    exponent, place = np.empty(low.shape, np.int64), np.empty(low.shape, np.int64)
+    for part in blocks(low.shape[1]):
+        least, most = low[:, part], high[:, part]
+        # a power of two may have been rounded up
+        power = np.frexp((most - least) * (1 - _FEW))[1]
+        exponent[:, part] = power
+        place[:, part] = np.floor(0.5 * (least + most) / np.ldexp(1.0, power + level))
+    numbers = _numbers([*exponent, *place])
     count = int(numbers.max(initial=-1)) + 1
     one = np.empty(count, dtype=np.intp)
     one[numbers] = np.arange(low.shape[1])
     half = np.ldexp(0.5, exponent[:, one]) * (1 + 2 * _FEW)
-    start = place[:, one] * size[:, one]
-    return Boxes(start - half, start + size[:, one] + half), half, numbers
+    size = np.ldexp(1.0, exponent[:, one] + level)
+    start = place[:, one] * size
+    return Boxes(start - half, start + size + half), half, numbers
 
 
 def _numbers(rows: list[Int64Array]) -> IndexArray:
@@ -836,7 +841,9 @@ def _numbers(rows: list[Int64Array]) -> IndexArray:
         if span * width >= 1 << 62:
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             span = len(key)
-        key = key * width + (row - first)
+        key *= width
+        key += row
+        key -= first
         span *= width
     if span > 8 * len(key) + 1000:
         return np.unique(key, return_inverse=True)[1].reshape(-1)

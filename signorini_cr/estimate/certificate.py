@@ -21,7 +21,7 @@ from ..arrays import FloatArray
 from ..data.diffusion import diffusion
 from ..data.loads import Certain, Load, Segments
 from ..data.moments import Coefficient
-from ..fem.cells import Cells, pick, poincare, sum_rows
+from ..fem.cells import Cells, blocks, pick, poincare, sum_rows
 from ..jit import compiled
 from .beyond import Beyond
 from .companion import Companion, companion, on_facet
@@ -193,11 +193,10 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     if kappa.reason is not None:
         return Certificate(reason=kappa.reason)
     w = vertex_rows(u.x.array, cells)
-    slopes = cells.slopes(w)
     contact_side = alpha.side(cells)
     gap = u.x.array[contact_side.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
-    size = _size(cells, kappa, w, flux, slopes)
+    size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
     if certain.reason is not None:
         return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
@@ -214,8 +213,8 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     carried = balance(cells, flux, kappa.low, size, left)
     if carried:
         left = unbalanced(level, cells, flux.left, kappa.low, size)
-    excess = field_squares(cells, flux.excess)
-    kappa.enclose(cells, slopes, excess, size)
+    if kappa.values is not None:
+        kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     if solution.element != "CR":
         conforming = solution.u.function_space.dofmap.list[: cells.number]
         own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
@@ -321,13 +320,14 @@ _TOTALS = (
 )
 
 
-def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux, slopes: FloatArray) -> float:
+def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
     """About how large the bound will be: ‖p‖, but for κ within cells; collective.
 
     Where that is next to nothing, as without a load, the jumps of u_h tell.
     """
     squares = field_squares(cells, flux.excess) / kappa.mean
-    square, scale, number = cells.total(np.sum(squares), np.sum(kappa.mean * slopes), cells.number)
+    scales = kappa.mean * flux.steepness
+    square, scale, number = cells.total(np.sum(squares), np.sum(scales), cells.number)
     if square < 0.05 * scale / number:
         index_map = cells.domain.mesh.topology.index_map(0)
         size, flat = index_map.size_local + index_map.num_ghosts, cells.vertices.ravel()
@@ -352,16 +352,21 @@ def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux:
     is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
     with ω, of which y may have the curl.
     """
-    values = np.maximum(w.max(axis=0), -w.min(axis=0))
-    trace = cells.trace(slice(0, cells.number))
-    square = kappa.high * trace * values**2
-    of_load = np.abs(load.mean)
-    if load.variance is not None:
-        of_load = of_load + np.sqrt(load.variance)
-    square += cells.diameter2 * cells.volume * of_load**2 / kappa.low
-    if flux.beyond is not None:
-        square += trace * flux.beyond.largest(cells) ** 2 / kappa.low
-    return float(ROUNDING * np.sqrt(cells.total(np.sum(square))[0]))
+    largest = None if flux.beyond is None else flux.beyond.largest(cells)
+    total = 0.0
+    for part in blocks(cells.number):
+        low, high = pick(kappa.low, part), pick(kappa.high, part)
+        values = np.maximum(w[:, part].max(axis=0), -w[:, part].min(axis=0))
+        trace = cells.trace(part)
+        square = high * trace * values**2
+        of_load = np.abs(load.mean[part])
+        if load.variance is not None:
+            of_load += np.sqrt(load.variance[part])
+        square += cells.diameter2[part] * cells.volume[part] * of_load**2 / low
+        if largest is not None:
+            square += trace * largest[part] ** 2 / low
+        total += float(np.sum(square))
+    return float(ROUNDING * np.sqrt(cells.total(total)[0]))
 
 
 def _hidden(
@@ -385,16 +390,19 @@ def _hidden(
         return 0.0, 0.0
     missed, square, change = np.zeros(cells.number), 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
-        missed = certain.missed
-        rough = poincare(cells.tdim) * np.sqrt(cells.diameter2 / kappa.low) * certain.rough
+        missed, constant = certain.missed, poincare(cells.tdim)
         assert sums.steepness is not None
-        means = np.abs(v.vertices[cells.vertices].sum(axis=0) / (cells.tdim + 1))
-        if cells.tdim == 2:
-            means += np.abs(v.bumps[cells.facets]).sum(axis=0) / 3
+        for part in blocks(cells.number):
+            rough = np.sqrt(cells.diameter2[part] / pick(kappa.low, part)) * certain.rough[part]
+            rough *= constant
+            means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
+            if cells.tdim == 2:
+                means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3
+            steep = np.sqrt(np.maximum(sums.steepness[part], 0.0))
+            change += float(means @ missed[part] + rough @ steep)
+            square += float(rough @ rough)
         if v.cusps is not None:
-            np.add.at(means, v.cusps.at, np.abs(v.cusps.means))
-        change = np.sum(means * missed + rough * np.sqrt(np.maximum(sums.steepness, 0.0)))
-        square = np.sum(rough**2)
+            change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
     at, sizes = segments.beyond()
     on_edge = np.sqrt(np.sum(sizes**2 / pick(kappa.low, at)))
     missed = missed + np.bincount(segments.facets.cells, segments.missed, minlength=cells.number)
@@ -406,8 +414,11 @@ def _hidden(
 
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
     """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
-    values = u[cells.facets]
-    return sum_rows(values) - cells.tdim * values
+    out = np.empty(cells.facets.shape)
+    for part in blocks(cells.number):
+        values = u[cells.facets[:, part]]
+        np.subtract(sum_rows(values), cells.tdim * values, out=out[:, part])
+    return out
 
 
 def _lifted(

@@ -146,11 +146,12 @@ def companion(
             taken = np.zeros(len(u))
             taken[~free] = 1.0
             free = cells.share(taken) == 0.0
-    excess = v[cells.vertices]
-    excess -= w
+    excess = np.empty_like(w)
+    for part in blocks(cells.number):
+        np.subtract(v[cells.vertices[:, part]], w[:, part], out=excess[:, part])
     cusps = None
     if cells.tdim == 2 and sweeps > 0:
-        energy, promise = _sweep(cells, kappa, excess, bumps, free, sweeps)
+        energy, promise = _sweep(cells, kappa, excess, bumps, free, (fixed, contact), sweeps)
         bumps[contact.dofs] = np.maximum(bumps[contact.dofs], lowest[contact.dofs])
         held = np.zeros(len(v))
         held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
@@ -331,6 +332,7 @@ def _sweep(
     excess: FloatArray,
     bumps: FloatArray,
     free: BoolArray,
+    bumped: tuple[Side, ...],
     steps: int,
 ) -> tuple[float, float]:
     """Conjugate gradients for E = ‖κ^{1/2}(∇v − ∇u_h)‖² in the heights of the bumps.
@@ -341,6 +343,7 @@ def _sweep(
         excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
         bumps: Heights, improved in place.
         free: Which of them may be.
+        bumped: The facets on which there are some to begin with.
         steps: How many steps.
 
     Returns:
@@ -349,14 +352,18 @@ def _sweep(
     slope, diagonal = np.empty_like(excess), np.empty(cells.number)
     energy = 0.0
     for part in blocks(cells.number):
-        k, height = pick(kappa, part), bumps[cells.facets[:, part]]
+        k = pick(kappa, part)
         diagonal[part] = k * cells.trace(part)
-        flow = k * cells.apply(excess[:, part], part)
-        slope[:, part] = flow - diagonal[part] * height - 2.0 * k * _across(cells, height, part)
-        energy += float(np.sum(dot_rows(excess[:, part], flow)))
-        energy -= 4 / 3 * float(np.sum(dot_rows(height, flow + slope[:, part])))
+        np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
+        energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
+    near = np.unique(np.concatenate([side.cells for side in bumped]))
+    flow, height = slope[:, near], bumps[cells.facets[:, near]]
+    change = diagonal[near] * height + 2.0 * pick(kappa, near) * _across(cells, height, near)
+    slope[:, near] = flow - change
+    energy -= 4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
+    held = np.flatnonzero(~free)
     down = cells.over_facets(slope)
-    down *= free
+    down[held] = 0.0
     weight = cells.over_facets(np.tile(diagonal, (len(excess), 1)))
     weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
     owned = slice(cells.owned_facets())
@@ -367,12 +374,16 @@ def _sweep(
             break
         for part in blocks(cells.number):
             k, step = pick(kappa, part), way[cells.facets[:, part]]
-            slope[:, part] = diagonal[part] * step + 2.0 * k * _across(cells, step, part)
+            across = _across(cells, step, part)
+            across *= 2.0 * k
+            step *= diagonal[part]
+            np.add(step, across, out=slope[:, part])
         image = cells.over_facets(slope)
-        image *= free
+        image[held] = 0.0
         length = square / cells.total(way[owned] @ image[owned])[0]
         bumps += length * way
-        down -= length * image
+        image *= length
+        down -= image
         energy -= 4 / 3 * length * square
         straight = down / weight
         before, square = square, cells.total(down[owned] @ straight[owned])[0]
@@ -396,14 +407,16 @@ def _promise(
     slope, diagonal = np.empty_like(excess), np.empty_like(excess)
     for part in blocks(cells.number):
         k, height = pick(kappa, part), bumps[cells.facets[:, part]]
-        slope[:, part] = k * cells.apply(excess[:, part] - 4 / 3 * height, part)
-        diagonal[:, part] = k * cells.squares(part)
+        height *= -4 / 3
+        height += excess[:, part]
+        np.multiply(k, cells.apply(height, part), out=slope[:, part])
+        np.multiply(k, cells.squares(part), out=diagonal[:, part])
     owned = slice(cells.owned_vertices())
     down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
     return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
 
 
-def _across(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
+def _across(cells: Cells, height: FloatArray, part: slice | IndexArray) -> FloatArray:
     """Σ_{j ≠ i} |T| ∇λ_i·∇λ_j height_j."""
     out = np.zeros_like(height)
     for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
@@ -454,7 +467,7 @@ def _lift(
     side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
     if cells.tdim != 2:
         return affine(cells, side, trace, v[side.ends], ends, scale)
-    third = cells.ways[side.local, side.cells] * thirds[side.dofs]
+    third = cells.ways_between(*side.ends) * thirds[side.dofs]
     companion = Cubic(v[side.ends], bumps[side.dofs], third)
     base = Cubic(ends, middle - ends.mean(axis=0), third) if obstacle else companion
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

@@ -34,7 +34,7 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
     boundary, thirds = v.boundary, np.zeros(len(cells.exterior))
     for data in (boundary.u_D, boundary.alpha):
         side = data.side(cells)
-        thirds[side.dofs] = cells.ways[side.local, side.cells] * _of_data(data)
+        thirds[side.dofs] = cells.ways_between(*side.ends) * _of_data(data)
     cells.share(thirds)
     thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
     contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)

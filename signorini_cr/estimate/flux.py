@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import Edge, Load
-from ..fem.cells import Cells, Side, blocks, pick, poincare, sum_rows
+from ..fem.cells import Cells, Side, blocks, dot_rows, pick, poincare, sum_rows
 from .beyond import Beyond
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ class Flux:
         contact: Fluxes through the facets of Γ1, not negative, shape (n,).
         touching: Whether the facet of Γ1 is in contact, shape (n,).
         left: ∫_T (f + div y), shape (cells,).
+        steepness: ‖∇u_h‖²_T, shape (cells,).
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
     """
 
@@ -39,6 +40,7 @@ class Flux:
     contact: FloatArray
     touching: BoolArray
     left: FloatArray
+    steepness: FloatArray
     beyond: Beyond | None = None
 
 
@@ -69,11 +71,14 @@ def equilibrate(
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
-    fluxes = np.empty_like(excess)
+    fluxes, steepness = np.empty_like(excess), np.empty(cells.number)
     for part in blocks(cells.number):
         shares = load.shares(cells, part)
         np.negative(shares, out=excess[:, part])
-        fluxes[:, part] = -d * pick(kappa, part) * cells.apply(w[:, part], part) - shares
+        slopes = cells.apply(w[:, part], part)
+        steepness[part] = dot_rows(w[:, part], slopes)
+        slopes *= -d * pick(kappa, part)
+        np.subtract(slopes, shares, out=fluxes[:, part])
     on_neumann, through = edge.side, edge.shares.sum(axis=0)
     for i, share in enumerate(edge.to_cells()):
         # the facet itself gets all of it further down
@@ -95,7 +100,7 @@ def equilibrate(
     excess[there] += through - fluxes[there]
     left = sum_rows(excess)
     left += cells.volume * load.mean
-    return Flux(excess, contact, touching, left)
+    return Flux(excess, contact, touching, left, steepness)
 
 
 def unbalanced(

@@ -59,8 +59,8 @@ def integrate(
         if height is not None:
             fv += load.mean[part] * sum_rows(height) / 3
         share = pp + bb
-        around += pp + bb + 2.0 * pb
-        beside += pp + bb - 2.0 * pb
+        around += share + 2.0 * pb
+        beside += share - 2.0 * pb
         if load.hats is not None and load.bumps is not None and load.variance is not None:
             hats, bumps = load.hats[:, part], load.bumps[:, part]
             moment = dot_rows(hats, c)
@@ -95,11 +95,13 @@ def integrate(
                 if kappa.values is not None:
                     # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
                     slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
-                sums.load_companion += float(np.sum(volume * moment))
+                work = volume * moment
+                sums.load_companion += float(np.sum(work))
                 sums.load_flux += float(np.sum(against))
                 sums.slack += float(np.sum(slack))
-                around += osc + 2.0 * (against + slack + volume * moment)
-                beside += osc + 2.0 * (against + slack - volume * moment)
+                against += slack
+                around += osc + 2.0 * (against + work)
+                beside += osc + 2.0 * (against - work)
         sums.flux += float(np.sum(pp))
         sums.companion += float(np.sum(bb))
         sums.cross += float(np.sum(pb))
@@ -240,14 +242,15 @@ def _exact(
     s, c_sum = sum_rows(P), sum_rows(c)
     z = c + W
     Sc, Sz = cells.apply(c, part), cells.apply(z, part)
-    bb, vv = dot_rows(c, Sc), dot_rows(z, Sz)
+    if height is None:
+        bb, vv, on_facets = dot_rows(c, Sc), dot_rows(z, Sz), c
+    else:
+        squares, bent = bump_squares(cells, height, part), 8 / 3 * height
+        bb, vv = (dot_rows(a - bent, Sa) + squares for a, Sa in ((c, Sc), (z, Sz)))
+        c_sum -= 2.0 * sum_rows(height)
+        on_facets = c - 0.5 * bent
     # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
-    pb = (s * c_sum - dot_rows(P, c)) / d - s * c_sum / (d + 1)
-    if height is not None:
-        squares = bump_squares(cells, height, part)
-        bb += squares - 8 / 3 * dot_rows(height, Sc)
-        vv += squares - 8 / 3 * dot_rows(height, Sz)
-        pb += 2 / 3 * dot_rows(P, height) - s * sum_rows(height) / 3
+    pb = (s * c_sum / (d + 1) - dot_rows(P, on_facets)) / d
     return field_squares(cells, P, part) / k, k * bb, pb, k * vv
 
 
@@ -370,19 +373,15 @@ def _against_potential(
 ) -> FloatArray:
     """∫_T (f − f_T) φ for the φ with ∇φ = y − κ_T∇u_h and d = 2, shape (cells in the part,).
 
-    d |T| φ = s |x − x_T|²/2 − (x − x_T)·Σ a_i X_i up to a constant, a_i = P_i − s/(d + 1). With
-    x = Σ λ_i X_i, |x − x_T|² = Σ λ_i |X_i − x_T|² − Σ_{i<j} λ_i λ_j |X_i − X_j|².
+    2d |T| φ = Σ P_i |x − X_i|² up to a constant, and for x = Σ λ_i X_i with L_ij = |X_i − X_j|²
+    |x − X_i|² = Σ_j λ_j L_ij − Σ_{j<k} λ_j λ_k L_jk.
     """
-    d = cells.tdim
-    a = P - s / (d + 1)
-    lengths = cells.lengths[:, part]
-    arm, reach = np.zeros_like(a), np.zeros_like(a)  # Σ_j |X_i − X_j|² times a_j, and times 1
-    square = np.zeros_like(s)
-    for (i, j), length in zip(cells.pairs, lengths, strict=True):
-        reach[i] += length
-        reach[j] += length
-        arm[i] += a[j] * length
-        arm[j] += a[i] * length
-        square -= bumps[3 - i - j] * length / 4
-    square += dot_rows(hats, reach) / (d + 1)
-    return (s * square + dot_rows(hats, arm)) / (2 * d)
+    total = np.zeros_like(s)
+    quarter = s / 4
+    for (i, j), length in zip(cells.pairs, cells.lengths[:, part], strict=True):
+        here = hats[j] * P[i]
+        here += hats[i] * P[j]
+        here -= quarter * bumps[3 - i - j]
+        here *= length
+        total += here
+    return total / (2 * cells.tdim)

@@ -142,9 +142,13 @@ class Cells:
         That is from the end with the lower local number to the other; −1 on one of both sides where
         they do not agree.
         """
+        return np.stack([self.ways_between(*self.vertices[pair]) for pair in self.others])
+
+    def ways_between(self, first: IndexArray, second: IndexArray) -> FloatArray:
+        """1 where the first of two vertices comes before the second on all ranks, else −1."""
         name = self.domain.mesh.topology.index_map(0).local_to_global
-        names = name(self.vertices.ravel().astype(np.int32)).reshape(self.vertices.shape)
-        return np.stack([np.where(names[j] < names[k], 1.0, -1.0) for j, k in self.others])
+        names = (name(ends.astype(np.int32)) for ends in (first, second))
+        return np.where(np.less(*names), 1.0, -1.0)
 
     @cached_property
     def sides(self) -> dict[int, Side]:

@@ -6,6 +6,8 @@ is touched.
 
 from __future__ import annotations
 
+import functools
+import io
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +19,7 @@ from .files import disk_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 Where = str | os.PathLike[str]
 
@@ -25,17 +27,38 @@ Where = str | os.PathLike[str]
 BLUE, RED, YELLOW, GREY = "#004488", "#BB5566", "#DDAA33", "#777777"
 
 
+@functools.cache
+def _page() -> type[Figure]:
+    from matplotlib.figure import Figure
+
+    class Page(Figure):
+        """A figure that notebooks can show, whether or not they have heard of Matplotlib."""
+
+        def _repr_png_(self) -> bytes:
+            return as_png(self)
+
+    return Page
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of so many inches that knows how to become a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    figure = _page()(figsize=(width, height), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def plane_axes(points: FloatArray, room: float = 0.0) -> tuple[Figure, Axes, float]:
+def as_png(figure: Figure | SubFigure) -> bytes:
+    """The bytes of a PNG."""
+    file = io.BytesIO()
+    figure.canvas.print_figure(file, format="png")
+    return file.getvalue()
+
+
+def plane_axes(
+    points: FloatArray, room: float = 0.0, ax: Axes | None = None
+) -> tuple[Figure | SubFigure, Axes, float]:
     """Axes of equal scale for what lies in the box of `points`.
 
     Only a very slender domain is stretched, and its axis says so.
@@ -43,6 +66,7 @@ def plane_axes(points: FloatArray, room: float = 0.0) -> tuple[Figure, Axes, flo
     Args:
         points: Shape (n, 2).
         room: Inches left free beside the axes.
+        ax: Axes to take in the place of new ones.
 
     Returns:
         The figure, the axes and their width in inches.
@@ -51,8 +75,11 @@ def plane_axes(points: FloatArray, room: float = 0.0) -> tuple[Figure, Axes, flo
     margin = 0.03 * (high - low).max()
     inches = 7.0 * (high - low) / (high - low).max()
     stretch = np.where(inches < 0.7, 2.2 / inches, 1.0)
-    figure = new_figure(max((inches * stretch)[0] + 1.2, 6.0) + room, (inches * stretch)[1] + 2.0)
-    axes = figure.subplots()
+    width, height = inches * stretch
+    axes = ax or new_figure(max(width + 1.2, 6.0) + room, height + 2.0).subplots()
+    figure = axes.figure
+    if ax is not None:
+        width = ax.bbox.width / figure.dpi
     axes.set_aspect(stretch[1] / stretch[0])
     margins = margin / stretch
     axes.set_xlim(low[0] - margins[0], high[0] + margins[0])
@@ -64,10 +91,10 @@ def plane_axes(points: FloatArray, room: float = 0.0) -> tuple[Figure, Axes, flo
     axes.set_xlabel(next(labels), fontsize=13)
     axes.set_ylabel(next(labels), fontsize=13)
     axes.tick_params(labelsize=11)
-    if inches[0] * stretch[0] < 3.0:
+    if width < 3.0:
         axes.locator_params(nbins=4, axis="x")
     axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
-    return figure, axes, float(inches[0] * stretch[0])
+    return figure, axes, float(width)
 
 
 def draw_lines(axes: Axes, segments: FloatArray, **style: Any) -> None:
@@ -77,11 +104,14 @@ def draw_lines(axes: Axes, segments: FloatArray, **style: Any) -> None:
     axes.add_collection(LineCollection(list(segments), **style), autolim=False)
 
 
-def legend(figure: Figure, *entries: Any, ncols: int, above: str = "") -> None:
-    """Put a legend below everything, and a text above it."""
-    figure.legend(
+def legend(
+    figure: Figure | SubFigure, *entries: Any, ncols: int, above: str = "", ax: Axes | None = None
+) -> None:
+    """Put a legend below everything, or below Axes that were given, and a text above it."""
+    below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18)}
+    (figure if ax is None else ax).legend(
         *entries,
-        loc="outside lower center",
+        **({"loc": "outside lower center"} if ax is None else below),
         ncols=ncols,
         fontsize=12,
         frameon=False,
@@ -101,11 +131,12 @@ def grouped(number: int) -> str:
     return f"{number:,}".replace(",", "\u2009")
 
 
-def save(figure: Figure, path: Where) -> None:
-    """Write the PNG.
+def save(figure: Figure | SubFigure, path: Where | None) -> None:
+    """Write the PNG, if a path is given.
 
     Raises:
         InputError: The system does not let us.
     """
-    with disk_errors(Path(path)):
-        figure.savefig(path, format="png")
+    if path is not None:
+        with disk_errors(Path(path)):
+            figure.canvas.print_figure(path, format="png")

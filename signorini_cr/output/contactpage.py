@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray
+from ..errors import InputError
 from .canvas import BLUE, RED, draw_lines, legend, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 Table = Mapping[str, npt.NDArray]
 
@@ -21,17 +22,20 @@ MOST_PARTS = 6
 """Contact parts with panels of their own: the longest ones."""
 
 
-def contact_page(table: Table, transitions: FloatArray, size: float) -> Figure:
+def contact_page(
+    table: Table, transitions: FloatArray, size: float, ax: Axes | None = None
+) -> Figure | SubFigure:
     """Draw all of Γ1, each connected part in a column of its own.
 
     Args:
         table: From `Contact.table`.
         transitions: Points where contact begins or ends, shape (m, 2 or 3).
         size: The largest |u_h| anywhere: far smaller values are drawn as the zeros they are.
+        ax: Axes in a grid, whose place the panels take.
     """
     parts, lengths = _parts(table)
     shares = np.maximum(lengths / lengths.max(), 0.2)
-    figure = new_figure(9.0, 6.6 + 0.2 * (len(parts) - 1))
+    figure = _page(9.0, 6.6 + 0.2 * (len(parts) - 1), ax)
     panels = figure.subplots(
         2, len(parts), sharex="col", sharey="row", squeeze=False, width_ratios=shares
     )
@@ -56,8 +60,20 @@ def contact_page(table: Table, transitions: FloatArray, size: float) -> Figure:
     for axes in panels.ravel():
         handles, labels = axes.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
-    legend(figure, list(entries.values()), list(entries), ncols=5, above=along)
+    legend(figure, list(entries.values()), list(entries), ncols=5 if ax is None else 3, above=along)
     return figure
+
+
+def _page(width: float, height: float, ax: Axes | None) -> Figure | SubFigure:
+    """A new figure, or what takes the place of the axes."""
+    if ax is None:
+        return new_figure(width, height)
+    place = ax.get_subplotspec()
+    if place is None:
+        raise InputError("a picture of the contact needs Axes of a grid, as from subplots")
+    page = ax.figure.add_subfigure(place)
+    ax.remove()
+    return page
 
 
 def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:

@@ -2,12 +2,15 @@
 
 Matplotlib is loaded when a picture is drawn, on rank 0 alone, and used through its objects:
 nothing global is touched. Functions that take a domain or a solution are collective.
+
+All of them take a path for a PNG, or Axes to draw on, or neither; they return the figure on rank 0,
+None elsewhere, and a notebook shows it.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +39,9 @@ from .contactpage import contact_page
 from .raster import raster
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
     from ..solution import Solution
 
 Where = str | os.PathLike[str]
@@ -66,13 +72,16 @@ def can_draw(comm: MPI.Comm) -> bool:
     return on_root(comm, lambda: find_spec("matplotlib") is not None)
 
 
-def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
+def plot_mesh(
+    domain: Domain, path: Where | None = None, title: str = "", ax: Axes | None = None
+) -> Figure | SubFigure | None:
     """Draw the mesh with Γ0, Γ1 and Γg.
 
     Args:
         domain: A plane domain.
-        path: The PNG to write.
+        path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
+        ax: Axes to draw on, on rank 0.
 
     Raises:
         InputError: The domain is not plane, or the file can't be written.
@@ -81,27 +90,31 @@ def plot_mesh(domain: Domain, path: Where, title: str = "") -> None:
     cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
     parts = {part: _segments(domain, part) for part in STYLES}
 
-    def draw() -> None:
-        figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2))
+    def draw() -> Figure | SubFigure:
+        figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2), ax=ax)
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
         for part, style in STYLES.items():
             if len(parts[part]):
                 draw_lines(axes, parts[part], zorder=3, capstyle="round", **style)
-        legend(figure, ncols=3)
+        legend(figure, ncols=3, ax=ax)
         hidden = "" if len(edges) else ", inner edges not drawn"
         axes.set_title(headline(title, f"mesh of {grouped(cells)} cells{hidden}"), fontsize=14)
         save(figure, path)
+        return figure
 
-    on_root(mesh.comm, draw)
+    return drawn(mesh.comm, draw)
 
 
-def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
+def plot_solution(
+    solution: Solution, path: Where | None = None, title: str = "", ax: Axes | None = None
+) -> Figure | SubFigure | None:
     """Draw u_h as it is, jumps across the edges included, and where it is in contact.
 
     Args:
         solution: On a plane domain.
-        path: The PNG to write.
+        path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
+        ax: Axes to draw on, on rank 0.
 
     Raises:
         InputError: The domain is not plane, or the file can't be written.
@@ -113,8 +126,8 @@ def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
     boundary = np.concatenate([_segments(domain, part) for part in STYLES])
     touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
 
-    def draw() -> None:
-        figure, axes, width = plane_axes(box, room=1.2)
+    def draw() -> Figure | SubFigure:
+        figure, axes, width = plane_axes(box, room=1.2, ax=ax)
         shown = axes.imshow(
             image,
             extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
@@ -141,20 +154,24 @@ def plot_solution(solution: Solution, path: Where, title: str = "") -> None:
         bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=2, ha="left", va="center")
         bar.ax.tick_params(labelsize=11)
         bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
-        legend(figure, ncols=2)
+        legend(figure, ncols=2, ax=ax)
         axes.set_title(headline(title, f"$u_h$ on {grouped(solution.cells)} cells"), fontsize=14)
         save(figure, path)
+        return figure
 
-    on_root(mesh.comm, draw)
+    return drawn(mesh.comm, draw)
 
 
-def plot_contact(solution: Solution, path: Where, title: str = "") -> None:
+def plot_contact(
+    solution: Solution, path: Where | None = None, title: str = "", ax: Axes | None = None
+) -> Figure | SubFigure | None:
     """Draw u_h with the obstacle, and the pressure λ_h below it, along Γ1.
 
     Args:
         solution: On a plane domain with a contact boundary.
-        path: The PNG to write.
+        path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
+        ax: Axes in a grid, on rank 0, whose place the panels take.
 
     Raises:
         InputError: The domain is not plane or has no Γ1, or the file can't be written.
@@ -165,14 +182,15 @@ def plot_contact(solution: Solution, path: Where, title: str = "") -> None:
         raise InputError("a picture of the contact needs a contact boundary")
     size = comm.allreduce(float(np.abs(solution.u.x.array).max(initial=0.0)), op=MPI.MAX)
 
-    def draw() -> None:
+    def draw() -> Figure | SubFigure:
         assert table is not None
-        figure = contact_page(table, contact.transitions, size)
+        figure = contact_page(table, contact.transitions, size, ax)
         count = f"{grouped(contact.number_active)} of {grouped(contact.number)} facets in contact"
         figure.suptitle(headline(title, count), fontsize=14)
         save(figure, path)
+        return figure
 
-    on_root(comm, draw)
+    return drawn(comm, draw)
 
 
 def convergence_series(records: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -180,7 +198,12 @@ def convergence_series(records: Sequence[Mapping[str, Any]]) -> list[str]:
     return [key for key in SERIES if sum(bool(record[key]) for record in records) > 1]
 
 
-def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: str = "") -> None:
+def plot_convergence(
+    records: Sequence[Mapping[str, Any]],
+    path: Where | None = None,
+    title: str = "",
+    ax: Axes | None = None,
+) -> Figure | SubFigure:
     """Draw errors, and the certified bound, with the slopes of an undisturbed convergence.
 
     They are drawn against h, or against the number of dofs where refinement was adaptive and h
@@ -188,8 +211,9 @@ def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: s
 
     Args:
         records: From `output.level_record`; two at least with an error or a bound.
-        path: The PNG to write, by this rank.
+        path: The PNG to write, if any, by this rank.
         title: What the picture is of, say the problem's name.
+        ax: Axes to draw on.
 
     Raises:
         InputError: There is nothing to draw, or the file can't be written.
@@ -199,8 +223,7 @@ def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: s
         raise InputError("a picture of convergence needs two levels with an error or a bound")
     sizes = np.array([record["h"] for record in records])
     uniform = bool(np.all(sizes[1:] < 0.7 * sizes[:-1]))
-    figure = new_figure(7.5, 6.0)
-    axes = figure.subplots()
+    axes = ax or new_figure(7.5, 6.0).subplots()
     for key in keys:
         used = [record for record in records if record[key]]
         x = np.array([record["h" if uniform else "dofs"] for record in used])
@@ -231,7 +254,15 @@ def plot_convergence(records: Sequence[Mapping[str, Any]], path: Where, title: s
     axes.grid(which="both", alpha=0.25)
     axes.legend(fontsize=12)
     axes.set_title(headline(title, "convergence"), fontsize=14)
-    save(figure, path)
+    save(axes.figure, path)
+    return axes.figure
+
+
+def drawn(comm: MPI.Comm, draw: Callable[[], Figure | SubFigure]) -> Figure | SubFigure | None:
+    """Draw on rank 0, which alone gets the figure; collective."""
+    figures: list[Figure | SubFigure] = []
+    on_root(comm, lambda: figures.append(draw()))
+    return figures[0] if figures else None
 
 
 def _plane(domain: Domain) -> Mesh:

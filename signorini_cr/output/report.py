@@ -29,7 +29,7 @@ from .files import Writer, write_files, write_text
 from .tables import contact_csv, levels_csv, markdown_table
 from .tables import table_header as table_header
 from .tables import table_row as table_row
-from .vtu import write_vtu
+from .vtu import write_solution
 
 if TYPE_CHECKING:
     from ..solution import Solution
@@ -198,7 +198,7 @@ def write_output(
     """
     comm, title, records = solution.domain.mesh.comm, report["title"], report["levels"]
     writers = _texts(report, solution)
-    writers["solution.vtu"] = lambda path: write_vtu(solution.u, path)
+    writers["solution.vtu"] = lambda path: write_solution(solution, path)
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
     if drawable and plots.can_draw(comm):
         writers["mesh.png"] = lambda path: plots.plot_mesh(solution.domain, path, title)
@@ -206,8 +206,8 @@ def write_output(
         if solution.contact.number:
             writers["contact.png"] = lambda path: plots.plot_contact(solution, path, title)
         if plots.convergence_series(records):
-            writers["convergence.png"] = lambda path: on_root(
-                comm, plots.plot_convergence, records, path, title
+            writers["convergence.png"] = lambda path: plots.drawn(
+                comm, lambda: plots.plot_convergence(records, path, title)
             )
     write_files(folder, writers, removed=FILES, comm=comm)
     return list(writers)

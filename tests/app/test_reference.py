@@ -6,6 +6,7 @@ import pytest
 from helpers import ROOT
 from mpi4py import MPI
 
+from signorini_cr.app.datacheck import USED_ON
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, KEYS, page
 
@@ -40,6 +41,12 @@ def test_examples_are_read(key, tmp_path: Path) -> None:
     path = tmp_path / "case.toml"
     path.write_text("\n".join(lines), encoding="utf-8")
     load(path, MPI.COMM_SELF)
+
+
+def test_every_expression_of_the_table_is_used() -> None:
+    """A datum that nothing asks for would be read and forgotten."""
+    expressions = {f"{key.section}.{key.name}" for key in KEYS if key.section in ("data", "exact")}
+    assert set(USED_ON) == expressions
 
 
 @pytest.mark.serial

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
 from dolfinx.mesh import (
     compute_midpoints,
     create_rectangle,
-    create_unit_cube,
     exterior_facet_indices,
     meshtags,
 )
@@ -21,10 +19,8 @@ from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Problem, solve, solve_levels
 from signorini_cr.estimate.certificate import SHARES, Certificate
-from signorini_cr.fem.space import function_space
 from signorini_cr.output import report as output
 from signorini_cr.output.files import check_writable, write_files
-from signorini_cr.output.vtu import write_vtu
 
 pytestmark = pytest.mark.ranks
 
@@ -259,59 +255,6 @@ def test_contact_csv_runs_along_the_boundary_and_adds_up(finished, folder):
     assert column["active"].sum() == contact["active"]
     assert column["active"] @ column["length"] == pytest.approx(contact["length"])
     assert set(column["active"]) == {0.0, 1.0}
-
-
-def read_vtu(path):
-    """The arrays of a .vtu file with raw appended data, by name."""
-    content = path.read_bytes()
-    head, data = content.split(b'<AppendedData encoding="raw">\n_', 1)
-    pattern = r'<DataArray type="(\w+)" Name="(\w+)" NumberOfComponents="(\d)" .*?offset="(\d+)"/>'
-    arrays = {}
-    for kind, name, components, offset in re.findall(pattern, head.decode()):
-        start = int(offset) + 8
-        size = int.from_bytes(data[start - 8 : start], "little")
-        array = np.frombuffer(data[start : start + size], dtype=kind.lower())
-        arrays[name] = array.reshape(-1, int(components)) if int(components) > 1 else array
-        end = start + size
-    assert data[end:] == b"\n</AppendedData>\n</VTKFile>\n"
-    assert f'NumberOfPoints="{len(arrays["points"])}"' in head.decode()
-    assert f'NumberOfCells="{len(arrays["types"])}"' in head.decode()
-    return arrays
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_the_field_for_paraview_is_the_cr_function_itself(shared_tmp_path, dim):
-    mesh = rectangle(4).mesh if dim == 2 else create_unit_cube(WORLD, 2, 2, 2)
-    u = fem.Function(function_space(mesh, "CR"))
-
-    def wave(x):
-        return np.sin(3 * x[0]) * np.cos(2 * x[1]) + x[2]
-
-    u.interpolate(wave)
-    u.x.scatter_forward()
-    write_vtu(u, shared_tmp_path / "u.vtu")
-    arrays = read_vtu(shared_tmp_path / "u.vtu")
-    cells = mesh.topology.index_map(dim).size_global
-    points, values = arrays["points"], arrays["u"]
-    assert len(points) == len(values) == (dim + 1) * cells
-    assert np.array_equal(arrays["connectivity"], np.arange(len(points)))
-    assert np.array_equal(arrays["offsets"], (dim + 1) * np.arange(1, cells + 1))
-    assert set(arrays["types"]) == {5 if dim == 2 else 10}
-    # The cells fill the domain, and on the middle of each facet stands the facet's dof
-    corners, at_corners = points.reshape(cells, dim + 1, 3), values.reshape(cells, dim + 1)
-    edges = (corners[:, 1:] - corners[:, :1])[:, :, :dim]
-    volume = np.abs(np.linalg.det(edges)).sum() / (2 if dim == 2 else 6)
-    assert volume == pytest.approx(2.0 if dim == 2 else 1.0)
-    for opposite in range(dim + 1):
-        middle = np.delete(corners, opposite, axis=1).mean(axis=1)
-        means = np.delete(at_corners, opposite, axis=1).mean(axis=1)
-        assert means == pytest.approx(wave(middle.T))
-    # The jumps are there
-    _, which = np.unique(points.round(9), axis=0, return_inverse=True)
-    at_first = [values[which.ravel() == 0].min(), values[which.ravel() == 0].max()]
-    spread = max(np.ptp(values[which.ravel() == i]) for i in range(which.max() + 1))
-    assert np.all(np.isfinite(at_first))
-    assert spread > 1e-3
 
 
 def test_a_writer_that_fails_leaves_everything_as_it_was(shared_tmp_path):

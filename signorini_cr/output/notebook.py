@@ -1,0 +1,57 @@
+"""A solution as a notebook shows it: what is known about it in a table, and its picture."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from typing import TYPE_CHECKING
+
+from . import plots
+from .canvas import as_png, grouped
+
+if TYPE_CHECKING:
+    from ..solution import Solution
+
+
+def as_html(solution: Solution) -> str:
+    """A table and, below it, the picture of u_h; not collective.
+
+    Nothing is solved or certified for it: of the certificate there is what has been made. There is
+    no picture where there are several ranks, which would have to draw it together, nor of
+    domains in space, nor without Matplotlib.
+    """
+    contact, iterations = solution.contact, solution.iterations
+    rows = {
+        "element": solution.element,
+        "cells": grouped(solution.cells),
+        "degrees of freedom": grouped(solution.dofs),
+        "energy J(u_h)": f"{solution.energy:.9g}",
+        "facets in contact": f"{grouped(contact.number_active)} of {grouped(contact.number)}",
+        "length in contact": f"{contact.length:.6g}",
+        "contact force": f"{contact.force:.6g}",
+        "Newton steps, linear iterations": f"{iterations.newton}, {iterations.linear}",
+    }
+    certificate = solution.__dict__.get("certificate")
+    if certificate is None:
+        rows["error bound"] = "not asked for: solution.certificate"
+    elif certificate.bound_h1 is None or certificate.energy is None:
+        rows["error bound"] = f"none: {certificate.reason}"
+    else:
+        rows["error at most"] = f"{certificate.bound_h1:.3g}"
+        rows["energy J(u) in"] = "[{:.9g}, {:.9g}]".format(*certificate.energy)
+    left, right = 'style="text-align:left"', 'style="text-align:right"'
+    table = "".join(
+        f"<tr><th {left}>{escape(name)}</th><td {right}>{escape(value)}</td></tr>"
+        for name, value in rows.items()
+    )
+    return f"<table>{table}</table>{_picture(solution)}"
+
+
+def _picture(solution: Solution) -> str:
+    mesh = solution.domain.mesh
+    if mesh.comm.size > 1 or mesh.geometry.dim != 2 or not plots.can_draw(mesh.comm):
+        return ""
+    figure = plots.plot_solution(solution)
+    assert figure is not None
+    data = base64.b64encode(as_png(figure)).decode()
+    return f'<img alt="u_h" style="max-width:640px" src="data:image/png;base64,{data}"/>'

@@ -1,0 +1,98 @@
+"""Pictures without a file: on Axes of one's own, or for a notebook."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+from helpers import on_a_slope
+from mpi4py import MPI
+
+from signorini_cr import InputError, plots
+from signorini_cr.output import canvas
+from signorini_cr.output.raster import raster
+
+image = pytest.importorskip("matplotlib.image")
+WORLD = MPI.COMM_WORLD
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return on_a_slope(2)
+
+
+def records():
+    rows = [{"h": 2.0**-k, "dofs": 4**k, "error_h1": 2.0**-k, "error_l2": None} for k in range(4)]
+    return [row | {"bound_h1": 2 * row["error_h1"], "rate_h1": 1.0} for row in rows]
+
+
+def grid(rows, columns):
+    """Axes in a grid; on rank 0, which draws."""
+    figure = canvas.new_figure(12.0, 9.0)
+    return figure, figure.subplots(rows, columns)
+
+
+def test_without_a_path_there_is_a_figure_that_shows_itself(solution):
+    figures = [
+        plots.plot_mesh(solution.domain),
+        plots.plot_solution(solution),
+        plots.plot_contact(solution),
+        plots.plot_convergence(records()) if WORLD.rank == 0 else None,
+    ]
+    assert all((figure is None) == (WORLD.rank > 0) for figure in figures)
+    for figure in figures if WORLD.rank == 0 else []:
+        pixels = image.imread(BytesIO(figure._repr_png_()))
+        assert abs(pixels.shape[1] - figure.get_figwidth() * figure.dpi) <= 1
+        assert np.ptp(pixels[..., :3]) > 0.9
+
+
+def test_axes_show_what_the_solution_says(solution):
+    figure, (ours, theirs) = grid(1, 2) if WORLD.rank == 0 else (None, (None, None))
+    drawn = plots.plot_solution(solution, ax=ours)
+    pixels, _, limits = raster(solution.u)
+    plots.plot_mesh(solution.domain, ax=theirs)
+    if figure is None:
+        assert drawn is None
+        return
+    assert drawn is figure
+    (shown,) = ours.get_images()
+    assert np.array_equal(shown.get_array().filled(np.nan), pixels, equal_nan=True)
+    assert shown.get_clim() == limits
+    assert shown.get_extent() == pytest.approx([-1, 1, 0, 1])
+    for axes in (ours, theirs):
+        low, high = axes.get_xlim()
+        assert low < -1 and high > 1 and axes.get_legend() is not None
+    # mesh: all edges; Γ0, Γ1, each facet by its two ends
+    segments = [len(lines.get_segments()) for lines in theirs.collections]
+    edges = solution.domain.mesh.topology.index_map(1).size_global
+    assert segments == [edges, 32, 16]
+
+
+def test_contact_takes_the_place_of_axes(solution):
+    figure, axes = grid(2, 2) if WORLD.rank == 0 else (None, np.full((2, 2), None))
+    plots.plot_contact(solution, ax=axes[0, 1])
+    table = solution.contact.table()
+    if figure is not None:
+        assert axes[0, 1] not in figure.axes
+        (page,) = figure.subfigs
+        upper, lower = page.axes
+        curves = {line.get_label(): line.get_ydata() for line in upper.get_lines()}
+        assert np.array_equal(curves["$u_h$"], table["u"])
+        (steps,) = (patch for patch in lower.patches if patch.get_label() == r"$\lambda_h$")
+        assert np.array_equal(steps.get_data().values, table["pressure"])
+        figure.canvas.draw()
+        # in the upper right quarter
+        box = upper.get_window_extent().transformed(figure.transFigure.inverted())
+        assert box.x0 > 0.5 and box.y0 > 0.5
+        alone = figure.add_axes((0.0, 0.0, 0.1, 0.1))
+    with pytest.raises(InputError, match="Axes of a grid"):
+        plots.plot_contact(solution, ax=alone if figure is not None else None)
+
+
+@pytest.mark.serial
+def test_convergence_on_axes_of_ones_own():
+    _, axes = grid(1, 1)
+    plots.plot_convergence(records(), ax=axes)
+    lines = {line.get_label().split(",")[0]: line for line in axes.get_lines()}
+    assert lines[plots.SERIES["bound_h1"]["label"]].get_ydata() == pytest.approx(
+        [2.0, 1.0, 0.5, 0.25]
+    )
