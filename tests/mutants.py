@@ -33,13 +33,19 @@ TESTS = {
 """What is run on the mutants of a street."""
 SLOW = "not waving and not need_two_sweeps and not rates"
 """What is left out of it."""
-OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
-OPERATORS |= {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult}
-OPERATORS |= {ast.And: ast.Or, ast.Or: ast.And}
-OFF_BY_ONE = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
-NEGATED = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt}
-NEGATED |= {ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is}
-NEGATED |= {ast.In: ast.NotIn, ast.NotIn: ast.In}
+
+
+def _table(pairs: str) -> dict[type[ast.AST], type[ast.AST]]:
+    return {getattr(ast, a): getattr(ast, b) for a, b in (one.split(">") for one in pairs.split())}
+
+
+OPERATORS = _table(
+    "Add>Sub Sub>Add Mult>Div Div>Mult Pow>Mult FloorDiv>Mult Mod>Mult And>Or Or>And"
+)
+OFF_BY_ONE = _table("Lt>LtE LtE>Lt Gt>GtE GtE>Gt")
+NEGATED = _table(
+    "Lt>GtE LtE>Gt Gt>LtE GtE>Lt Eq>NotEq NotEq>Eq Is>IsNot IsNot>Is In>NotIn NotIn>In"
+)
 NAMES = {"min": "max", "minimum": "maximum", "any": "all", "low": "high"}
 NAMES |= {new: old for old, new in NAMES.items()}
 ELSEWHERE = ("scatter_forward()", "destroy()")
@@ -64,13 +70,6 @@ def mutants(node: ast.AST) -> Iterator[Mutant]:
 
 def _text(node: ast.AST) -> str:
     return ast.unparse(node).split("\n")[0][:60]
-
-
-def _set(node: ast.AST, name: str, i: int | None, new: ast.AST) -> None:
-    if i is None:
-        setattr(node, name, new)
-    else:
-        getattr(node, name)[i] = new
 
 
 def _of_node(node: ast.AST) -> Iterator[Mutant]:
@@ -105,7 +104,10 @@ def _in_place(
     """Changes that put something else in the place of a node."""
 
     def put(new: ast.AST) -> Callable[[], None]:
-        return lambda: _set(parent, field, i, ast.copy_location(new, node))
+        ast.copy_location(new, node)
+        if i is None:
+            return lambda: setattr(parent, field, new)
+        return lambda: getattr(parent, field).__setitem__(i, new)
 
     text = _text(node)
     match node:
@@ -113,11 +115,10 @@ def _in_place(
             yield f"{text} -> {_text(operand)}", put(operand)
         case ast.Call(func=ast.Attribute(attr="abs" | "sqrt") | ast.Name(id="abs"), args=[inner]):
             yield f"{text} -> {_text(inner)}", put(inner)
-        case ast.AugAssign() | ast.Expr(value=ast.Call()) if not text.endswith(ELSEWHERE):
-            yield f"{text} dropped", put(ast.Pass())
-        case ast.Assign(targets=[ast.Subscript() | ast.Attribute()]):
-            yield f"{text} dropped", put(ast.Pass())
-        case ast.Continue() | ast.Break() | ast.Assert():
+        case (
+            ast.AugAssign() | ast.Expr(value=ast.Call()) | ast.Continue() | ast.Break()
+            | ast.Assert() | ast.Assign(targets=[ast.Subscript() | ast.Attribute()])
+        ) if not text.endswith(ELSEWHERE):  # fmt: skip
             yield f"{text} dropped", put(ast.Pass())
     if field == "test" and not isinstance(parent, ast.Assert):
         yield f"not {text}", put(ast.UnaryOp(ast.Not(), node))
