@@ -138,15 +138,13 @@ class Mutated(SourceFileLoader):
         return self.code
 
 
-def load(path: Path, index: int) -> tuple[str, Mutated]:
+def load(path: Path, index: int) -> Mutated:
     """The mutant of this number of a file."""
     tree = ast.parse(path.read_text())
-    line, what, change = list(mutants(tree))[index]
-    change()
-    name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-    mutated = Mutated(name, str(path))
+    list(mutants(tree))[index][2]()
+    mutated = Mutated(".".join(path.relative_to(ROOT).with_suffix("").parts), str(path))
     mutated.code = compile(ast.fix_missing_locations(tree), str(path), "exec")
-    return f"{path.relative_to(ROOT)}:{line}: {what}", mutated
+    return mutated
 
 
 def end_of(mutated: Mutated | None, tests: list[str], seconds: float) -> str:
@@ -192,15 +190,18 @@ def main() -> None:
     if end_of(None, tests, 3600) != "passed":
         sys.exit("the tests fail as it is")
     limit = 30 + 5 * (time.monotonic() - began)
-    pool = [(f, i) for f in files for i in range(len(list(mutants(ast.parse(f.read_text())))))]
+    pool = [
+        (path, i, f"{path.relative_to(ROOT)}:{line}: {what}")
+        for path in files
+        for i, (line, what, _) in enumerate(mutants(ast.parse(path.read_text())))
+    ]
     drawn = [pool[i] for i in np.random.default_rng(arguments.seed).permutation(len(pool))]
     if arguments.only:
         wanted = tuple(f"{place}: " for place in arguments.only)
-        drawn = [one for one in drawn if load(*one)[0].startswith(wanted)]
+        drawn = [one for one in drawn if one[2].startswith(wanted)]
     ends: Counter[str] = Counter()
-    for place in drawn[: arguments.count]:
-        what, mutated = load(*place)
-        end = end_of(mutated, tests, limit)
+    for path, index, what in drawn[: arguments.count]:
+        end = end_of(load(path, index), tests, limit)
         ends[end] += 1
         if end == "passed" or arguments.all:
             print(f"{end}: {what}", flush=True)
