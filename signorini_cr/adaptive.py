@@ -15,8 +15,10 @@ from .arrays import BoolArray, FloatArray, Int32Array
 from .errors import InputError, NotConverged
 from .fem.problem import Problem
 from .levels import LevelMonitor, solve_sequence
+from .limits import Limits
 from .mesh.domain import Domain
 from .mesh.refinement import refine_marked
+from .restart import Restart
 from .solution import Solution
 
 RESOLUTION = 1e-11
@@ -33,6 +35,8 @@ def solve_adaptive(
     fraction: float = 0.5,
     element: str = "CR",
     monitor: LevelMonitor | None = None,
+    max_time: float | None = None,
+    restart: Restart | None = None,
 ) -> Iterator[Solution]:
     """Solve on meshes that are refined where the error is; each starts from the one below.
 
@@ -45,6 +49,8 @@ def solve_adaptive(
         fraction: Part of the bound's square that the marked cells hold, in (0, 1].
         element: "CR"; with another one there is no bound.
         monitor: Called after each step of the solver.
+        max_time: No level is begun that would end later than so many seconds from now.
+        restart: Where to go on: the first solution is the one it was taken from, once more.
 
     Yields:
         The solutions, coarsest first; `Solution.certificate` has the bounds.
@@ -53,12 +59,16 @@ def solve_adaptive(
         InputError: As for `solve`; or there is no bound to go by, and the message says why; or
             a mesh of other cells than straight-sided triangles is to be refined; or the fraction or
             the number of levels is out of its range.
-        NotConverged: The solver stopped short on one of the meshes, or cells got too small.
+        NotConverged: The solver stopped short on one of the meshes, or cells got too small, or the
+            next level would not fit into the memory there is, or into ``max_time``.
     """
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None and levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
+
+    limits = Limits(max_time)
+    limits.begin(domain, element, restart)
 
     def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
         certificate = solution.certificate
@@ -79,11 +89,13 @@ def solve_adaptive(
             )
         fine, parent_cell = refine_marked(solution.domain, marked)
         tdim = fine.mesh.topology.dim
-        if fine.mesh.topology.index_map(tdim - 1).size_global > max_dofs:
+        dofs = fine.mesh.topology.index_map(tdim - 1).size_global
+        if dofs > max_dofs:
             return None
+        limits.admit(solution, dofs)
         return fine, parent_cell
 
-    for solution in solve_sequence(problem, domain, step, element, monitor):
+    for solution in solve_sequence(problem, domain, step, element, monitor, restart=restart):
         _ = solution.certificate  # made here, so that it doesn't count as time for the mesh
         yield solution
 

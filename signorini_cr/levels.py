@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 from dolfinx import fem
 
@@ -12,13 +13,15 @@ from .diffusion import Diffusion
 from .errors import InputError, NotConverged
 from .fem.physics import Physics
 from .fem.problem import Problem
+from .limits import Limits
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.hierarchy import Hierarchy
+from .restart import Restart
 from .solution import Solution
 from .vi.contact import contact_facts
 from .vi.level import Level
-from .vi.nested import nested_start
+from .vi.nested import known_start, nested_start
 from .vi.solver import solve_vi
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
@@ -59,6 +62,8 @@ def solve_levels(
     element: str = "CR",
     monitor: LevelMonitor | None = None,
     nested: bool = True,
+    max_time: float | None = None,
+    restart: Restart | None = None,
 ) -> Iterator[Solution]:
     """Solve on a mesh and its uniform refinements, each starting from the one below.
 
@@ -69,6 +74,8 @@ def solve_levels(
         element: "CR" or "P1".
         monitor: Called after each step of the solver.
         nested: Start from the solution on the mesh below; otherwise from zero, to compare.
+        max_time: No level is begun that would end later than so many seconds from now.
+        restart: Where to go on: the first solution is the one it was taken from, once more.
 
     Yields:
         The solutions, coarsest first.
@@ -76,17 +83,24 @@ def solve_levels(
     Raises:
         InputError: As for `solve`; or the data are tied to a mesh, or the mesh is to be refined and
             does not consist of straight-sided triangles.
-        NotConverged: The solver stopped short on one of the levels.
+        NotConverged: The solver stopped short on one of the levels, or a level would not fit into
+            the memory there is, or into ``max_time``.
     """
     if levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
     if levels > 1:
         check_refinable(domain.mesh)
 
-    def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
-        return refine(solution.domain) if solution.level.number + 1 < levels else None
+    limits = Limits(max_time)
+    limits.begin(domain, element, restart)
 
-    yield from solve_sequence(problem, domain, step, element, monitor, nested)
+    def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
+        if solution.level.number + 1 >= levels:
+            return None
+        limits.admit(solution, 4 * solution.dofs)
+        return refine(solution.domain)
+
+    yield from solve_sequence(problem, domain, step, element, monitor, nested, restart)
 
 
 def solve_sequence(
@@ -96,6 +110,7 @@ def solve_sequence(
     element: str = "CR",
     monitor: LevelMonitor | None = None,
     nested: bool = True,
+    restart: Restart | None = None,
 ) -> Iterator[Solution]:
     """Solve on a mesh and on those that ``step`` makes of it, one from the other.
 
@@ -107,12 +122,13 @@ def solve_sequence(
         element: "CR" or "P1".
         monitor: Called after each step of the solver.
         nested: Start from the solution on the mesh below; otherwise from zero, to compare.
+        restart: As for `solve_levels`.
 
     Yields:
         The solutions, coarsest first.
     """
     yield from solve_physics(
-        Diffusion(problem, domain.mesh, element), domain, step, monitor, nested
+        Diffusion(problem, domain.mesh, element), domain, step, monitor, nested, restart
     )
 
 
@@ -122,13 +138,21 @@ def solve_physics(
     step: Callable[[Solution], tuple[Domain, Int32Array] | None],
     monitor: LevelMonitor | None = None,
     nested: bool = True,
+    restart: Restart | None = None,
 ) -> Iterator[Solution]:
     """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`."""
     physics.check(domain)
-    hierarchy, seconds = Hierarchy(physics, domain), {"mesh": 0.0}
-    level, coarser, before = Level(hierarchy.meshes), None, None
+    hierarchy, seconds = Hierarchy(physics, domain), {"mesh": domain.seconds}
+    level, start, before = Level(hierarchy.meshes), _Start(), None
+    if restart is not None:
+        for mesh, parents in restart.meshes(domain):
+            level.tidy()
+            hierarchy.add(mesh, parents)
+            level = Level(hierarchy.meshes, held=level.loose is None)
+        start = _Start(known=restart.function(level.V, 0))
+        before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:
-        solution = _solve(level, hierarchy, (coarser, before), monitor, seconds)
+        solution = _solve(level, hierarchy, start, monitor, seconds)
         yield solution
         began = time.perf_counter()
         refined = step(solution)
@@ -137,16 +161,31 @@ def solve_physics(
         level.tidy()
         hierarchy.add(*refined)
         level = Level(hierarchy.meshes, held=level.loose is None)
+        start = _Start()
         if nested:
-            coarser, before = solution, None if coarser is None else coarser.u
+            start, before = _Start(solution, before), solution.u
         seconds = {"mesh": time.perf_counter() - began}
     hierarchy.free()
+
+
+class _Start(NamedTuple):
+    """What a solve starts from: zero, unless there is something here.
+
+    Attributes:
+        coarser: The solution on the mesh below.
+        before: What that one was started from.
+        known: What was found on the same mesh before.
+    """
+
+    coarser: Solution | None = None
+    before: fem.Function | None = None
+    known: fem.Function | None = None
 
 
 def _solve(
     level: Level,
     hierarchy: Hierarchy,
-    below: tuple[Solution | None, fem.Function | None],
+    start: _Start,
     monitor: LevelMonitor | None,
     seconds: dict[str, float],
 ) -> Solution:
@@ -155,8 +194,7 @@ def _solve(
     Args:
         level: That mesh.
         hierarchy: All meshes.
-        below: The solution on the mesh below, and the one that it was started from; None for a
-            start from zero.
+        start: What to start from.
         monitor: Called after each step of the solver.
         seconds: Wall time of the phases so far; others are added.
     """
@@ -166,8 +204,10 @@ def _solve(
     u, residual = system.start(), fem.Function(level.V)
     if level.loose is not None:
         level.loose.check(system)
-    if below[0] is not None:
-        nested_start(below[0], level, u, below[1])
+    if start.known is not None:
+        known_start(start.known, level, u)
+    elif start.coarser is not None:
+        nested_start(start.coarser, level, u, start.before)
     if level.loose is not None:
         level.loose.hold(system, u)
     told = None if monitor is None else lambda *facts: monitor(level.number, *facts)

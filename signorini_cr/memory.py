@@ -1,15 +1,20 @@
-"""Memory: how much of it there has been, and whether it was at an end."""
+"""Memory: how much of it there has been, how much is left, and whether it was at an end."""
 
 from __future__ import annotations
 
 import errno
+import math
 import resource
 from pathlib import Path
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
+CGROUPS = Path("/sys/fs/cgroup")
+
 _PETSC_ERR_MEM = 55
-_WORDS = ("std::bad_alloc", "Cannot allocate memory")
+# The last one stands in what the other ranks are told of a rank's error, see errors.fail_together
+_WORDS = ("std::bad_alloc", "Cannot allocate memory", "MemoryError")
 
 
 def ran_out_of_memory(error: BaseException | None) -> bool:
@@ -28,9 +33,81 @@ def ran_out_of_memory(error: BaseException | None) -> bool:
 
 def most_memory() -> float:
     """The most memory, in bytes, that this program has held at a time."""
+    # ru_maxrss counts what the process held before it became this program, as a copy of another
+    ours = _status().get("VmHWM")
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss if ours is None else ours
+
+
+def shortage(comm: MPI.Comm, growth: float) -> str | None:
+    """What keeps the ranks from holding more memory than they have ever held; collective.
+
+    Counted are the address space (``ulimit -v``) of each, and what is left to all of them on a
+    machine and in their cgroups, file caches not counted as taken.
+
+    Args:
+        comm: The ranks.
+        growth: How much more this one needs, in bytes.
+
+    Returns:
+        What the lowest rank with too little of it has, in words, on all ranks; None if it fits.
+    """
+    own, words = _status(), None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    spare = math.inf if limit == resource.RLIM_INFINITY else limit - own.get("VmPeak", 0.0)
+    if growth > spare:
+        words = f"{_shown(growth)} more memory, and ulimit -v leaves {_shown(spare)}"
+    together = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    wanted = together.allreduce(growth + own.get("VmHWM", 0.0) - own.get("VmRSS", 0.0))
+    together.Free()
+    if words is None and wanted > (spare := _spare()):
+        words = f"{_shown(wanted)} more memory, and there are {_shown(spare)}"
+    return next((each for each in comm.allgather(words) if each is not None), None)
+
+
+def _shown(size: float) -> str:
+    return f"{max(size, 0.0) / 1e9:.2g} GB"
+
+
+def _status() -> dict[str, float]:
+    """What the system knows of this process, in bytes."""
+    lines = _text(Path("/proc/self/status")).splitlines()
+    return {line.split(":")[0]: 1024.0 * int(line.split()[1]) for line in lines if " kB" in line}
+
+
+def _spare() -> float:
+    """Memory in bytes that is left to the processes of this machine, or of this cgroup."""
+    spare = [math.inf]
+    for line in _text(Path("/proc/meminfo")).splitlines():
+        if line.startswith("MemAvailable:"):
+            spare.append(1024.0 * int(line.split()[1]))
+    for line in _text(Path("/proc/self/cgroup")).splitlines():
+        _, kinds, path = line.split(":", 2)
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        top = CGROUPS / kinds  # the first version has a tree for each kind, the second one for all
+        names = ("limit_in_bytes", "usage_in_bytes") if kinds else ("max", "current")
+        place = top / path.strip("/")
+        for group in (place, *place.parents):
+            if not group.is_relative_to(top):
+                break
+            limit, used = (_text(group / f"memory.{name}").strip() for name in names)
+            if limit.isdigit() and used.isdigit():
+                spare.append(int(limit) - int(used) + _cached(group))
+    return min(spare)
+
+
+def _cached(group: Path) -> int:
+    """What a cgroup's processes have read or written and would give back."""
+    facts = dict(line.split() for line in _text(group / "memory.stat").splitlines())
+    return sum(
+        int(facts.get(f"total_{name}", facts.get(name, 0)))
+        for name in ("inactive_file", "active_file")
+    )
+
+
+def _text(path: Path) -> str:
+    """What a file of the system's holds; nothing where there is none."""
     try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        # ru_maxrss counts what the process held before it became this program, as a copy of another
-        return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return path.read_text()
+    except OSError:
+        return ""

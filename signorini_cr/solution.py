@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 
 import numpy as np
 from dolfinx import fem
@@ -29,7 +33,8 @@ class Solution:
         contact: The state of Γ1.
         energy: J(u_h) = ½ a_h(u_h, u_h) − χ(u_h).
         iterations: Newton steps and linear iterations.
-        seconds: Wall time of the phases mesh, assemble, solve, estimate.
+        seconds: Wall time of the phases mesh, assemble, solve, estimate; whoever does a part of the
+            work books it here, errors and certificate when they are made.
     """
 
     level: Level
@@ -52,9 +57,8 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """A table and a picture, for notebooks; of the certificate what has been made."""
-        from . import notebook  # by the front door, as what draws stands above the solution
-
-        return str(notebook.as_html(self))
+        # through the package's public names, as what draws stands above the solution
+        return str(import_module("signorini_cr").notebook.as_html(self))
 
     @property
     def domain(self) -> Domain:
@@ -98,14 +102,18 @@ class Solution:
         Computed when first asked for, collectively.
         """
         physics = self.level.physics
-        return None if physics.exact is None else physics.errors(self.domain, self.u)
+        if physics.exact is None:
+            return None
+        with self._estimating():
+            return physics.errors(self.domain, self.u)
 
     @cached_property
     def certificate(self) -> Certificate:
         """What is certain about the error; made when first asked for, collectively."""
         try:
-            certificate: Certificate = self.level.physics.certify(self)
-            return certificate
+            with self._estimating():
+                certificate: Certificate = self.level.physics.certify(self)
+                return certificate
         finally:
             self.level.tidy()
 
@@ -139,3 +147,10 @@ class Solution:
             "obstacle": contact.obstacle,
         }
         return found | fields.on_facets(mesh, contact.facets, columns)
+
+    @contextmanager
+    def _estimating(self) -> Iterator[None]:
+        """Book the time a block takes."""
+        began = time.perf_counter()
+        yield
+        self.seconds["estimate"] = self.seconds.get("estimate", 0.0) + time.perf_counter() - began

@@ -1,9 +1,10 @@
 """Runs that are ended from outside, each from a seed, and a look at what they leave.
 
-    container/run python3 tests/kills.py --count 60 --seed 0
+    container/run python3 tests/kills.py --count 60 --seed 0 --ranks 1 2 4
 
 prints for each kind of end how many runs there were and with which status they ended, and the seeds
-of those that left anything but whole files of one run.
+of those that hung, lost a finished level, could not be resumed, or left anything but whole files of
+one run.
 """
 
 from __future__ import annotations
@@ -18,13 +19,16 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import helpers
 import numpy as np
 from dolfinx import jit
+from mpi4py import MPI
 
+from signorini_cr.output.checkpoint import read_checkpoint
 from signorini_cr.output.files import STAGE, check_writable
 from signorini_cr.output.report import FILES
 
@@ -114,10 +118,10 @@ def levels_in(out: Path) -> int:
         return 0
 
 
-def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
-    """Start a run, end it at a random moment, look around."""
+def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
+    """Start a run on one of some numbers of ranks, end it at a random moment, look around."""
     random = np.random.default_rng(seed)
-    ranks = int(random.integers(1, most_ranks + 1))
+    ranks = int(random.choice(counts))
     number = signal.Signals(random.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
     target = "one" if ranks == 1 else str(random.choice(["mpirun", "one rank", "all ranks"]))
     moment = float(random.uniform(0, 3)) if random.random() < 0.3 else None
@@ -127,13 +131,15 @@ def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
     out.mkdir()
     for name in FILES:
         (out / name).write_text("former")
+    solve = [sys.executable, "-m", "signorini_cr", "solve", str(case), "--out", str(out)]
     launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    clean = helpers.clean_environment(XDG_CACHE_HOME=str(own_cache(folder)))
     run = subprocess.Popen(
-        [*launch, sys.executable, "-m", "signorini_cr", "solve", str(case), "--out", str(out)],
+        [*launch, *solve],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=helpers.clean_environment(XDG_CACHE_HOME=str(own_cache(folder))),
+        env=clean,
         start_new_session=True,
     )
     began = time.monotonic()
@@ -143,7 +149,7 @@ def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
             break
         time.sleep(0.01)
     time.sleep(more)
-    everyone = family(run.pid)
+    everyone, done = family(run.pid), levels_in(out)
     own = ranks_of(everyone)
     hit = {"one rank": own[-1:], "all ranks": own}.get(target, [run.pid]) or [run.pid]
     for pid in hit:
@@ -162,6 +168,19 @@ def killed(folder: Path, seed: int, most_ranks: int = 2) -> End:
     if number == signal.SIGINT and target != "mpirun" and "Traceback" in said and own:
         faults.append(f"traceback: {said[-600:]}")
     levels, more_faults = _left(out)
+    if max(levels, 0) < done:
+        faults.append(f"{done} levels were finished, {levels} are left")
+    if ranks == 1 and done and number != signal.SIGKILL:
+        if run.returncode not in (128 + number, 0):
+            faults.append(f"status {run.returncode}")
+        if run.returncode and "finished and kept in" not in said:
+            faults.append(f"nothing is said of what is kept: {said[-600:]}")
+    if levels > 0 and random.random() < 0.3:
+        again = [*solve, "--resume", "--levels", str(levels + 1), "-q"]
+        # a minute longer where a killed one has left a form half compiled
+        more_run = subprocess.run(again, capture_output=True, text=True, env=clean, timeout=180)
+        if more_run.returncode or levels_in(out) < levels + 1:
+            faults.append(f"not resumed, status {more_run.returncode}: {more_run.stderr[-600:]}")
     return End(f"{ranks} {number.name} {target}", run.returncode, levels, faults + more_faults)
 
 
@@ -188,6 +207,9 @@ def _left(out: Path) -> tuple[int, list[str]]:
         faults.append(f"{len(report['levels'])} levels in the report, {len(rows)} in the table")
     if (out / "solution.vtu").exists() and not report["complete"]:
         faults.append("a field beside a report that is not complete")
+    found = read_checkpoint(out, MPI.COMM_SELF)
+    if found is None or len(found[1]["levels"]) < len(report["levels"]):
+        faults.append("nothing to resume from")
     return len(report["levels"]), faults
 
 
@@ -196,7 +218,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--ranks", type=int, default=2, help="most ranks of a run")
+    parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2], help="numbers of ranks")
     arguments = parser.parse_args()
     counts: Counter[tuple[str, int]] = Counter()
     wrong = kept = 0

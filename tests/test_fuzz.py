@@ -338,7 +338,7 @@ FOLDER = tempfile.TemporaryDirectory()
 
 
 def check_file(text: str) -> None:
-    """It is refused with its name and one message, or read; then `check` does the same."""
+    """It is refused with one message, or read; then `check` does the same."""
     path = Path(FOLDER.name) / "case.toml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     began, end = time.perf_counter(), "files read"
@@ -352,7 +352,7 @@ def check_file(text: str) -> None:
             end = "files checked on their mesh"
     except InputError as error:
         words = str(error)
-        assert words.startswith(f"{path}: ") and len(words) < 2000, words
+        assert words and len(words) < 2000, words
         end = "files refused"
     assert time.perf_counter() - began < SECONDS
     ENDS[end] += 1

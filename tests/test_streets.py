@@ -16,7 +16,7 @@ FLOORS = (
     ("multigrid",),
     ("vi",),
     ("estimate",),
-    ("solution", "diffusion", "levels", "adaptive"),
+    ("solution", "diffusion", "limits", "restart", "levels", "adaptive"),
     ("verification",),
     ("output",),
     ("app",),

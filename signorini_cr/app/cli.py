@@ -10,11 +10,13 @@ import argparse
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .. import __version__
 from .commandline import (
     UsageError,
     launched,
@@ -28,10 +30,12 @@ from .screen import Screen, wrapped
 if TYPE_CHECKING:
     from ..errors import NotConverged
     from ..mesh.domain import Domain
+    from ..restart import Restart
     from ..solution import Solution
     from .problemfile import ProblemFile
 
-DONE, FAULT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, FAULT, BAD_INPUT, NOT_CONVERGED = 0, 1, 2, 3
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,9 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status, the same on every rank.
     """
+    began = time.perf_counter()
     screen = Screen(launched()[0] == 0)
     try:
         args = read_arguments(sys.argv[1:] if argv is None else argv)
+        args.began = began
     except SystemExit:  # --help and --version have answered
         screen.flush()
         return DONE
@@ -53,37 +59,48 @@ def main(argv: Sequence[str] | None = None) -> int:
         screen.complain(str(error))
         wait_for_all()
         return BAD_INPUT
-    with _interruptible() as interrupted:
-        return _run(args, screen, interrupted)
+    with _interruptible() as asked:
+        return _run(args, screen, asked)
 
 
 @contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """Keep in mind that an interruption was asked for.
+def _interruptible() -> Iterator[list[int]]:
+    """Keep in mind the signals that asked for an end, and turn them into KeyboardInterrupt.
 
-    KeyboardInterrupt may reach us as another error: of PETSc, whose callback it was raised in, or
-    of an import.
+    That may reach us as another error: of PETSc, whose callback it was raised in, or of an import.
     """
-    asked = threading.Event()
+    asked: list[int] = []
 
-    def ask(*_: object) -> None:
-        asked.set()
+    def ask(number: int, _: object) -> None:
+        asked.append(number)
         raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():  # which can't be interrupted
-        yield asked
-        return
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # not where it is ignored, as in the background
-        signal.signal(signal.SIGINT, ask)
+    usual: dict[signal.Signals, Any] = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+    }
+    ours = []
+    if threading.current_thread() is threading.main_thread():  # others can't be interrupted
+        # not where it is ignored, as in the background
+        ours = [each for each, handler in usual.items() if signal.getsignal(each) == handler]
+    for each in ours:
+        signal.signal(each, ask)
     try:
         yield asked
     finally:
-        if before is signal.default_int_handler:
-            signal.signal(signal.SIGINT, before)
+        for each in ours:
+            signal.signal(each, usual[each])
 
 
-def _run(args: argparse.Namespace, screen: Screen, interrupted: threading.Event) -> int:
+def _stopped_by(asked: Sequence[int]) -> int:
+    """The exit status after a signal; from here on it is too late for another one."""
+    if threading.current_thread() is threading.main_thread():
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, signal.SIG_IGN)
+    return 128 + (asked[0] if asked else signal.SIGINT)
+
+
+def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
     """Start PETSc and do what the command says; whatever goes wrong becomes a message."""
     try:
         start_petsc(args.petsc)
@@ -95,34 +112,34 @@ def _run(args: argparse.Namespace, screen: Screen, interrupted: threading.Event)
         if (complaint := left_alone(comm.size)) is not None:
             screen.complain(complaint)
             return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except Exception:
-        if interrupted.is_set():
-            return INTERRUPTED
+    except (Exception, KeyboardInterrupt) as error:
+        if asked or isinstance(error, KeyboardInterrupt):
+            return _stopped_by(asked)
         raise
     try:
         from ..errors import InputError, NotConverged
 
         try:
             status = {"solve": _solve, "check": _check}[args.command](args, screen, comm)
-        except InputError as error:
-            screen.complain(str(error))
-            status = BAD_INPUT
-        except NotConverged as error:
-            screen.complain(str(error))
-            status = NOT_CONVERGED
+        except (InputError, NotConverged) as error:
+            screen.complain(f"{args.file}: {error}")
+            status = BAD_INPUT if isinstance(error, InputError) else NOT_CONVERGED
         screen.flush()
         comm.Barrier()  # mpirun ends all ranks when the first leaves with an error
         return status
     except (Exception, KeyboardInterrupt) as error:
         # Perhaps on this rank only: the others must not wait for it
         kept = "".join(getattr(error, "__notes__", ()))  # from _solve
-        if interrupted.is_set() or isinstance(error, KeyboardInterrupt):
-            screen.complain(f"interrupted{kept and f'; {kept}'}")
+        if asked or isinstance(error, KeyboardInterrupt):
+            status = _stopped_by(asked)
+            if not screen.root:  # which tells and ends all, if it was asked and can
+                time.sleep(1.0 + 0.5 * min(comm.rank, 4))
+                screen.root = True
+            word = "terminated" if status == TERMINATED else "interrupted"
+            screen.complain(f"{word}{kept and f'; {kept}'}")
             if comm.size > 1:
-                comm.Abort(INTERRUPTED)
-            return INTERRUPTED
+                comm.Abort(status)
+            return status
         import traceback
 
         where = f" on rank {comm.rank}" if comm.size > 1 else ""
@@ -146,7 +163,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     screen.progress("reading")
     records: list[output.Record] = []
     try:
-        return _solve_levels(args, screen, comm, folder, records)
+        _solve_levels(args, screen, comm, folder, records)
+        return DONE
     except (Exception, KeyboardInterrupt) as error:
         if not ran_out_of_memory(error):
             error.add_note(_kept(records, folder) if records else "")
@@ -156,10 +174,9 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     )
     if comm.size > 1:  # the other ranks know nothing of it
         screen.root = True
-    screen.complain(f"{args.file}: {_stopped(failure, records, folder)}")
-    if comm.size > 1:
+        screen.complain(f"{args.file}: {_stopped(failure, records, folder)}")
         comm.Abort(NOT_CONVERGED)
-    return NOT_CONVERGED
+    raise NotConverged(_stopped(failure, records, folder))
 
 
 def _solve_levels(
@@ -168,31 +185,37 @@ def _solve_levels(
     comm: Any,
     folder: Path,
     records: list[dict[str, Any]],
-) -> int:
+) -> None:
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged
     from ..output import report as output
+    from ..restart import Restart
 
-    case, domain, seconds = _read(args, screen, comm)
+    case, domain = _read(args, screen, comm)
     element = args.element.upper()
+    said = _said(args, case, comm)
+    restart = _resumed(folder, said, records, comm) if args.resume else None
+    for record in records:
+        _tell(record, records[0], screen)
     finest: Solution | None = None
     failure: NotConverged | None = None
     try:
-        for solution in _solutions(case, domain, element, screen):
-            if not records:
-                solution.seconds["mesh"] = seconds
+        for solution in _solutions(args, case, domain, restart, screen):
+            if solution.level.number < len(records):  # the one that it goes on from
+                finest = solution
+                continue
+            _ = solution.errors, solution.certificate  # the report reads what is there
             record = output.level_record(solution, records[-1] if records else None)
             report = output.make_report(case.title, element, comm, [*records, record], False)
             with _named("--out"):
-                output.write_levels(folder, report, solution)
+                restart = Restart.of(solution, restart, case.mode == "adaptive")
+                output.write_levels(folder, report, solution, restart, said)
             records.append(record)
             finest = solution
             if screen.verbose:
                 taken = solution.iterations.preconditioner
                 screen.line(wrapped(taken, "  linear systems: "))
-            if len(records) == 1:
-                screen.line(output.table_header(records[0]))
-            screen.line(output.table_row(records[-1], records[0]))
+            _tell(record, records[0], screen)
     except NotConverged as error:
         failure = error
     failure = failure or _above_tolerance(case, records)
@@ -200,16 +223,14 @@ def _solve_levels(
     if finest is not None:
         report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
-            names = output.write_output(folder, report, finest)
+            names = output.write_output(folder, report, finest, resumable=True)
         screen.line("")
         screen.text(_facts(records[-1]))
         if (reason := records[-1]["bound_reason"]) is not None:
             screen.text(f"no bound of the error: {reason}")
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
-        screen.complain(f"{case.path}: {_stopped(failure, records, folder)}")
-        return NOT_CONVERGED
-    return DONE
+        raise NotConverged(_stopped(failure, records, folder))
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
@@ -221,9 +242,9 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     folder, picture = _folder(args), "mesh.png"
     with _named("--out"):
         check_writable(folder, [picture], comm)
-    case, domain, _ = _read(args, screen, comm)
+    case, domain = _read(args, screen, comm)
     topology = domain.mesh.topology
-    screen.line(f"{case.path}: in order")
+    screen.line(f"{args.file}: in order")
     screen.text(f"{topology.index_map(topology.dim).size_global} cells on the coarsest mesh")
     for name, part in PARTS.items():
         _, lengths = facet_measures(domain.mesh, domain.facets(part))
@@ -242,9 +263,8 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     return DONE
 
 
-def _read(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemFile, Domain, float]:
-    """The checked problem file, the coarsest mesh and how long the mesh took."""
-    import time
+def _read(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemFile, Domain]:
+    """The checked problem file and the coarsest mesh."""
     from dataclasses import replace
 
     from . import problemfile
@@ -253,41 +273,107 @@ def _read(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemF
     if getattr(args, "levels", None) is not None:
         case = replace(case, levels=args.levels)
     screen.progress("making the mesh")
-    began = time.perf_counter()
     domain = case.mesh(comm)
-    seconds = time.perf_counter() - began
     for doubt in case.check(domain):
-        screen.warn(f"{case.path}: {doubt}")
-    return case, domain, seconds
+        screen.warn(f"{args.file}: {doubt}")
+    return case, domain
+
+
+def _said(args: argparse.Namespace, case: ProblemFile, comm: Any) -> dict[str, Any]:
+    """All that the levels depend on, by the name the user knows it by; collective."""
+    import hashlib
+
+    from petsc4py import PETSc
+
+    from ..errors import on_root
+    from ..options import PREFIX
+
+    said = {**case.said, "--element": args.element, "signorini_cr": __version__}
+    for name, value in sorted(PETSc.Options(PREFIX).getAll().items()):
+        said[f"-{PREFIX}{name}"] = value
+    if isinstance(case.domain, Path):
+        content = on_root(comm, case.domain.read_bytes)
+        said["domain.mesh, the file"] = hashlib.sha256(content).hexdigest()[:16]
+    return said
+
+
+def _resumed(
+    folder: Path, said: dict[str, Any], records: list[dict[str, Any]], comm: Any
+) -> Restart | None:
+    """Where a run goes on; fills in the records of the levels before; collective."""
+    import json
+
+    from ..errors import InputError
+    from ..output.checkpoint import read_checkpoint
+
+    with _named("--resume"):
+        found = read_checkpoint(folder, comm)
+        if found is None:
+            return None
+        restart, facts = found
+        for key in sorted({*said, *facts["said"]}):
+            was, now = (each.get(key) for each in (facts["said"], said))
+            if was != now:
+                was, now = (
+                    "not given" if each is None else json.dumps(each) for each in (was, now)
+                )
+                raise InputError(
+                    f"{folder} has levels of another run: {key} was {was} and is {now}; the same"
+                    " is needed, or another --out"
+                )
+    records += facts["levels"]
+    return restart
+
+
+def _tell(record: dict[str, Any], first: dict[str, Any], screen: Screen) -> None:
+    """Print the row of a level, and the head before the first."""
+    from ..output import report as output
+
+    if record is first:
+        screen.line(output.table_header(first))
+    screen.line(output.table_row(record, first))
 
 
 def _solutions(
-    case: ProblemFile, domain: Domain, element: str, screen: Screen
+    args: argparse.Namespace,
+    case: ProblemFile,
+    domain: Domain,
+    restart: Restart | None,
+    screen: Screen,
 ) -> Iterator[Solution]:
     from .. import levels
     from ..adaptive import solve_adaptive
-    from ..errors import InputError
 
     def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
         facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
         screen.step(f"  level {level}  {facts}")
 
     screen.progress("level 0")
-    try:
-        if case.mode == "uniform":
-            yield from levels.solve_levels(case.problem, domain, case.levels, element, monitor)
-        else:
-            yield from solve_adaptive(
-                case.problem,
-                domain,
-                tolerance=case.tolerance,
-                levels=case.levels,
-                max_dofs=case.max_dofs,
-                element=element,
-                monitor=monitor,
-            )
-    except InputError as error:
-        raise InputError(f"{case.path}: {error}") from None
+    max_time, element = args.max_time, args.element.upper()
+    if max_time is not None:
+        max_time += args.began - time.perf_counter()
+    if case.mode == "uniform":
+        yield from levels.solve_levels(
+            case.problem,
+            domain,
+            case.levels,
+            element,
+            monitor,
+            max_time=max_time,
+            restart=restart,
+        )
+    else:
+        yield from solve_adaptive(
+            case.problem,
+            domain,
+            tolerance=case.tolerance,
+            levels=case.levels,
+            max_dofs=case.max_dofs,
+            element=element,
+            monitor=monitor,
+            max_time=max_time,
+            restart=restart,
+        )
 
 
 def _facts(record: dict[str, Any]) -> str:

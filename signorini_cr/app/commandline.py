@@ -98,7 +98,9 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         description="Solve on a sequence of meshes, print one row a level, write DIR.",
         usage="signorini-cr solve FILE.toml [--out DIR] [--levels N] [--element cr|p1]\n"
         + " " * 26
-        + "[--quiet] [-v] [PETSc options]",
+        + "[--max-time SECONDS] [--resume] [--quiet] [-v]\n"
+        + " " * 26
+        + "[PETSc options]",
         epilog=f"{PETSC_NOTE} {EXIT_NOTE}",
         **shared,
     )
@@ -132,6 +134,20 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         help="Crouzeix-Raviart (default), or conforming linear elements to compare with",
     )
     solve.add_argument(
+        "--max-time",
+        metavar="SECONDS",
+        type=_positive,
+        help="begin no level that would end later, by what the levels before took; what is left to"
+        " do then is to write fields and pictures",
+    )
+    solve.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on from the last level that a run into DIR has finished, on any number of ranks;"
+        " the problem must be the same, but --levels, tolerance and max_dofs may differ; where DIR"
+        " has none, begin",
+    )
+    solve.add_argument(
         "-v", "--verbose", action="store_true", help="print every step of the solver"
     )
     for each in (parser, solve, check):
@@ -152,6 +168,16 @@ def _at_least_one(text: str) -> int:
         number = 0
     if number < 1:
         raise argparse.ArgumentTypeError(f"a whole number of 1 or more is needed, found {text}")
+    return number
+
+
+def _positive(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0.0 < number < float("inf"):
+        raise argparse.ArgumentTypeError(f"a number of seconds above 0 is needed, found {text}")
     return number
 
 

@@ -1,7 +1,7 @@
 """Problem files: TOML → domain, problem and refinement, with every key checked.
 
-Each mistake is an :class:`~signorini_cr.errors.InputError` that names the file, the key, what was
-found and what is allowed, the same on all ranks.
+Each mistake is an :class:`~signorini_cr.errors.InputError` that names the key, what was found and
+what is allowed, the same on all ranks; the command puts the file's name before it.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ from .reference import SECTIONS, allowed
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 MAX_DOFS = 1_000_000
+ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
+"""Keys that say where a run ends, and nothing else."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 MOST_CELLS = 1e9
@@ -53,7 +55,6 @@ class ProblemFile:
     """What a problem file says.
 
     Attributes:
-        path: The file.
         title: For reports and pictures; the file's name where there is none.
         domain: A polygon, or the path of a gmsh file.
         size: Facet length wanted on the coarsest mesh of a polygon.
@@ -63,9 +64,9 @@ class ProblemFile:
         levels: Number of meshes, the coarsest included.
         tolerance: Adaptive refinement stops when the certified bound is below it.
         max_dofs: Adaptive refinement stops before a mesh with more degrees of freedom.
+        said: All that levels depend on, by key, as it was written.
     """
 
-    path: Path
     title: str
     domain: Polygon | Path
     size: float | None
@@ -75,6 +76,7 @@ class ProblemFile:
     levels: int
     tolerance: float
     max_dofs: int
+    said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Make or read the coarsest mesh; collective."""
@@ -85,7 +87,7 @@ class ProblemFile:
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
         except InputError as error:
-            raise InputError(f"{self.path}: {key}: {error}") from None
+            raise InputError(f"{key}: {error}") from None
 
     def check(self, domain: Domain) -> list[str]:
         """Try the data out on the coarsest mesh; collective.
@@ -103,15 +105,12 @@ class ProblemFile:
         """
         topology = domain.mesh.topology
         cells = topology.index_map(topology.dim).size_global
-        try:
-            if self.mode == "uniform":
-                _few_enough(self.levels, cells, topology.dim)
-            check_values(self.expressions, domain)
-            forms = Forms(self.problem, domain.mesh)
-            check_data(forms, domain)
-            return doubts(forms, domain)
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from None
+        if self.mode == "uniform":
+            _few_enough(self.levels, cells, topology.dim)
+        check_values(self.expressions, domain)
+        forms = Forms(self.problem, domain.mesh)
+        check_data(forms, domain)
+        return doubts(forms, domain)
 
 
 def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
@@ -125,43 +124,45 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         InputError: The file cannot be read or says something that is not allowed.
     """
     path = Path(path)
-    try:
-        table = parse_toml(on_root(comm, read_text, path))
-        insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
-        title = get(table, "", "title", string, path.stem)
-        sections = {name: _section(table, name) for name in SECTIONS}
-        if "domain" not in table:
-            raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
-        if "data" not in table and "exact" not in table:
-            raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
-        if "exact" in table and not table["exact"]:
-            raise InputError("exact.u: this key is missing; an expression in x and y is needed")
-        domain, size = _domain(sections["domain"], path.parent)
-        expressions = _expressions(sections)
-        refine = sections["refine"]
-        mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
-        tolerance = get(refine, "refine", "tolerance", not_negative, 0.0)
-        max_dofs = get(refine, "refine", "max_dofs", whole, MAX_DOFS)
-        for key, limit in (("tolerance", tolerance), ("max_dofs", max_dofs)):
-            if mode == "uniform" and refine.get(key):
-                raise InputError(
-                    f"refine.{key}: {shown(limit)} is where adaptive refinement ends;"
-                    ' mode = "adaptive" is needed beside it'
-                )
-        return ProblemFile(
-            path=path,
-            title=title,
-            domain=domain,
-            size=size,
-            problem=_problem(expressions),
-            expressions=expressions,
-            mode=mode,
-            levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
-            tolerance=tolerance,
-            max_dofs=max_dofs,
-        )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    table = parse_toml(on_root(comm, read_text, path))
+    insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
+    title = get(table, "", "title", string, path.stem)
+    sections = {name: _section(table, name) for name in SECTIONS}
+    if "domain" not in table:
+        raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
+    if "data" not in table and "exact" not in table:
+        raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
+    if "exact" in table and not table["exact"]:
+        raise InputError("exact.u: this key is missing; an expression in x and y is needed")
+    domain, size = _domain(sections["domain"], path.parent)
+    expressions = _expressions(sections)
+    refine = sections["refine"]
+    mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
+    tolerance = get(refine, "refine", "tolerance", not_negative, 0.0)
+    max_dofs = get(refine, "refine", "max_dofs", whole, MAX_DOFS)
+    for key, limit in (("tolerance", tolerance), ("max_dofs", max_dofs)):
+        if mode == "uniform" and refine.get(key):
+            raise InputError(
+                f"refine.{key}: {shown(limit)} is where adaptive refinement ends;"
+                ' mode = "adaptive" is needed beside it'
+            )
+    return ProblemFile(
+        title=title,
+        domain=domain,
+        size=size,
+        problem=_problem(expressions),
+        expressions=expressions,
+        mode=mode,
+        levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
+        tolerance=tolerance,
+        max_dofs=max_dofs,
+        said={
+            f"{name}.{key}": value
+            for name, section in sections.items()
+            for key, value in section.items()
+            if f"{name}.{key}" not in ENDS
+        },
+    )
 
 
 _SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, [define] and [refine] are optional"

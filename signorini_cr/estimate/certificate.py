@@ -8,7 +8,7 @@ what neither of them knows about u. Both come from u_h at linear cost, see `flux
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -110,6 +110,11 @@ class Certificate:
         y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 
+    @property
+    def companion_at_vertices(self) -> FloatArray | None:
+        """The companion v at the mesh's vertices, ghosts included, shape (vertices,)."""
+        return None if self._made is None else self._made.vertices
+
     @cached_property
     def companion(self) -> fem.Function | None:
         """The companion v; collective.
@@ -179,35 +184,82 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     """
     began = time.perf_counter()
     base = solution if flux_from is None else flux_from
-    level, u = base.level, base.u
+    try:
+        known = _equilibrated(solution, base)
+        v, sums = _companion(solution, base, known, sweeps)
+        certificate = _added_up(known, v, sums)
+    except _NoBound as why:
+        certificate = Certificate(reason=str(why))
+    return replace(certificate, seconds=time.perf_counter() - began)
+
+
+class _NoBound(Exception):
+    """Why there is none; raised on all ranks."""
+
+
+def _insist(reason: str | None) -> None:
+    """Raise _NoBound if there is a reason, which all ranks have."""
+    if reason is not None:
+        raise _NoBound(reason)
+
+
+@dataclass(eq=False)
+class _Known:
+    """The enclosed data, y, and what is left of −div y = f, on the way to a certificate.
+
+    Attributes:
+        level: The mesh, with those below it.
+        cells: What the certificate needs to know of it.
+        kappa: The coefficient.
+        certain: f.
+        segments: g.
+        flux: y.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        size: About how large the bound will be.
+        left: What the loose ends of −div y = f add to it.
+        carried: The norm of what was added to y for their sake.
+    """
+
+    level: Level
+    cells: Cells
+    kappa: Coefficient
+    certain: Certain
+    segments: Segments
+    flux: Flux
+    w: FloatArray
+    size: float
+    left: float
+    carried: float
+
+
+def _equilibrated(solution: Solved, base: Solved) -> _Known:
+    """Make y from u_h, and enclose f, g and κ as finely as it calls for; collective.
+
+    Raises:
+        _NoBound: With the reason.
+    """
+    level, u = base.level, base.u.x.array
     if base.element != "CR" or base.domain is not solution.domain:
-        return Certificate(reason=NO_FLUX)
+        raise _NoBound(NO_FLUX)
     data = diffusion(level.data)
-    if data.forms.uncertified is not None:
-        return Certificate(reason=data.forms.uncertified)
+    _insist(data.forms.uncertified)
     if data.compiled.kappa is None:
-        return Certificate(reason=TENSOR)
-    cells, load, (edge,) = data.cells, data.load, data.edges
-    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.u_D, data.alpha))
+        raise _NoBound(TENSOR)
+    cells, load, (edge,), (alpha,) = data.cells, data.load, data.edges, data.alpha
     kappa = Coefficient(data.compiled.kappa, cells)
-    if kappa.reason is not None:
-        return Certificate(reason=kappa.reason)
-    w = vertex_rows(u.x.array, cells)
-    contact_side = alpha.side(cells)
-    gap = u.x.array[contact_side.dofs] - alpha.means
+    _insist(kappa.reason)
+    w, contact_side = vertex_rows(u, cells), alpha.side(cells)
+    gap = u[contact_side.dofs] - alpha.seen_from(cells).means
     flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
     size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
-    if certain.reason is not None:
-        return Certificate(reason=certain.reason, seconds=time.perf_counter() - began)
-    flux.left += cells.volume * (certain.load.mean - load.mean)
-    load = certain.load
+    _insist(certain.reason)
     segments = Segments.of(edge, cells, kappa.low, size)
-    if segments.reason is not None:
-        return Certificate(reason=segments.reason, seconds=time.perf_counter() - began)
-    there = edge.side.local, edge.side.cells
-    change = segments.through - edge.shares.sum(axis=0)  # y·n is to have g's mean as it is now
-    flux.excess[there] += change
+    _insist(segments.reason)
+    # y is to have the means that f and g have now
+    flux.left += cells.volume * (certain.load.mean - load.mean)
+    change = segments.through - edge.shares.sum(axis=0)
+    flux.excess[edge.side.local, edge.side.cells] += change
     np.add.at(flux.left, edge.side.cells, change)
     left = unbalanced(level, cells, flux.left, kappa.low, size)
     carried = balance(cells, flux, kappa.low, size, left)
@@ -215,81 +267,103 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
         left = unbalanced(level, cells, flux.left, kappa.low, size)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
+    return _Known(level, cells, kappa, certain, segments, flux, w, size, left, carried)
+
+
+def _companion(
+    solution: Solved, base: Solved, known: _Known, sweeps: int
+) -> tuple[Companion, Sums]:
+    """Make v, improve y where that promises much, and integrate the gap; collective."""
+    cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     if solution.element != "CR":
+        # v comes from the conforming solution itself, and p is seen from its gradient
         conforming = solution.u.function_space.dofmap.list[: cells.number]
         own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
-        change = cells.apply(w - own, slice(0, cells.number))
+        change = cells.apply(known.w - own, slice(0, cells.number))
         flux.excess -= cells.tdim * kappa.mean * change
-        w = own
+        known.w = own
+    data = diffusion(known.level.data)
+    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.u_D, data.alpha))
     steady = kappa.high - kappa.low <= STEADY * kappa.mean
-    goal = LIFT_SHARE * size / np.sqrt(max(cells.comm.allgather(kappa.high.max(initial=1e-300))))
-    v = companion(cells, kappa.mean, w, u.x.array, flux, u_D, alpha, sweeps, steady, goal)
-    sums = integrate(cells, kappa, w, load, flux, v)
+    highest = max(cells.comm.allgather(kappa.high.max(initial=1e-300)))
+    goal = LIFT_SHARE * known.size / np.sqrt(highest)
+    u = base.u.x.array
+    v = companion(cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal)
+    sums = integrate(cells, kappa, known.w, load, flux, v)
     if promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
             v = cubed(cells, kappa.mean, flux, v)
-        improve(cells, kappa.mean, load, segments, flux, v)
-        sums = integrate(cells, kappa, w, load, flux, v)
-    cusps, known = v.cusps, (v.excess, v.bumps)
-    unsure = 0.0 if cusps is None else cusps.add(cells, w, load, kappa.low, flux, known, sums)
+        improve(cells, kappa.mean, load, known.segments, flux, v)
+        sums = integrate(cells, kappa, known.w, load, flux, v)
+    if v.cusps is not None:
+        sums.energy_slack += v.cusps.add(
+            cells, known.w, load, kappa.low, flux, (v.excess, v.bumps), sums
+        )
     assert sums.indicators is not None
-    np.add.at(sums.indicators, contact_side.cells, v.contact)
-    edge_square = integrate_edge(cells, kappa, w, load, segments, flux, v, sums)
-    lift, lift_energy, *with_lift = _lifted(cells, kappa, certain, v, sums)
-    lift_energy += unsure
+    np.add.at(sums.indicators, alpha.side(cells).cells, v.contact)
+    return v, sums
+
+
+def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
+    """Add up the bounds and the energy's bracket; collective.
+
+    Raises:
+        _NoBound: With the reason.
+    """
+    cells, kappa, flux, w = known.cells, known.kappa, known.flux, known.w
+    certain, segments = known.certain, known.segments
+    edge_square = integrate_edge(cells, kappa, w, certain.load, segments, flux, v, sums)
+    lift, lift_energy, lift_far, lift_near = _lifted(cells, kappa, certain, v, sums)
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
     edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
-    total = dict(zip(_TOTALS, cells.total(*(getattr(sums, name) for name in _TOTALS)), strict=True))
-    contact, edge_square, edge_energy, lift, lift_energy, *with_lift = cells.total(
-        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, *with_lift
+    hidden, hidden_energy = _hidden(
+        known.level, cells, kappa, certain, segments, v, sums, known.size
     )
-    lift = np.sqrt(lift)
-    hidden, hidden_energy = _hidden(level, cells, kappa, certain, segments, v, sums, size)
-    rounding = _rounding(cells, kappa, w, load, flux)
-    loose = np.sqrt(edge_square) + left + hidden + rounding
-    same = total["flux"] + total["companion"] + total["load"]
-    same += 2 * (total["load_flux"] + total["slack"])
-    mixed = 2 * (total["cross"] + total["load_companion"])
-    far = np.sqrt(max(same - mixed + total["far"], 0.0) + with_lift[0]) + loose
-    near = np.sqrt(max(same + mixed + total["near"], 0.0) + with_lift[1]) + rounding
+    rounding = _rounding(cells, kappa, w, certain.load, flux)
+    assert sums.middle is not None and sums.steepness is not None
+    total = sums.over_ranks(cells)
+    contact, edge_square, edge_energy, lift, lift_energy, lift_far, lift_near = cells.total(
+        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, lift_far, lift_near
+    )
+    of_gradients, steep = cells.total(
+        np.sum(np.maximum(sums.middle, 0.0) / kappa.low), np.sum(np.maximum(sums.steepness, 0.0))
+    )
+
+    # ‖p + κ^{-1/2}σ ∓ b‖ and the ball around (y + κ∇v)/2 that has κ∇u in it
+    loose = np.sqrt(edge_square) + known.left + hidden + rounding
+    same = total.flux + total.companion + total.load + 2 * (total.load_flux + total.slack)
+    mixed = 2 * (total.cross + total.load_companion)
+    far = np.sqrt(max(same - mixed + total.far, 0.0) + lift_far) + loose
+    near = np.sqrt(max(same + mixed + total.near, 0.0) + lift_near) + rounding
     radius = loose / 2 + np.sqrt(far**2 / 4 + contact)
     bound = near / 2 + radius
-    assert sums.middle is not None
-    of_gradients = cells.total(np.sum(np.maximum(sums.middle, 0.0) / kappa.low))[0]
-    bound_h1 = np.sqrt(of_gradients) / 2
-    bound_h1 += (rounding / 2 + radius) / np.sqrt(kappa.smallest)
-    energy = total["energy"] - edge_energy
-    assert sums.steepness is not None
-    steep = float(cells.total(np.sum(np.maximum(sums.steepness, 0.0)))[0])
-    lift_energy += hidden_energy + total["energy_slack"]
-    lift_energy += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    reason = v.reason or (None if np.isfinite(bound) else ADRIFT)
-    if reason is not None:
-        return Certificate(reason=reason, seconds=time.perf_counter() - began)
+    bound_h1 = np.sqrt(of_gradients) / 2 + (rounding / 2 + radius) / np.sqrt(kappa.smallest)
+    _insist(v.reason or (None if np.isfinite(bound) else ADRIFT))
+
+    energy = total.energy - edge_energy
+    unsure = lift_energy + hidden_energy + total.energy_slack
+    unsure += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
+    lift = np.sqrt(lift)
     return Certificate(
         bound_h1=float(min(bound_h1, bound / np.sqrt(kappa.smallest))),
         bound_energy_norm=float(bound),
         bound_companion=float((far + np.sqrt(far**2 + 4 * contact)) / 2 + lift),
-        energy=(
-            float(energy - lift_energy - far**2 / 2 - contact),
-            float(energy + lift_energy),
-        ),
+        energy=(float(energy - unsure - far**2 / 2 - contact), float(energy + unsure)),
         parts={
-            "flux": float(np.sqrt(total["flux"])),
-            "companion": float(np.sqrt(total["companion"])),
+            "flux": float(np.sqrt(total.flux)),
+            "companion": float(np.sqrt(total.companion)),
             "contact": float(np.sqrt(contact)),
-            "load": float(np.sqrt(total["load"]) + hidden),
-            "neumann": float(np.sqrt(total["neumann"])),
+            "load": float(np.sqrt(total.load) + hidden),
+            "neumann": float(np.sqrt(total.neumann)),
             "boundary": float(lift),
-            "solver": float(left + carried),
+            "solver": float(known.left + known.carried),
         },
         indicators=sums.indicators,
-        seconds=time.perf_counter() - began,
         _made=_Made(
-            level=level,
+            level=known.level,
             w=w,
             kappa=kappa.mean,
-            hats=load.hats,
+            hats=certain.load.hats,
             segments=segments,
             varies=kappa.values is not None,
             excess=flux.excess,
@@ -302,22 +376,6 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
             reach=float(bound - near / 2 + loose + lift / 2),
         ),
     )
-
-
-_TOTALS = (
-    "flux",
-    "companion",
-    "cross",
-    "load",
-    "load_flux",
-    "load_companion",
-    "slack",
-    "energy",
-    "energy_slack",
-    "far",
-    "near",
-    "neumann",
-)
 
 
 def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 from ..arrays import FloatArray
+from ..fem.cells import Cells
 
 
 @dataclass(eq=False)
@@ -46,3 +47,11 @@ class Sums:
     steepness: FloatArray | None = None
     middle: FloatArray | None = None
     across: FloatArray | None = None
+
+    def over_ranks(self, cells: Cells) -> Sums:
+        """The totals over all ranks' cells; collective."""
+        names = [field.name for field in fields(self) if field.type == "float"]
+        total, found = replace(self), cells.total(*(getattr(self, name) for name in names))
+        for name, value in zip(names, found, strict=True):
+            setattr(total, name, float(value))
+        return total

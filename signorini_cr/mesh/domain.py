@@ -7,6 +7,7 @@ A `Domain` comes from a `Polygon`, from a gmsh file or from a mesh and facet tag
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -48,10 +49,12 @@ class Domain:
     Attributes:
         mesh: Affine simplices; no ghost cells when we make it.
         tags: Facet tags; each exterior facet has one value of `PARTS`.
+        seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
     mesh: Mesh
     tags: MeshTags
+    seconds: float = 0.0
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
@@ -288,6 +291,7 @@ def _distribute(
     comm: MPI.Comm, make: Callable[..., gmshmesh.Triangulation], *args: object
 ) -> Domain:
     """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
+    began = time.perf_counter()
     raw: gmshmesh.Triangulation | None = None
 
     def on_rank_0() -> None:
@@ -314,4 +318,5 @@ def _distribute(
     found = meshtags_from_entities(mesh, 1, adjacencylist(ends), labels)
     values = np.full(_count(mesh, 1), REST, dtype=np.int32)
     values[found.indices] = found.values
-    return Domain(mesh, meshtags(mesh, 1, exterior, values[exterior]))
+    tags = meshtags(mesh, 1, exterior, values[exterior])
+    return Domain(mesh, tags, time.perf_counter() - began)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import ufl
 from dolfinx import cpp, la
 from dolfinx.mesh import CellType, Mesh, RefinementOption, meshtags
-from dolfinx.mesh import refine as refine_edges
+from dolfinx.mesh import refine as split
 
 from .. import compat
 from ..arrays import Int32Array
@@ -88,14 +88,32 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
     Raises:
         InputError: The mesh does not consist of straight-sided triangles.
     """
-    coarse = _prepared(domain.mesh)
-    owned = coarse.topology.index_map(2).size_local
+    mesh = _prepared(domain.mesh)
+    owned = mesh.topology.index_map(2).size_local
     marked = np.asarray(marked_cells)
     marked = np.flatnonzero(marked) if marked.dtype == bool else marked.astype(np.int32)
     marked = marked[(marked >= 0) & (marked < owned)]
+    edges = np.unique(_table(mesh.topology.connectivity(2, 1))[marked]).astype(np.int32)
+    return refine_edges(domain, edges)
+
+
+def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]:
+    """Halve some edges, and what else conformity takes; collective.
+
+    Args:
+        domain: Straight-sided triangles; ghost cells are left behind.
+        edges: Local indices; those of the new vertices of a mesh that was made like this make the
+            same mesh again.
+
+    Returns:
+        As for `refine_marked`.
+
+    Raises:
+        InputError: The mesh does not consist of straight-sided triangles.
+    """
+    coarse = _prepared(domain.mesh)
     of_cells = _table(coarse.topology.connectivity(2, 1))
-    edges = np.unique(of_cells[marked]).astype(np.int32)
-    fine, parent, parent_facet = refine_edges(
+    fine, parent, parent_facet = split(
         coarse,
         edges,
         partitioner=None,

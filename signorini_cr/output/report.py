@@ -24,7 +24,7 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import on_root
 from ..estimate.certificate import SHARES
-from . import plots
+from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .tables import contact_csv, levels_csv, markdown_table
 from .tables import table_header as table_header
@@ -32,6 +32,7 @@ from .tables import table_row as table_row
 from .vtu import write_solution
 
 if TYPE_CHECKING:
+    from ..restart import Restart
     from ..solution import Solution
 
 FILES = (
@@ -39,6 +40,7 @@ FILES = (
     "levels.csv",
     "levels.md",
     "contact.csv",
+    checkpoint.NAME,
     "solution.vtu",
     "mesh.png",
     "solution.png",
@@ -70,8 +72,6 @@ def level_record(
     gdim = solution.domain.mesh.geometry.dim
     certificate = solution.certificate
     bound = certificate.bound_h1
-    seconds = {phase: solution.seconds.get(phase, 0.0) for phase in PHASES}
-    seconds["estimate"] += certificate.seconds
     return plain(
         {
             "level": solution.level.number,
@@ -106,7 +106,7 @@ def level_record(
             "energy_bounds": dict(
                 zip(("lower", "upper"), certificate.energy or (None, None), strict=True)
             ),
-            "seconds": seconds,
+            "seconds": {phase: solution.seconds.get(phase, 0.0) for phase in PHASES},
         }
     )
 
@@ -152,17 +152,25 @@ def plain(value: Any) -> Any:
     return value
 
 
-def write_levels(folder: str | os.PathLike[str], report: Record, solution: Solution) -> list[str]:
-    """Write what costs next to nothing, so that it outlives whatever ends the run; collective.
+def write_levels(
+    folder: str | os.PathLike[str],
+    report: Record,
+    solution: Solution,
+    restart: Restart,
+    said: Record,
+) -> list[str]:
+    """Write what costs little, so that it outlives whatever ends the run; collective.
 
-    These are the report, the tables, and contact.csv. Fields and pictures of a former run are
-    removed.
+    These are the report, the tables, contact.csv, and what a run that is resumed goes on from.
+    Fields and pictures of a former run are removed.
 
     Args:
         folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
             touched.
         report: From `make_report`.
         solution: The finest level so far.
+        restart: From there.
+        said: What the run was told to solve; nothing but what JSON knows.
 
     Returns:
         The names of the files written.
@@ -172,12 +180,18 @@ def write_levels(folder: str | os.PathLike[str], report: Record, solution: Solut
     """
     comm = solution.domain.mesh.comm
     writers = _texts(report, solution)
+    facts = {"said": said, "levels": report["levels"]}
+    writers[checkpoint.NAME] = lambda path: checkpoint.write_checkpoint(path, restart, facts, comm)
     write_files(folder, writers, removed=FILES, comm=comm)
     return list(writers)
 
 
 def write_output(
-    folder: str | os.PathLike[str], report: Record, solution: Solution, pictures: bool = True
+    folder: str | os.PathLike[str],
+    report: Record,
+    solution: Solution,
+    pictures: bool = True,
+    resumable: bool = False,
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
 
@@ -189,6 +203,7 @@ def write_output(
         solution: The finest level: contact.csv, the field and the pictures are of this one.
         pictures: Whether to draw. There are none of three-dimensional domains, and none where
             Matplotlib is not installed.
+        resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
 
     Returns:
         The names of the files written.
@@ -209,7 +224,8 @@ def write_output(
             writers["convergence.png"] = lambda path: plots.drawn(
                 comm, lambda: plots.plot_convergence(records, path, title)
             )
-    write_files(folder, writers, removed=FILES, comm=comm)
+    removed = set(FILES) - ({checkpoint.NAME} if resumable else set())
+    write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)
 
 

@@ -92,9 +92,10 @@ def write_solution(solution: Solution, path: Path) -> None:
         return np.concatenate([each.ravel() for each in at_corners(values)])
 
     on_points = {"u": flat(vertex_values(solution.u))}
-    v = certificate.companion
+    v = certificate.companion_at_vertices
     if v is not None:
-        on_points["companion"] = flat(v.x.array[v.function_space.dofmap.list[:, :corners]])
+        vertices = mesh.topology.connectivity(mesh.topology.dim, 0).array
+        on_points["companion"] = flat(v[vertices.reshape(-1, corners)])
     nowhere = np.zeros(owned)
     on_cells = {
         "pressure": np.append(nowhere, contact.pressure),

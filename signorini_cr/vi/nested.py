@@ -72,6 +72,23 @@ def nested_start(
     release(vector)
 
 
+def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
+    """Start from what was found on the same mesh before; collective.
+
+    Args:
+        u: What was found, with its contact dofs on their bounds but for rounding.
+        level: The mesh and what is assembled on it.
+        start: On entry with the Dirichlet values; on exit the start.
+    """
+    system = level.system
+    values = start.x.array[system.dirichlet].copy()
+    start.x.array[:] = u.x.array
+    start.x.array[system.dirichlet] = values
+    bounded, above = system.bounded, _just_above(start, system)
+    x = start.x.array[bounded]
+    start.x.array[bounded] = np.where(x < above, system.lower[bounded], x)
+
+
 def _expected(inherited: _Inherited, system: System, x: PETSc.Vec) -> tuple[ActiveSet, FloatArray]:
     """The active set to begin with, and the forces there, shape (n,)."""
     operator, bounded = system.operator, system.bounded
@@ -86,10 +103,15 @@ def _expected(inherited: _Inherited, system: System, x: PETSc.Vec) -> tuple[Acti
 def _put_on_bounds(start: fem.Function, system: System, active: ActiveSet) -> None:
     """Put active dofs on their bounds and the others above, if only by rounding; collective."""
     x, bounded, lower = start.x.array, system.bounded, system.lower[system.bounded]
-    comm = start.function_space.mesh.comm
-    scale = comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX)
-    above = lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
+    above = _just_above(start, system)
     x[bounded] = np.where(active.mask, lower, np.maximum(x[bounded], above))
+
+
+def _just_above(start: fem.Function, system: System) -> FloatArray:
+    """The bounds, and as much more as rounding cannot hide; collective."""
+    comm, lower = start.function_space.mesh.comm, system.lower[system.bounded]
+    scale = comm.allreduce(float(np.abs(start.x.array).max(initial=0.0)), op=MPI.MAX)
+    return lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
 
 
 def _make_forces(

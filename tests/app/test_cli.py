@@ -324,6 +324,8 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "FILE", "--levels", "-2"], ["--levels", "1 or more", "found -2"]),
         (["solve", "FILE", "--levels", "two"], ["--levels", "whole number", "found two"]),
         (["solve", "FILE", "--levels"], ["--levels"]),
+        (["solve", "FILE", "--max-time", "0"], ["--max-time", "above 0", "found 0"]),
+        (["solve", "FILE", "--max-time", "1h"], ["--max-time", "seconds", "found 1h"]),
         (["solve", "FILE", "--out="], ["--out", "folder"]),
         (["solve", "FILE", "--element", "p2"], ["--element", "cr", "p1"]),
         (["check", "FILE", "--levels", "2"], ["no option --levels"]),
@@ -472,7 +474,7 @@ def _at_once(*_, **__):
 
 @pytest.mark.serial
 def test_the_unexpected_is_told_as_such(write, monkeypatch) -> None:
-    monkeypatch.setattr(levels, "solve_levels", lambda *_: 1 / 0)
+    monkeypatch.setattr(levels, "solve_levels", lambda *_, **__: 1 / 0)
     status, _, err = run("solve", write(CASE), "--out", "out")
     assert status == cli.FAULT
     assert "ZeroDivisionError" in err and "signorini-cr: unexpected error" in err
@@ -480,7 +482,7 @@ def test_the_unexpected_is_told_as_such(write, monkeypatch) -> None:
 
 @pytest.mark.serial
 def test_ctrl_c(write, monkeypatch) -> None:
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(levels, "solve_levels", interrupt)

@@ -59,6 +59,7 @@ def test_the_cells_of_the_notebook_run():
         if cell["cell_type"] == "code":
             assert (cell["outputs"], cell["execution_count"]) == ([], None)
             exec("".join(cell["source"]), names)
+    names["plt"].close("all")
     assert names["finest"].certificate.bound_h1 <= 0.05 < names["certificate"].bound_h1
 
 

@@ -134,18 +134,19 @@ def test_rates_on_adaptive_meshes_go_by_the_number_of_dofs(finished):
 
 
 def test_the_bound_and_its_time_are_reported(finished):
+    """Whoever makes a certificate books its time; the report reads."""
     solution, report = finished
     plain = report["levels"][-1]
     try:
-        solution.certificate = Certificate(bound_h1=3 * plain["error_h1"], seconds=100.0)
+        solution.certificate = Certificate(bound_h1=3 * plain["error_h1"])
         record = output.level_record(solution)
-        solution.certificate = Certificate(reason="no", seconds=1.0)
+        solution.certificate = Certificate(reason="no")
         unknown = output.level_record(solution)
     finally:
         del solution.certificate
     assert record["bound_h1"] == pytest.approx(3 * plain["error_h1"])
     assert record["effectivity"] == pytest.approx(3)
-    assert 100 <= record["seconds"]["estimate"] < 200
+    assert record["seconds"] == solution.seconds
     assert unknown["bound_h1"] is unknown["effectivity"] is None
     assert unknown["energy_bounds"] == {"lower": None, "upper": None}
     assert unknown["bound_reason"] == "no"

@@ -1,0 +1,95 @@
+"""Whether another level fits into the time and the memory there are, by what those before took."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+from .errors import NotConverged
+from .memory import most_memory, shortage
+from .mesh.domain import Domain
+from .restart import Restart
+from .vi.solved import Solved
+
+BYTES = 800.0
+"""Peak memory that a dof more takes, with all coarser meshes and the certificate."""
+TELLING = 20_000
+"""Dofs that two levels must be apart for their peaks to tell more than that."""
+
+
+class _Taken(NamedTuple):
+    """What a level took: its dofs, seconds, and the most bytes this rank has held until its end."""
+
+    dofs: int
+    seconds: float
+    peak: float
+
+
+class Limits:
+    """What the levels of a sequence may take.
+
+    Args:
+        max_time: Wall time in seconds from now on, None for any.
+    """
+
+    def __init__(self, max_time: float | None = None):
+        """Begin to count."""
+        self._max_time = max_time
+        self._began = time.perf_counter()
+        self._passed = 0.0
+        self._before: _Taken | None = None
+
+    def begin(self, domain: Domain, element: str, restart: Restart | None) -> None:
+        """Look whether memory holds the first level to be solved; collective.
+
+        Args:
+            domain: The coarsest mesh.
+            element: "CR" or "P1".
+            restart: Where to go on, if it is not the coarsest mesh.
+
+        Raises:
+            NotConverged: It does not.
+        """
+        comm, topology, number = domain.mesh.comm, domain.mesh.topology, 0
+        dofs = topology.index_map(0 if element == "P1" else topology.dim - 1).size_global
+        if restart is not None:
+            number, dofs = len(restart.added), len(restart.u[0][0])
+        _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
+
+    def admit(self, solution: Solved, dofs: int) -> None:
+        """Look, when a level is done, whether the next one fits; collective.
+
+        Time and peak memory are taken to grow with the dofs as between the last two levels, time
+        not to fall and memory not to grow more slowly than usual.
+
+        Args:
+            solution: Of the level that is done.
+            dofs: Of the next one.
+
+        Raises:
+            NotConverged: It does not; the message has the figures.
+        """
+        comm, dofmap = solution.domain.mesh.comm, solution.u.function_space.dofmap
+        n = dofmap.index_map.size_global * dofmap.index_map_bs
+        passed = comm.allreduce(time.perf_counter() - self._began, op=MPI.MAX)
+        last = _Taken(n, passed - self._passed, most_memory())
+        before = self._before or last
+        self._before, self._passed = last, passed
+        more, grown = dofs - n, max(n - before.dofs, 1)
+        seconds = last.seconds + max(last.seconds - before.seconds, 0.0) * more / grown
+        growth = BYTES * dofmap.index_map.size_local * dofmap.index_map_bs / n
+        if grown >= TELLING:
+            growth = max(growth, (last.peak - before.peak) / grown)
+        words = shortage(comm, growth * more)
+        if self._max_time is not None and passed + seconds > self._max_time:
+            left = max(self._max_time - passed, 0.0)
+            words = f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"
+        _refuse(solution.level.number + 1, dofs, words)
+
+
+def _refuse(number: int, dofs: int, words: str | None) -> None:
+    """Raise NotConverged if a level would take too much of something."""
+    if words is not None:
+        raise NotConverged(f"its {dofs} degrees of freedom would take about {words}", number)

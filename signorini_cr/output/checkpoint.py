@@ -1,0 +1,72 @@
+"""The file that a run which was ended goes on from: a `Restart`, and what it belongs to."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError, on_root
+from ..restart import Restart
+from .files import disk_errors
+
+NAME = "restart.npz"
+
+
+def write_checkpoint(path: Path, restart: Restart, facts: dict[str, Any], comm: MPI.Comm) -> None:
+    """Write the file; collective.
+
+    Args:
+        path: The file; overwritten if it is there.
+        restart: From `Restart.of`.
+        facts: Nothing but what JSON knows.
+        comm: The ranks.
+
+    Raises:
+        InputError: The system refuses to write.
+    """
+
+    def write() -> None:
+        arrays: dict[str, Any] = {
+            f"added{k}": at for k, at in enumerate(restart.added) if at is not None
+        }
+        for k, (at, values) in enumerate(restart.u):
+            arrays |= {f"at{k}": at, f"u{k}": values}
+        text = json.dumps({"meshes": len(restart.added), "facts": facts})
+        with disk_errors(path):
+            np.savez(path, facts=np.frombuffer(text.encode(), dtype=np.uint8), **arrays)
+
+    on_root(comm, write)
+
+
+def read_checkpoint(
+    folder: str | os.PathLike[str], comm: MPI.Comm
+) -> tuple[Restart, dict[str, Any]] | None:
+    """Read the file of a folder; collective.
+
+    Returns:
+        What was written, None if there is no such file.
+
+    Raises:
+        InputError: It can't be read.
+    """
+
+    def read() -> tuple[Restart, dict[str, Any]] | None:
+        path = Path(folder) / NAME
+        if not path.exists():
+            return None
+        try:
+            with np.load(path) as file:
+                text = json.loads(bytes(file["facts"]))
+                added = [file.get(f"added{k}") for k in range(text["meshes"])]
+                u = [(file[f"at{k}"], file[f"u{k}"]) for k in range(2 if added else 1)]
+                return Restart(tuple(added), tuple(u)), text["facts"]
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"cannot read {path}: {error}") from error
+
+    return on_root(comm, read)

@@ -1,0 +1,138 @@
+"""Where a sequence of meshes goes on: u_h on the last two, and how all were made.
+
+Cells, facets and vertices are told by where they are. Places are the same to the last bit however a
+mesh is shared out: those of vertices are read, or are midpoints of two others, and so are those of
+facets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from mpi4py import MPI
+
+from . import compat
+from .arrays import FloatArray, Int32Array
+from .errors import raise_together
+from .mesh.domain import Domain
+from .mesh.refinement import refine, refine_edges
+from .multigrid.parents import Layout
+from .solution import Solution
+
+Places = npt.NDArray[np.complex128]
+"""Points of the plane; they sort by x, then by y."""
+
+
+@dataclass(frozen=True, eq=False)
+class Restart:
+    """A sequence of meshes and u_h on the last two, for any number of ranks.
+
+    Attributes:
+        added: For each mesh but the coarsest the places of the vertices that the one below does not
+            have; None where every triangle was cut into four.
+        u: Places of the dofs of u_h and its values, on the last mesh and on the one below it.
+    """
+
+    added: tuple[Places | None, ...]
+    u: tuple[tuple[Places, FloatArray], ...]
+
+    @classmethod
+    def of(cls, solution: Solution, below: Restart | None, adaptive: bool) -> Restart:
+        """Take what there is on all ranks to rank 0; collective.
+
+        Args:
+            solution: On the last mesh.
+            below: The same for the mesh below, None on the coarsest.
+            adaptive: Whether meshes were refined in parts.
+
+        Returns:
+            Nothing but empty arrays on the other ranks.
+        """
+        comm, V = solution.domain.mesh.comm, solution.u.function_space
+        size = V.dofmap.index_map.size_local
+        at, values = _places(V)[:size], solution.u.x.array[:size]
+        here = _gathered(at, comm), _gathered(values, comm)
+        if below is None:
+            return cls((), (here,))
+        added = None
+        if adaptive:
+            coarse, fine = (_nodes(each.domain.mesh) for each in solution.level.meshes[-2:])
+            added = _gathered(np.setdiff1d(fine, coarse), comm)
+        return cls((*below.added, added), (here, below.u[0]))
+
+    def meshes(self, domain: Domain) -> Iterator[tuple[Domain, Int32Array]]:
+        """Refine as it was done before; collective.
+
+        Args:
+            domain: The coarsest mesh.
+
+        Yields:
+            The next domain, and the parent of each of its cells.
+        """
+        for places in self.added:
+            if places is None:
+                refined = refine(domain)
+            else:
+                refined = refine_edges(domain, _edges_at(domain.mesh, places))
+            yield refined
+            domain = refined[0]
+
+    def function(self, V: fem.FunctionSpace, number: int) -> fem.Function:
+        """u_h on the last mesh (0) or on the one below (1); collective.
+
+        Raises:
+            InputError: The mesh is another one.
+        """
+        at, values = self.u[number]
+        order, mine = np.argsort(at), _places(V)
+        index = order[np.minimum(np.searchsorted(at, mine, sorter=order), len(at) - 1)]
+        other = len(at) != V.dofmap.index_map.size_global or not np.array_equal(at[index], mine)
+        complaint = "the mesh is not the one that the levels before were solved on"
+        raise_together(V.mesh.comm, complaint if other else None)
+        u = fem.Function(V)
+        u.x.array[:] = values[index]
+        return u
+
+
+def _corners(mesh: Mesh) -> Places:
+    """The corners of this rank's cells, shape (cells, 3)."""
+    return _nodes(mesh)[compat.cell_nodes(mesh)]
+
+
+def _nodes(mesh: Mesh) -> Places:
+    """The vertices of this rank's cells."""
+    x = mesh.geometry.x
+    return x[:, 0] + 1j * x[:, 1]
+
+
+def _places(V: fem.FunctionSpace) -> Places:
+    """Where the dofs of CR or P1 are, ghosts included."""
+    layout, at = Layout.of_space(V), _corners(V.mesh)
+    places = np.empty(layout.index_map.size_local + layout.index_map.num_ghosts, dtype=at.dtype)
+    places[layout.cells] = _midpoints(at) if layout.cr else at
+    return places
+
+
+def _midpoints(corners: Places) -> Places:
+    """Those of the sides opposite the corners, shape (cells, 3); a + b is b + a to the last bit."""
+    return 0.5 * (corners[:, [1, 2, 0]] + corners[:, [2, 0, 1]])
+
+
+def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
+    """The edges of this rank's cells whose midpoints are among some places."""
+    mesh.topology.create_connectivity(2, 1)
+    edges = mesh.topology.connectivity(2, 1).array.reshape(-1, 3)
+    return np.unique(edges[np.isin(_midpoints(_corners(mesh)), places)]).astype(np.int32)
+
+
+def _gathered(values: npt.NDArray, comm: MPI.Comm) -> npt.NDArray:
+    """All ranks' values on rank 0, nothing elsewhere; collective."""
+    if comm.size == 1:
+        return values
+    parts = comm.gather(values)
+    return values[:0] if parts is None else np.concatenate(parts)
