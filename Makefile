@@ -6,8 +6,8 @@ limit = timeout --kill-after=20 1500
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz docs quick test test-alone test-pair ranks readers test-package \
-    test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz docs quick test test-alone test-pair coverage mutants ranks readers \
+    test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -41,6 +41,20 @@ test-alone:
 
 test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
+
+# Branches of signorini_cr/ that no test takes, on one rank and on two together
+coverage:
+	$(run) container/tool coverage erase
+	$(run) $(limit) container/tool coverage run -m pytest -q
+	$(run) $(limit) mpirun -n 2 container/tool coverage run -m pytest -q
+	$(run) container/tool coverage combine -q
+	$(run) container/tool coverage report
+
+# Mistakes put into the program, one at a time: do the tests notice?
+mutants:
+	$(run) python3 tests/mutants.py estimate --count 200
+	$(run) python3 tests/mutants.py vi --count 100
+	$(run) python3 tests/mutants.py multigrid --count 100
 
 # What depends on how a mesh is shared out, on more ranks than that.
 ranks:

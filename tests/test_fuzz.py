@@ -414,8 +414,7 @@ def problems(draw: st.DrawFn) -> str:
 def check_problem(text: str) -> None:
     """Solved, with figures of three meshes that do not contradict one another; or refused.
 
-    The energy lies in every mesh's bracket, so that any two of them overlap; and two solutions
-    are no farther apart than their bounds of the distance to u together.
+    The energy lies in every mesh's bracket, so that any two of them overlap.
     """
     path = Path(FOLDER.name) / "case.toml"
     path.write_text(text)

@@ -1,0 +1,213 @@
+"""Mistakes put into the program one at a time, and whether the tests notice.
+
+    container/run python3 tests/mutants.py estimate --count 200 --seed 0
+
+draws mutants of a street (or of one file), runs the street's tests on each in a process of its
+own, forked from this one so that nothing large is imported twice, and prints those that survive.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.util
+import os
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from importlib.machinery import ModuleSpec, SourceFileLoader
+from pathlib import Path
+from types import CodeType
+
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "signorini_cr"
+TESTS = {
+    "estimate": "estimate/test_terms.py estimate/test_pieces.py estimate/test_sharpness.py",
+    "vi": "vi fem/test_conditions.py",
+    "multigrid": "multigrid",
+}
+"""What is run on the mutants of a street."""
+SLOW = "not waving and not need_two_sweeps and not rates"
+"""What is left out of it."""
+
+
+def _table(pairs: str) -> dict[type[ast.AST], type[ast.AST]]:
+    return {getattr(ast, a): getattr(ast, b) for a, b in (one.split(">") for one in pairs.split())}
+
+
+OPERATORS = _table(
+    "Add>Sub Sub>Add Mult>Div Div>Mult Pow>Mult FloorDiv>Mult Mod>Mult And>Or Or>And"
+)
+OFF_BY_ONE = _table("Lt>LtE LtE>Lt Gt>GtE GtE>Gt")
+NEGATED = _table(
+    "Lt>GtE LtE>Gt Gt>LtE GtE>Lt Eq>NotEq NotEq>Eq Is>IsNot IsNot>Is In>NotIn NotIn>In"
+)
+NAMES = {"min": "max", "minimum": "maximum", "any": "all", "low": "high"}
+NAMES |= {new: old for old, new in NAMES.items()}
+ELSEWHERE = ("scatter_forward()", "destroy()")
+"""What only other ranks or the memory would notice is not dropped."""
+Mutant = tuple[int, str, Callable[[], None]]
+"""Line, what is changed, and the change."""
+
+
+def mutants(node: ast.AST) -> Iterator[Mutant]:
+    """All mutants of a module; a tree takes one change and is then to be parsed anew."""
+    yield from _of_node(node)
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns", "decorator_list"):
+            continue
+        for i, child in enumerate(value if isinstance(value, list) else [value]):
+            if isinstance(child, ast.expr | ast.stmt):
+                place = (node, field, i if isinstance(value, list) else None)
+                yield from ((child.lineno, *one) for one in _in_place(child, *place))
+            if isinstance(child, ast.AST) and "TYPE_CHECKING" not in _text(child):
+                yield from mutants(child)
+
+
+def _text(node: ast.AST) -> str:
+    return ast.unparse(node).split("\n")[0][:60]
+
+
+def _of_node(node: ast.AST) -> Iterator[Mutant]:
+    """Changes of what a node holds itself."""
+    line = getattr(node, "lineno", 0)
+    match node:
+        case ast.BinOp(op=op) | ast.BoolOp(op=op) | ast.AugAssign(op=op):
+            if new := OPERATORS.get(type(op)):
+                what = f"{type(op).__name__} -> {new.__name__}"
+                yield line, what, lambda: setattr(node, "op", new())
+        case ast.Compare(ops=[op]):
+            for table in (OFF_BY_ONE, NEGATED):
+                if new := table.get(type(op)):
+                    what = f"{type(op).__name__} -> {new.__name__}"
+                    yield line, what, lambda new=new: setattr(node, "ops", [new()])
+        case ast.Constant(value=bool(value)):
+            yield line, f"{value} -> {not value}", lambda: setattr(node, "value", not value)
+        case ast.Constant(value=int(value)):
+            yield line, f"{value} -> {value + 1}", lambda: setattr(node, "value", value + 1)
+        case ast.Constant(value=float(value)):
+            new = 2.0 * value if value else 1.0
+            yield line, f"{value} -> {new}", lambda: setattr(node, "value", new)
+        case ast.Name(id=name) if name in NAMES:
+            yield line, f"{name} -> {NAMES[name]}", lambda: setattr(node, "id", NAMES[name])
+        case ast.Attribute(attr=name) if name in NAMES:
+            yield line, f"{name} -> {NAMES[name]}", lambda: setattr(node, "attr", NAMES[name])
+
+
+def _in_place(
+    node: ast.AST, parent: ast.AST, field: str, i: int | None
+) -> Iterator[tuple[str, Callable[[], None]]]:
+    """Changes that put something else in the place of a node."""
+
+    def put(new: ast.AST) -> Callable[[], None]:
+        ast.copy_location(new, node)
+        if i is None:
+            return lambda: setattr(parent, field, new)
+        return lambda: getattr(parent, field).__setitem__(i, new)
+
+    text = _text(node)
+    match node:
+        case ast.UnaryOp(operand=operand):
+            yield f"{text} -> {_text(operand)}", put(operand)
+        case ast.Call(func=ast.Attribute(attr="abs" | "sqrt") | ast.Name(id="abs"), args=[inner]):
+            yield f"{text} -> {_text(inner)}", put(inner)
+        case (
+            ast.AugAssign() | ast.Expr(value=ast.Call()) | ast.Continue() | ast.Break()
+            | ast.Assert() | ast.Assign(targets=[ast.Subscript() | ast.Attribute()])
+        ) if not text.endswith(ELSEWHERE):  # fmt: skip
+            yield f"{text} dropped", put(ast.Pass())
+    if field == "test" and not isinstance(parent, ast.Assert):
+        yield f"not {text}", put(ast.UnaryOp(ast.Not(), node))
+
+
+class Mutated(SourceFileLoader):
+    """Finds and loads one module from code that is not that of its file."""
+
+    code: CodeType
+
+    def find_spec(self, name: str, *_: object) -> ModuleSpec | None:
+        if name != self.name:
+            return None
+        return importlib.util.spec_from_file_location(name, self.path, loader=self)
+
+    def get_code(self, _: str) -> CodeType:
+        return self.code
+
+
+def load(path: Path, index: int) -> Mutated:
+    """The mutant of this number of a file."""
+    tree = ast.parse(path.read_text())
+    list(mutants(tree))[index][2]()
+    mutated = Mutated(".".join(path.relative_to(ROOT).with_suffix("").parts), str(path))
+    mutated.code = compile(ast.fix_missing_locations(tree), str(path), "exec")
+    return mutated
+
+
+def end_of(mutated: Mutated | None, tests: list[str], seconds: float) -> str:
+    """How the tests end: passed, failed, or timeout."""
+    child = os.fork()
+    if not child:
+        os.setpgid(0, 0)
+        null = os.open(os.devnull, os.O_RDWR)
+        for number in range(3):
+            os.dup2(null, number)
+        if mutated is not None:
+            sys.meta_path.insert(0, mutated)
+        import pytest
+
+        os._exit(pytest.main(["-qx", "-p", "no:cacheprovider", "-k", SLOW, *tests]))
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        pid, status = os.waitpid(child, os.WNOHANG)
+        if pid:
+            return "failed" if status else "passed"
+        time.sleep(0.05)
+    os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return "timeout"
+
+
+def main() -> None:
+    """Draw mutants, run the tests on each, print those that none of them fails on."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("what", help="a street of the package, or one of its files")
+    parser.add_argument("--count", type=int, default=150)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", metavar="FILE:LINE", nargs="*", help="the mutants of these lines")
+    parser.add_argument("--tests", nargs="*", help="what to run instead of the street's tests")
+    parser.add_argument("--all", action="store_true", help="print those that are noticed as well")
+    arguments = parser.parse_args()
+    at = PACKAGE / arguments.what
+    files = sorted(at.glob("*.py")) if at.is_dir() else [at]
+    tests = arguments.tests or [str(ROOT / "tests" / name) for name in TESTS[at.name].split()]
+    import dolfinx.fem.petsc, gmsh, matplotlib.pyplot, petsc4py.PETSc, pytest, scipy.optimize  # noqa
+
+    began = time.monotonic()
+    if end_of(None, tests, 3600) != "passed":
+        sys.exit("the tests fail as it is")
+    limit = 30 + 5 * (time.monotonic() - began)
+    pool = [
+        (path, i, f"{path.relative_to(ROOT)}:{line}: {what}")
+        for path in files
+        for i, (line, what, _) in enumerate(mutants(ast.parse(path.read_text())))
+    ]
+    drawn = [pool[i] for i in np.random.default_rng(arguments.seed).permutation(len(pool))]
+    if arguments.only:
+        wanted = tuple(f"{place}: " for place in arguments.only)
+        drawn = [one for one in drawn if one[2].startswith(wanted)]
+    ends: Counter[str] = Counter()
+    for path, index, what in drawn[: arguments.count]:
+        end = end_of(load(path, index), tests, limit)
+        ends[end] += 1
+        if end == "passed" or arguments.all:
+            print(f"{end}: {what}", flush=True)
+    noticed, number = ends["failed"] + ends["timeout"], ends.total()
+    print(f"{noticed} of {number} mutants noticed, {noticed / number:.1%}; {len(pool)} there are")
+
+
+if __name__ == "__main__":
+    main()
