@@ -33,7 +33,9 @@ def imports(path: Path) -> Iterator[Path]:
             if node.module:
                 yield base.joinpath(*node.module.split("."))
             else:
-                yield from (base / alias.name for alias in node.names)
+                places = (base / alias.name for alias in node.names)
+                # what is neither a module nor a street is a public name, loaded by the front door
+                yield from (p for p in places if p.is_dir() or p.with_suffix(".py").exists())
 
 
 def read(package: Path = PACKAGE) -> Arrows:
