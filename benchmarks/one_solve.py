@@ -181,35 +181,43 @@ def columns(row: Row) -> list[str]:
 
 def picture(rows: list[Row], path: Path) -> None:
     """All meshes together against one linear solve, and CG steps, over the number of dofs."""
-    import matplotlib
+    from signorini_cr.output import canvas
 
-    matplotlib.use("agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
+    figure = canvas.new_figure(13.0, 5.0)
+    rows = sorted((r for r in rows if r.ranks == 1 and r.dofs > SHOWN), key=lambda r: r.dofs)
     names = list(dict.fromkeys(r.case for r in rows))
-    colors = {name: f"C{i}" for i, name in enumerate(n for n in names if "mapped" not in n)}
-    for name in names:
-        mine = [r for r in rows if r.case == name and r.ranks == 1 and r.dofs > SHOWN]
-        mine.sort(key=lambda r: r.dofs)
-        if not mine:
-            continue
-        dofs = np.array([r.dofs for r in mine])
-        color = colors.get(name.removesuffix(" mapped"), "black")
-        style = {"color": color, "marker": "o", "markersize": 3.5, "label": name}
-        style["linestyle"] = "--" if "mapped" in name else "-"
-        axes[0].semilogx(dofs, [r.all_ratio for r in mine], **style)
-        axes[1].semilogx(dofs, [1e6 * r.all_levels / r.dofs for r in mine], **style)
-        axes[2].semilogx(dofs, [r.cg for r in mine], **style)
-    axes[0].axhline(1.0, color="black", linewidth=0.8)
-    titles = "all meshes / one linear solve", "all meshes, µs a dof", "CG steps on the mesh"
-    for axis, title in zip(axes, titles, strict=True):
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel("dofs")
-        axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-    axes[2].legend(fontsize=7, ncols=3, loc="lower center")
-    figure.savefig(path, dpi=130)
+    plain = [name for name in names if "mapped" not in name]
+    hues = dict(zip(plain, [canvas.BLUE, canvas.RED, canvas.YELLOW, canvas.GREY, "black"]))
+    colors = [hues[name.removesuffix(" mapped")] for name in names]
+    curves = [[r for r in rows if r.case == name] for name in names]
+    last = [curve[-1] for curve in curves]
+    shares, steps = [r.all_ratio for r in last], [r.cg for r in rows]
+    titles = (
+        f"All meshes together take {min(shares):.1f} to {max(shares):.1f}\n"
+        "of the time of one linear solve on the finest",
+        f"CG steps stay between {min(steps)} and {max(steps)}\nhowever fine the mesh",
+    )
+    values: list[Callable[[Row], float]] = [lambda r: r.all_ratio, lambda r: r.cg]
+    for axes, title, value in zip(figure.subplots(1, 2), titles, values, strict=True):
+        for name, color, curve in zip(names, colors, curves, strict=True):
+            style = "--" if "mapped" in name else "-"
+            axes.semilogx([r.dofs for r in curve], [value(r) for r in curve], style, color=color,
+                          marker="o", markersize=4)  # fmt: skip
+        axes.set_title(title, fontsize=14)
+        axes.set_xlabel("degrees of freedom on the finest mesh", fontsize=13)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.25)
+        canvas.label_ends(axes, [(r.dofs, value(r)) for r in last], names, colors)
+    figure.axes[0].axhline(1.0, color="black", linewidth=1)
+    figure.axes[0].annotate(
+        "one linear solve",
+        (0.98, 1.0),
+        xytext=(0, 4),
+        ha="right",
+        xycoords=("axes fraction", "data"),
+        textcoords="offset points",
+    )
+    canvas.save(figure, path)
 
 
 def read(paths: Iterable[Path]) -> list[Row]:

@@ -194,21 +194,32 @@ def by_bandwidth(points: list[Point]) -> Iterator[list[str]]:
 
 def picture(cases: list[Case], path: Path) -> None:
     """How much faster each solve on two ranks was, over its bandwidth."""
-    import matplotlib
+    from signorini_cr.output import canvas
 
-    matplotlib.use("agg")
-    from matplotlib import pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(7.5, 4.2), layout="constrained")
-    for i, case in enumerate(cases):
-        memory, faster = zip(*((p.memory, p.faster) for p in case.points()), strict=True)
-        axis.plot(memory, faster, "o", color=f"C{i}", markersize=4, alpha=0.7, label=case.name)
-    axis.axline((1.0, 1.0), slope=1.0, color="black", linewidth=0.8)
-    axis.set_xlabel("streaming meanwhile: two ranks' bandwidth over one's")
-    axis.set_ylabel("solve: one rank's time over two ranks'")
-    axis.grid(alpha=0.3)
-    figure.legend(loc="outside right upper", fontsize=8)
-    figure.savefig(path, dpi=130)
+    points = sorted((p for case in cases for p in case.points()), key=lambda p: p.memory)
+    third = len(points) // 3
+    slow, fast = (median(p.faster for p in some) for some in (points[:third], points[-third:]))
+    figure = canvas.new_figure(8.0, 5.5)
+    axes = figure.subplots()
+    axes.plot([p.memory for p in points], [p.faster for p in points], "o", color=canvas.GREY,
+              markersize=4, alpha=0.5)  # fmt: skip
+    for some, value in ((points[:third], slow), (points[-third:], fast)):
+        axes.plot([some[0].memory, some[-1].memory], [value, value], color=canvas.BLUE, linewidth=4)
+        axes.annotate(f"half are faster than {value:.2f} times", (some[-1].memory, value),
+                      xytext=(0, 7), textcoords="offset points", ha="right", fontsize=12,
+                      bbox={"color": "white", "alpha": 0.8, "pad": 1})  # fmt: skip
+    axes.axline((1.0, 1.0), slope=1.0, color="black", linewidth=1)
+    axes.annotate("as much faster\nas memory is", (1.0, 1.0), xytext=(45, -8),
+                  textcoords="offset points", fontsize=12)  # fmt: skip
+    axes.set_title(
+        f"Two ranks solve {slow:.1f} times as fast as one where memory is shared,\n"
+        f"{fast:.1f} times where each has nearly its own",
+        fontsize=14,
+    )
+    axes.set_xlabel("bandwidth of two ranks over that of one, meanwhile", fontsize=13)
+    axes.set_ylabel("one rank's time over two ranks'", fontsize=13)
+    axes.grid(alpha=0.25)
+    canvas.save(figure, path)
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ from itertools import pairwise
 from petsc4py import PETSc
 
 from .errors import InputError
+from .garbage import release
 from .memory import ran_out_of_memory
 
 PREFIX = "signorini_"
@@ -24,6 +25,9 @@ BOTTOM_PREFIX = PREFIX + "bottom_"
 
 ALONE_PREFIX = PREFIX + "alone_"
 """That of what takes the cycle's place where it has been given up."""
+
+ESTIMATE_PREFIX = PREFIX + "estimate_"
+"""That of the linear systems of the certificate; what they leave costs sharpness, not validity."""
 
 HAS_MUMPS = PETSc.Sys.hasExternalPackage("mumps")
 
@@ -68,6 +72,18 @@ BOOMERAMG: dict[str, object] = {
     "pc_hypre_boomeramg_no_CF": True,
 }
 """Algebraic multigrid at the bottom of the cycle, or in its place."""
+
+COMPANION: dict[str, object] = {
+    "ksp_type": PETSc.KSP.Type.CG,
+    # the energy is what the companion is to bring down
+    "ksp_norm_type": "natural",
+    "ksp_max_it": 100,
+    "pc_type": AMG,
+}
+"""The best companion, where it is solved for."""
+
+WEIGHT: dict[str, object] = {"ksp_type": PETSc.KSP.Type.CG, "ksp_rtol": 1e-3, "pc_type": AMG}
+"""The harmonic weight of the contact force's bounds."""
 
 LARGE_FACTORS: dict[str, object] = {
     "pc_factor_mat_solver_type": "mumps",
@@ -156,6 +172,25 @@ def explained() -> Iterator[None]:
             raise
         given = ", ".join(f"-{PREFIX}{name} {value}".rstrip() for name, value in options.items())
         raise InputError(f"PETSc can't solve with {given}: {_words(origin)}") from error
+
+
+def solve_once(
+    A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, options: Mapping[str, object], prefix: str
+) -> None:
+    """Solve A x = b by a solver that is made for it alone, from such defaults; collective.
+
+    Raises:
+        InputError: PETSc does not know what was asked for.
+    """
+    ksp = PETSc.KSP().create(A.getComm())
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(A)
+    try:
+        with defaults(options, prefix):
+            read(ksp)
+        ksp.solve(b, x)
+    finally:
+        release(ksp)
 
 
 @contextmanager

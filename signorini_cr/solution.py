@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib import import_module
 
 import numpy as np
 from dolfinx import fem
@@ -57,8 +56,9 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """A table and a picture, for notebooks; of the certificate what has been made."""
-        # through the package's public names, as what draws stands above the solution
-        return str(import_module("signorini_cr").notebook.as_html(self))
+        from . import notebook  # by the front door, as what draws stands above the solution
+
+        return str(notebook.as_html(self))
 
     @property
     def domain(self) -> Domain:
@@ -117,6 +117,13 @@ class Solution:
         finally:
             self.level.tidy()
 
+    @contextmanager
+    def _estimating(self) -> Iterator[None]:
+        """Book the time a block takes."""
+        began = time.perf_counter()
+        yield
+        self.seconds["estimate"] = self.seconds.get("estimate", 0.0) + time.perf_counter() - began
+
     def u_dg(self) -> fem.Function:
         """u_h as a discontinuous P1 function, which DOLFINx's writers draw right; collective."""
         return fields.discontinuous(self.u)
@@ -147,10 +154,3 @@ class Solution:
             "obstacle": contact.obstacle,
         }
         return found | fields.on_facets(mesh, contact.facets, columns)
-
-    @contextmanager
-    def _estimating(self) -> Iterator[None]:
-        """Book the time a block takes."""
-        began = time.perf_counter()
-        yield
-        self.seconds["estimate"] = self.seconds.get("estimate", 0.0) + time.perf_counter() - began

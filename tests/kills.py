@@ -187,7 +187,11 @@ def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
 def _left(out: Path) -> tuple[int, list[str]]:
     """How many levels are kept, and what is wrong with the folder."""
     faults = []
+    looked = time.monotonic()
     check_writable(out)  # as the next run does
+    while any(out.glob(STAGE + "*")) and time.monotonic() - looked < PATIENCE:
+        time.sleep(0.1)  # a process that is gone may have threads that are not, with its locks
+        check_writable(out)
     there = {path.name for path in out.iterdir()}
     if strange := sorted(there - set(FILES)):
         faults.append(f"left over: {strange}")

@@ -7,6 +7,7 @@ misspelt option answer at once.
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -114,7 +115,10 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
             return BAD_INPUT
     except (Exception, KeyboardInterrupt) as error:
         if asked or isinstance(error, KeyboardInterrupt):
-            return _stopped_by(asked)
+            status = _stopped_by(asked)
+            if launched()[1] > 1:  # the others would wait for it, and it for them when MPI ends
+                os._exit(status)
+            return status
         raise
     try:
         from ..errors import InputError, NotConverged
@@ -133,7 +137,7 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         if asked or isinstance(error, KeyboardInterrupt):
             status = _stopped_by(asked)
             if not screen.root:  # which tells and ends all, if it was asked and can
-                time.sleep(1.0 + 0.5 * min(comm.rank, 4))
+                time.sleep(0.3 * min(1 + comm.rank, 5))
                 screen.root = True
             word = "terminated" if status == TERMINATED else "interrupted"
             screen.complain(f"{word}{kept and f'; {kept}'}")
@@ -189,6 +193,7 @@ def _solve_levels(
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged
     from ..output import report as output
+    from ..output.tables import LEGEND
     from ..restart import Restart
 
     case, domain = _read(args, screen, comm)
@@ -224,7 +229,10 @@ def _solve_levels(
         report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
+            if args.html:
+                names += _write_page(args, comm, folder, report)
         screen.line("")
+        screen.text(LEGEND)
         screen.text(_facts(records[-1]))
         if (reason := records[-1]["bound_reason"]) is not None:
             screen.text(f"no bound of the error: {reason}")
@@ -374,6 +382,21 @@ def _solutions(
             max_time=max_time,
             restart=restart,
         )
+
+
+def _write_page(args: argparse.Namespace, comm: Any, folder: Path, report: Any) -> list[str]:
+    """The run as one page; collective."""
+    from ..errors import on_root
+    from ..output.files import write_files, write_text
+    from ..output.page import run_page
+
+    def make() -> str:
+        source = args.file.read_text(encoding="utf-8")
+        return run_page(folder, source, report, args.words, _facts(report["levels"][-1]))
+
+    name = "report.html"
+    write_files(folder, {name: lambda path: on_root(comm, write_text, path, make)}, comm=comm)
+    return [name]
 
 
 def _facts(record: dict[str, Any]) -> str:

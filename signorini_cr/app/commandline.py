@@ -75,7 +75,7 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
     for option, value in pairwise(petsc):
         if option == "-options_file" and not Path(value).is_file():
             parser.error(f"-options_file {value}: there is no such file")
-    args.petsc = petsc
+    args.petsc, args.words = petsc, list(argv)
     return args
 
 
@@ -98,9 +98,9 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         description="Solve on a sequence of meshes, print one row a level, write DIR.",
         usage="signorini-cr solve FILE.toml [--out DIR] [--levels N] [--element cr|p1]\n"
         + " " * 26
-        + "[--max-time SECONDS] [--resume] [--quiet] [-v]\n"
+        + "[--max-time SECONDS] [--resume] [--html] [--quiet]\n"
         + " " * 26
-        + "[PETSc options]",
+        + "[-v] [PETSc options]",
         epilog=f"{PETSC_NOTE} {EXIT_NOTE}",
         **shared,
     )
@@ -149,6 +149,9 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
     )
     solve.add_argument(
         "-v", "--verbose", action="store_true", help="print every step of the solver"
+    )
+    solve.add_argument(
+        "--html", action="store_true", help="write all of the run into one page, DIR/report.html"
     )
     for each in (parser, solve, check):
         vars(each)["color"] = False  # messages are folded, which counts every character

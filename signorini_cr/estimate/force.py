@@ -9,15 +9,15 @@ import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
-from petsc4py import PETSc
 
 from ..data.diffusion import diffusion
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, sum_rows
 from ..fem.conditions import facets_of
 from ..fem.space import ghosted_vector, shared_sum
+from ..garbage import release
 from ..jit import compiled
-from ..options import AMG
+from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate
 
@@ -115,15 +115,9 @@ def _weight(solution: Certified) -> fem.Function:
     fem.apply_lifting(b.x.array, [form], [[bc]])
     b.x.scatter_reverse(InsertMode.add)
     b.x.array[known] = marks.x.array[known]
-    ksp = PETSc.KSP().create(mesh.comm)
-    ksp.setOperators(A)
-    ksp.setType(PETSc.KSP.Type.CG)
-    ksp.getPC().setType(AMG)
-    ksp.setTolerances(rtol=1e-3)
-    vectors = [ghosted_vector(V, function.x.array) for function in (b, phi)]
-    ksp.solve(*vectors)
-    for thing in (ksp, A, *vectors):
-        thing.destroy()
+    load, found = (ghosted_vector(V, function.x.array) for function in (b, phi))
+    solve_once(A, load, found, WEIGHT, ESTIMATE_PREFIX)
+    release(A, load, found)
     # Exactly so, whatever the solver did
     phi.x.array[bounded] = 1.0
     phi.x.array[fixed] = 0.0

@@ -13,14 +13,13 @@ import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
-from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray
 from ..fem.cells import Cells, blocks, dot_rows, pick, sum_rows
 from ..fem.space import ghosted_vector, shared_maximum
 from ..garbage import release
 from ..jit import compiled
-from ..options import AMG
+from ..options import COMPANION, ESTIMATE_PREFIX, solve_once
 
 SHARE = 1e-10
 """Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on
@@ -98,15 +97,9 @@ def nearest(
     form = compiled(mesh.comm, fem.form, k * ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
     A.assemble()
-    ksp = PETSc.KSP().create(mesh.comm)
-    ksp.setOperators(A)
-    ksp.setType(PETSc.KSP.Type.CG)
-    ksp.setNormType(PETSc.KSP.NormType.NATURAL)
-    ksp.getPC().setType(AMG)
-    ksp.setTolerances(rtol=SHARE, max_it=100)
-    vectors = [ghosted_vector(V, function.x.array) for function in (b, x)]
-    ksp.solve(*vectors)
-    release(ksp, A, *vectors)
+    load, found = (ghosted_vector(V, function.x.array) for function in (b, x))
+    solve_once(A, load, found, COMPANION | {"ksp_rtol": SHARE}, ESTIMATE_PREFIX)
+    release(A, load, found)
     x.x.scatter_forward()
     nodal = x.x.array[dofs]
     corners, middles = nodal[: d + 1], nodal[d + 1 :]

@@ -9,6 +9,9 @@ from __future__ import annotations
 import functools
 import io
 import os
+import textwrap
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +22,16 @@ from .files import disk_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import YAxis
     from matplotlib.figure import Figure, SubFigure
 
 Where = str | os.PathLike[str]
 
 # Told apart by colour-blind eyes and in grey
 BLUE, RED, YELLOW, GREY = "#004488", "#BB5566", "#DDAA33", "#777777"
+
+LONGEST = 54
+"""Characters in a line of a title, which the narrowest picture has room for."""
 
 
 @functools.cache
@@ -76,7 +83,7 @@ def plane_axes(
     inches = 7.0 * (high - low) / (high - low).max()
     stretch = np.where(inches < 0.7, 2.2 / inches, 1.0)
     width, height = inches * stretch
-    axes = ax or new_figure(max(width + 1.2, 6.0) + room, height + 2.0).subplots()
+    axes = ax or new_figure(max(width + 1.5, 6.5) + room, height + 2.0).subplots()
     figure = axes.figure
     if ax is not None:
         width = ax.bbox.width / figure.dpi
@@ -97,8 +104,8 @@ def plane_axes(
     return figure, axes, float(width)
 
 
-def draw_lines(axes: Axes, segments: FloatArray, **style: Any) -> None:
-    """Draw straight lines given by their ends, shape (n, 2, 2)."""
+def draw_lines(axes: Axes, segments: FloatArray | Sequence[FloatArray], **style: Any) -> None:
+    """Draw lines given by their points: segments of shape (n, 2, 2), or `chains` of them."""
     from matplotlib.collections import LineCollection
 
     axes.add_collection(LineCollection(list(segments), **style), autolim=False)
@@ -122,8 +129,83 @@ def legend(
 
 def headline(title: str, what: str) -> str:
     """The problem's name, dollar signs and all, and what is seen of it."""
-    name = title if len(title) <= 40 else title[:39] + "…"
-    return name.replace("$", r"\$") + ": " + what if title else what
+    if not title:
+        return what
+    name = textwrap.fill(title, LONGEST).replace("$", r"\$")
+    last = len(name) - name.rfind("\n") - 1
+    return f"{name}:{' ' if last + len(what) <= LONGEST else chr(10)}{what}"
+
+
+def label_ends(
+    axes: Axes, ends: Sequence[tuple[float, float]], labels: Sequence[str], colors: Sequence[str]
+) -> None:
+    """Name curves beside their right ends, apart where these are close; limits are to be final.
+
+    Args:
+        axes: With limits and scales as they are to stay.
+        ends: The right end of each curve.
+        labels: What to write, the same number.
+        colors: The curves', for the lines from the labels to them.
+    """
+    points = axes.transAxes.inverted().transform(axes.transData.transform(ends))
+    high = axes.get_window_extent().height / axes.figure.dpi
+    height = [0.21 * (1 + label.count("\n")) / high for label in labels]
+    below = -np.inf
+    for i in np.argsort(points[:, 1], kind="stable"):
+        y = max(points[i, 1], below + height[i] / 2)
+        below = y + height[i] / 2
+        axes.annotate(labels[i], ends[i], (1.02, y), textcoords="axes fraction", va="center",
+                      fontsize=12, annotation_clip=False,
+                      arrowprops={"arrowstyle": "-", "color": colors[i], "linewidth": 0.6,
+                                  "relpos": (0.0, 0.5)})  # fmt: skip
+
+
+def log_ticks(axis: YAxis) -> None:
+    """Decades with what is between; where there are few of them, 1, 2 and 5 of each."""
+    from matplotlib.ticker import LogFormatterSciNotation, LogLocator
+
+    low, high = axis.get_view_interval()
+    few = high < 200 * low
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=12))
+    axis.set_minor_locator(LogLocator(subs=range(2, 10), numticks=99))
+    if few:
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+    else:
+        axis.set_major_formatter(LogFormatterSciNotation())
+    axis.set_minor_formatter(lambda *_: "")
+
+
+def chains(segments: FloatArray) -> list[FloatArray]:
+    """Straight lines put together where two of them meet, so that they are drawn as one.
+
+    Args:
+        segments: Their ends, shape (n, 2, 2).
+
+    Returns:
+        Polygonal lines, each of shape (points, 2); closed ones return to their first point.
+    """
+    if not len(segments):
+        return []
+    points = segments.reshape(-1, 2)
+    grid = np.rint((points - points.min(axis=0)) / (1e-9 * np.ptp(points, axis=0).max()))
+    _, first, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    ends = place.reshape(-1, 2).tolist()
+    at = defaultdict(set)
+    for segment, pair in enumerate(ends):
+        for point in pair:
+            at[point].add(segment)
+    lines = []
+    # From loose ends and crossings first; what is left then is closed
+    for start in sorted(at, key=lambda point: len(at[point]) == 2):
+        while at[start]:
+            line, point = [start], start
+            while at[point]:
+                segment = at[point].pop()
+                point = ends[segment][ends[segment][0] == point]
+                at[point].discard(segment)
+                line.append(point)
+            lines.append(points[first[line]])
+    return lines
 
 
 def grouped(number: int) -> str:

@@ -82,7 +82,18 @@ def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
     longest = np.sort(np.argsort(-lengths, kind="stable")[:MOST_PARTS])
     rows = [{name: column[table["part"] == part] for name, column in table.items()}
             for part in longest]  # fmt: skip
-    return rows, lengths[longest]
+    return [_as_seen(part) for part in rows], lengths[longest]
+
+
+def _as_seen(rows: dict[str, npt.NDArray]) -> dict[str, npt.NDArray]:
+    """A part from the left to the right, or upwards, whichever way the boundary runs there."""
+    dx, dy = rows["x"][-1] - rows["x"][0], rows["y"][-1] - rows["y"][0]
+    closed = np.hypot(dx, dy) < 1.5 * rows["length"].max() and len(rows["x"]) > 2
+    if closed or (dx if abs(dx) >= abs(dy) else dy) >= 0:
+        return rows
+    back = {name: column[::-1] for name, column in rows.items()}
+    back["arc_length"] = back["arc_length"][0] + back["length"][0] / 2 - back["arc_length"]
+    return back
 
 
 def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) -> str:

@@ -11,7 +11,7 @@ from ..errors import InputError, on_root
 from ..fem.space import facet_measures
 from ..mesh.domain import PARTS
 from ..solution import Solution
-from .canvas import draw_lines, grouped, headline, plane_axes, save
+from .canvas import chains, draw_lines, grouped, headline, log_ticks, plane_axes, save
 
 Where = str | os.PathLike[str]
 
@@ -51,7 +51,7 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
 
         assert pieces is not None
         triangles, values, boundary = (np.concatenate(rows) for rows in zip(*pieces, strict=True))
-        figure, axes, width = plane_axes(boundary.reshape(-1, 2), room=1.2)
+        figure, axes, width = plane_axes(boundary.reshape(-1, 2), room=1.5)
         # A corner has few cells of very high density: they must not take all colours
         bottom, top = np.quantile(np.maximum(values, 1e-300), (0.005, 0.995))
         cells = PolyCollection(
@@ -63,9 +63,10 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
             rasterized=True,
         )
         axes.add_collection(cells, autolim=False)
-        draw_lines(axes, boundary, color="black", linewidth=1.2, capstyle="round")
+        draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
         beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
         bar = figure.colorbar(cells, cax=beside)
+        log_ticks(bar.ax.yaxis)
         bar.set_label("density of the error", fontsize=12)
         bound = f"bound {certificate.bound_h1:.3g} on {grouped(len(values))} cells"
         axes.set_title(headline(title, bound), fontsize=14)

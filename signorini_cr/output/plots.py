@@ -27,10 +27,13 @@ from .canvas import (
     GREY,
     RED,
     YELLOW,
+    chains,
     draw_lines,
     grouped,
     headline,
+    label_ends,
     legend,
+    log_ticks,
     new_figure,
     plane_axes,
     save,
@@ -59,7 +62,7 @@ SERIES = {
         "color": YELLOW,
         "marker": "D",
         "linestyle": "--",
-        "label": r"certified bound of $\|\nabla_h(u-u_h)\|$",
+        "label": "certified bound of\n" r"$\|\nabla_h(u-u_h)\|$",
     },
     "error_l2": {"color": RED, "marker": "s", "label": r"$\|u-u_h\|$"},
 }
@@ -95,7 +98,8 @@ def plot_mesh(
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
         for part, style in STYLES.items():
             if len(parts[part]):
-                draw_lines(axes, parts[part], zorder=3, capstyle="round", **style)
+                lines = chains(parts[part])
+                draw_lines(axes, lines, zorder=3, capstyle="round", joinstyle="round", **style)
         legend(figure, ncols=3, ax=ax)
         hidden = "" if len(edges) else ", inner edges not drawn"
         axes.set_title(headline(title, f"mesh of {grouped(cells)} cells{hidden}"), fontsize=14)
@@ -122,12 +126,15 @@ def plot_solution(
     domain, contact = solution.domain, solution.contact
     mesh = _plane(domain)
     image, box, limits = raster(solution.u)
-    edges = _edges(mesh) if solution.cells <= 2000 else np.zeros((0, 2, 2))
     boundary = np.concatenate([_segments(domain, part) for part in STYLES])
     touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
+    free = _gather(mesh.comm, contact.vertices[~contact.active][..., :2])
 
     def draw() -> Figure | SubFigure:
-        figure, axes, width = plane_axes(box, room=1.2, ax=ax)
+        from matplotlib.patheffects import Normal, Stroke
+        from matplotlib.ticker import MaxNLocator
+
+        figure, axes, width = plane_axes(box, room=1.5, ax=ax)
         shown = axes.imshow(
             image,
             extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
@@ -136,14 +143,23 @@ def plot_solution(
             vmin=limits[0],
             vmax=limits[1],
         )
-        draw_lines(axes, edges, color="white", linewidth=0.3, alpha=0.5)
-        draw_lines(axes, boundary, color="black", linewidth=1.2, capstyle="round")
-        where = " at facet midpoints" if solution.element == "CR" else ""
+        heights = np.asarray(MaxNLocator(9).tick_values(*limits))
+        inner: FloatArray = heights[(heights > limits[0]) & (heights < limits[1])]
+        rows, columns = ((np.arange(n) + 0.5) / n for n in image.shape)
+        size = box[1] - box[0]
+        x, y = box[0, 0] + columns * size[0], box[0, 1] + rows * size[1]
+        if len(inner):
+            axes.contour(x, y, image, levels=inner, colors="white", linewidths=0.8, alpha=0.7,
+                         linestyles="solid")  # fmt: skip
+        draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
+        if len(free):
+            outlined = [Stroke(linewidth=5.5, foreground="black"), Normal()]
+            style: dict[str, Any] = {"color": "white", "linewidth": 3.5, "path_effects": outlined}
+            draw_lines(axes, chains(free), zorder=3, **style)
+            axes.plot([], [], label="no contact", **style)
         if len(touching):
-            draw_lines(axes, touching, color=RED, linewidth=5.0, zorder=3,
-                       label=rf"contact: $u_h = \alpha${where}")  # fmt: skip
-        else:
-            axes.plot([], [], linestyle="none", label="no contact")
+            draw_lines(axes, chains(touching), color=RED, linewidth=5.5, zorder=3,
+                       label="contact")  # fmt: skip
         points = contact.transitions
         if len(points):
             axes.plot(points[:, 0], points[:, 1], linestyle="none", marker="o", markersize=7,
@@ -151,10 +167,13 @@ def plot_solution(
                       label="contact begins or ends")  # fmt: skip
         beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
         bar = figure.colorbar(shown, cax=beside)
-        bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=2, ha="left", va="center")
+        bar.set_ticks(list(inner) if len(inner) else list(limits))
+        for height in inner:
+            bar.ax.axhline(height, color="white", linewidth=0.8, alpha=0.7)
+        bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
         bar.ax.tick_params(labelsize=11)
         bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
-        legend(figure, ncols=2, ax=ax)
+        legend(figure, ncols=3, ax=ax)
         axes.set_title(headline(title, f"$u_h$ on {grouped(solution.cells)} cells"), fontsize=14)
         save(figure, path)
         return figure
@@ -223,7 +242,9 @@ def plot_convergence(
         raise InputError("a picture of convergence needs two levels with an error or a bound")
     sizes = np.array([record["h"] for record in records])
     uniform = bool(np.all(sizes[1:] < 0.7 * sizes[:-1]))
-    axes = ax or new_figure(7.5, 6.0).subplots()
+    axes = ax or new_figure(9.5, 6.0).subplots()
+    ends: list[tuple[float, float]] = []
+    styles: list[dict[str, Any]] = []
     for key in keys:
         used = [record for record in records if record[key]]
         x = np.array([record["h" if uniform else "dofs"] for record in used])
@@ -231,9 +252,12 @@ def plot_convergence(
         style = dict(SERIES[key])
         rate = used[-1].get(key.replace("error", "rate")) if uniform else None
         style["label"] += (
-            f", last rate {rate:.2f}" if rate is not None and key != "bound_h1" else ""
+            f",\nlast rate {rate:.2f}" if rate is not None and key != "bound_h1" else ""
         )
         axes.loglog(x, values, markersize=7, linewidth=2, **style)
+        styles.append(style)
+        last = int(np.argmax(x))
+        ends.append((x[last], values[last]))
         if key == "bound_h1" and "error_h1" in keys:
             continue
         # A slope below the curve, touching it but for the factor
@@ -252,7 +276,8 @@ def plot_convergence(
     axes.set_ylabel("error", fontsize=13)
     axes.tick_params(labelsize=11)
     axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=12)
+    log_ticks(axes.yaxis)
+    label_ends(axes, ends, *([style[key] for style in styles] for key in ("label", "color")))
     axes.set_title(headline(title, "convergence"), fontsize=14)
     save(axes.figure, path)
     return axes.figure

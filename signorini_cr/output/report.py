@@ -14,6 +14,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import dolfinx
@@ -32,6 +33,7 @@ from .tables import table_row as table_row
 from .vtu import write_solution
 
 if TYPE_CHECKING:
+    from ..mesh.domain import Domain
     from ..restart import Restart
     from ..solution import Solution
 
@@ -46,8 +48,12 @@ FILES = (
     "solution.png",
     "contact.png",
     "convergence.png",
+    "report.html",
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
+
+MOST_CELLS = 4000
+"""Of a mesh that is drawn, if there is a coarser one."""
 
 PHASES = ("mesh", "assemble", "solve", "estimate")
 Record = dict[str, Any]
@@ -216,7 +222,7 @@ def write_output(
     writers["solution.vtu"] = lambda path: write_solution(solution, path)
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
     if drawable and plots.can_draw(comm):
-        writers["mesh.png"] = lambda path: plots.plot_mesh(solution.domain, path, title)
+        writers["mesh.png"] = lambda path: plots.plot_mesh(*_clear_mesh(solution, path, title))
         writers["solution.png"] = lambda path: plots.plot_solution(solution, path, title)
         if solution.contact.number:
             writers["contact.png"] = lambda path: plots.plot_contact(solution, path, title)
@@ -227,6 +233,16 @@ def write_output(
     removed = set(FILES) - ({checkpoint.NAME} if resumable else set())
     write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)
+
+
+def _clear_mesh(solution: Solution, path: Path, title: str) -> tuple[Domain, Path, str]:
+    """The finest mesh whose cells can be told apart in a picture, and a title that says which."""
+    domains = [mesh.domain for mesh in solution.level.meshes]
+    sizes = [domain.mesh.topology.index_map(2).size_global for domain in domains]
+    level = max((i for i, size in enumerate(sizes) if size <= MOST_CELLS), default=0)
+    if level == solution.level.number:
+        return domains[level], path, title
+    return domains[level], path, f"{title} – level {level} of 0 to {solution.level.number}"
 
 
 def _texts(report: Record, solution: Solution) -> dict[str, Writer]:

@@ -12,6 +12,12 @@ from typing import Any
 
 import numpy.typing as npt
 
+LEGEND = (
+    "h: largest diameter; newton, cg: steps of the solver; active: facets in contact; contact:"
+    " their length; bound: certified, of the error in H1; eff.: bound by error."
+)
+"""The printed columns, in at most three lines."""
+
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 
 
@@ -35,6 +41,15 @@ def markdown_table(records: Sequence[Mapping[str, Any]]) -> str:
         for row in rows
     )
     return "".join(f"| {line} |\n" for line in lines)
+
+
+def table_rows(records: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """The cells of the printed table, its head first."""
+    columns = _columns(records[0])
+    return [
+        [name for name, _, _ in columns],
+        *([cell(record) for _, _, cell in columns] for record in records),
+    ]
 
 
 def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
