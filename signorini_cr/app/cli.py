@@ -193,7 +193,7 @@ def _solve_levels(
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged
     from ..output import report as output
-    from ..output.tables import LEGEND
+    from ..output.tables import certified, legend, times
     from ..restart import Restart
 
     case, domain = _read(args, screen, comm)
@@ -232,10 +232,11 @@ def _solve_levels(
             if args.html:
                 names += _write_page(args, comm, folder, report)
         screen.line("")
-        screen.text(LEGEND)
+        screen.text(legend(records[0]))
+        screen.line("")
         screen.text(_facts(records[-1]))
-        if (reason := records[-1]["bound_reason"]) is not None:
-            screen.text(f"no bound of the error: {reason}")
+        screen.text(certified(records[-1]))
+        screen.text(times(records))
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
         raise NotConverged(_stopped(failure, records, folder))

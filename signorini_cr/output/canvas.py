@@ -59,7 +59,8 @@ def new_figure(width: float, height: float) -> Figure:
 def as_png(figure: Figure | SubFigure) -> bytes:
     """The bytes of a PNG."""
     file = io.BytesIO()
-    figure.canvas.print_figure(file, format="png")
+    # whatever the layout has left no room for, a title of several lines for one, is on it
+    figure.canvas.print_figure(file, format="png", bbox_inches="tight", pad_inches=0.1)
     return file.getvalue()
 
 
@@ -150,14 +151,37 @@ def label_ends(
     points = axes.transAxes.inverted().transform(axes.transData.transform(ends))
     high = axes.get_window_extent().height / axes.figure.dpi
     height = [0.21 * (1 + label.count("\n")) / high for label in labels]
-    below = -np.inf
-    for i in np.argsort(points[:, 1], kind="stable"):
-        y = max(points[i, 1], below + height[i] / 2)
-        below = y + height[i] / 2
+    order = np.argsort(points[:, 1], kind="stable")
+    places = apart(points[order, 1], [height[i] for i in order])
+    for i, y in zip(order, places, strict=True):
         axes.annotate(labels[i], ends[i], (1.02, y), textcoords="axes fraction", va="center",
                       fontsize=12, annotation_clip=False,
                       arrowprops={"arrowstyle": "-", "color": colors[i], "linewidth": 0.6,
                                   "relpos": (0.0, 0.5)})  # fmt: skip
+
+
+def apart(wanted: Sequence[float] | FloatArray, heights: Sequence[float]) -> list[float]:
+    """Middles of things in a column that do not overlap, as near as can be to where they belong.
+
+    Args:
+        wanted: Where their middles belong, ascending.
+        heights: How high they are.
+    """
+    blocks: list[tuple[float, float, int]] = []  # lower end, height, number of things
+    for middle, height in zip(wanted, heights, strict=True):
+        low, high, number = float(middle) - height / 2, height, 1
+        while blocks and sum(blocks[-1][:2]) > low:
+            under, size, others = blocks.pop()
+            low = (others * under + number * (low - size)) / (others + number)
+            high, number = high + size, others + number
+        blocks.append((low, high, number))
+    places, left = [], iter(heights)
+    for low, _, number in blocks:
+        for _ in range(number):
+            height = next(left)
+            places.append(low + height / 2)
+            low += height
+    return places
 
 
 def log_ticks(axis: YAxis) -> None:
@@ -221,4 +245,4 @@ def save(figure: Figure | SubFigure, path: Where | None) -> None:
     """
     if path is not None:
         with disk_errors(Path(path)):
-            figure.canvas.print_figure(path, format="png")
+            Path(path).write_bytes(as_png(figure))

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from .tables import LEGEND, table_rows
+from .tables import certified, legend, table_rows, times
 
 PICTURES = {
     "mesh.png": "The mesh and the parts of its boundary",
@@ -55,22 +55,10 @@ def run_page(
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{title}</title><style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n"
-        f"<p>{escape(fact)}</p>\n<p>{escape(_certificate(levels[-1]))}</p>\n"
+        f"<p>{escape(fact)}</p>\n<p>{escape(certified(levels[-1]))}</p>\n"
         f'{pictures}\n<h2>Levels</h2>\n<div class="wide"><table>{table}</table></div>\n'
-        f"<p>{escape(LEGEND)}</p>\n<h2>Problem file</h2>\n<pre>{escape(source)}</pre>\n"
+        f"<p>{escape(legend(levels[0]))}</p>\n<p>{escape(times(levels))}</p>\n"
+        f"<h2>Problem file</h2>\n<pre>{escape(source)}</pre>\n"
         f"<h2>To do it again</h2>\n<pre>{escape(shlex.join([*launch, 'signorini-cr', *words]))}"
         f"</pre>\n<p>{escape(versions)}</p>\n</body></html>\n"
-    )
-
-
-def _certificate(record: Mapping[str, Any]) -> str:
-    if record["bound_h1"] is None:
-        return f"There is no bound of the error: {record['bound_reason']}."
-    text = f"Certified: the error in the broken energy norm is at most {record['bound_h1']:.3g}"
-    lower, upper = (record["energy_bounds"][end] for end in ("lower", "upper"))
-    if lower is None or upper is None:
-        return text + "."
-    width = (upper - lower) / max(abs(lower), abs(upper), 1e-300)
-    return (
-        f"{text}; the energy J(u) lies in [{lower:.9g}, {upper:.9g}], relative width {width:.2g}."
     )

@@ -7,16 +7,27 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy.typing as npt
 
-LEGEND = (
-    "h: largest diameter; newton, cg: steps of the solver; active: facets in contact; contact:"
-    " their length; bound: certified, of the error in H1; eff.: bound by error."
-)
-"""The printed columns, in at most three lines."""
+MEANINGS = {
+    "dofs": "unknowns",
+    "h": "largest diameter of a cell",
+    "newton": "steps of the active set method",
+    "cg": "of its linear solver, in all",
+    "active": "facets in contact",
+    "contact": "their length",
+    "energy": "J(u_h)",
+    "H1 error": "‖∇_h(u − u_h)‖",
+    "rate": "of the error before it, as a power of h",
+    "L2 error": "‖u − u_h‖",
+    "bound": "certified, the H1 error is not above it",
+    "eff.": "bound / error",
+}
+"""The printed columns, but for those that need no word."""
 
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 
@@ -24,6 +35,50 @@ Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 def table_header(first: Mapping[str, Any]) -> str:
     """The head of the printed table; `first` is the record that decides on the columns."""
     return " ".join(f"{name:>{width}}" for name, width, _ in _columns(first))
+
+
+def legend(first: Mapping[str, Any]) -> str:
+    """What the printed columns mean."""
+    names = dict.fromkeys(name for name, *_ in _columns(first) if name in MEANINGS)
+    return "; ".join(f"{name}: {MEANINGS[name]}" for name in names)
+
+
+def certified(record: Mapping[str, Any]) -> str:
+    """What is certain about a level, rounded so that it stays certain."""
+    if record["bound_h1"] is None:
+        return f"no bound of the error: {record['bound_reason']}"
+    text = f"certified: ‖∇_h(u − u_h)‖ is at most {_rounded_up(record['bound_h1']):.3g}"
+    lower, upper = (record["energy_bounds"][end] for end in ("lower", "upper"))
+    if lower is None or upper is None:
+        return text
+    width, size = upper - lower, max(abs(lower), abs(upper))
+    if not (0.0 < width < math.inf):
+        return f"{text}; J(u) is in [{lower!r}, {upper!r}]"
+    # two digits of what they differ by
+    unit = 10.0 ** (math.floor(math.log10(max(width, 1e-15 * size))) - 1)
+    digits = max(math.ceil(math.log10(size / unit)), 1) + 1
+    low, high = math.floor(lower / unit) * unit, math.ceil(upper / unit) * unit
+    share = f"{_rounded_up(100 * width / size, 2):.2g} % wide"
+    return f"{text}; J(u) is in [{low:.{digits}g}, {high:.{digits}g}], {share}"
+
+
+def times(records: Sequence[Mapping[str, Any]]) -> str:
+    """How long the levels have taken, and what with."""
+    names = {"mesh": "meshes", "assemble": "assembly", "solve": "solver", "estimate": "certificate"}
+    each = {
+        words: sum(record["seconds"].get(phase) or 0.0 for record in records)
+        for phase, words in names.items()
+    }
+    parts = ", ".join(f"{words} {seconds:.2g}" for words, seconds in each.items())
+    return f"{sum(each.values()):.2g} s for all levels: {parts}"
+
+
+def _rounded_up(value: float, digits: int = 3) -> float:
+    """To so many digits, never below it."""
+    if not (value > 0 and math.isfinite(value)):
+        return value
+    unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
+    return math.ceil(value / unit) * unit
 
 
 def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None) -> str:
@@ -114,7 +169,7 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
             ("contact", 8, lambda r: _short(r["contact"]["length"])),
         ]
     if bound:
-        columns.append(("bound", 7, lambda r: _short(r["bound_h1"])))
+        columns.append(("bound", 7, lambda r: _short(_rounded_up(r["bound_h1"]))))
     if bound and exact:
         # Eighty columns: the number of cells gives way, it is in levels.csv
         del columns[1]

@@ -1,0 +1,46 @@
+"""What is printed beside the table."""
+
+import re
+
+import pytest
+
+from signorini_cr.output.tables import certified, legend, table_header, times
+
+RECORD = {
+    "level": 0, "cells": 8, "dofs": 16, "h": 0.5, "newton_iterations": 1, "linear_iterations": 3,
+    "energy": -2.0, "contact": {"active": 2, "length": 1.0}, "error_h1": None, "error_l2": None,
+    "bound_h1": 0.26683801, "bound_reason": None,
+    "energy_bounds": {"lower": -2.68565172, "upper": -2.68529189},
+    "seconds": {"mesh": 0.5, "assemble": 0.25, "solve": 1.0, "estimate": None},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-9, 123.456, 7.1e5])
+@pytest.mark.parametrize("bound", [0.26683801, 1.0, 0.1, 0.999999, 2.5e-7])
+def test_what_is_printed_as_certain_is_certain(factor, bound):
+    ends = {end: factor * value for end, value in RECORD["energy_bounds"].items()}
+    text = certified(RECORD | {"bound_h1": factor * bound, "energy_bounds": ends})
+    number = r"(-?[\d.]+(?:e[+-]?\d+)?)"
+    least = float(re.search(f"at most {number};", text)[1])
+    low, high, wide = map(float, re.search(rf"\[{number}, {number}\], {number} %", text).groups())
+    assert factor * bound <= least * (1 + 1e-12) and least <= 1.011 * factor * bound
+    slack = 1e-14 * abs(ends["lower"])  # the last digit of a float
+    assert low <= ends["lower"] + slack and ends["upper"] <= high + slack
+    width = ends["upper"] - ends["lower"]
+    assert wide >= 99.99 * width / -ends["lower"] and wide <= 0.0141
+    assert high - low <= 1.21 * width
+
+
+def test_no_bound_no_figures():
+    record = RECORD | {"bound_h1": None, "bound_reason": "no flux"}
+    assert certified(record) == "no bound of the error: no flux"
+
+
+def test_every_printed_column_has_its_word():
+    told = {entry.split(":")[0] for entry in legend(RECORD).split("; ")}
+    assert set(table_header(RECORD).split()) - {"level", "cells"} == told
+
+
+def test_times_add_up():
+    text = times([RECORD, RECORD])
+    assert text == "3.5 s for all levels: meshes 1, assembly 0.5, solver 2, certificate 0"
