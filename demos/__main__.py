@@ -57,6 +57,21 @@ diameter of a triangle, and rates are those between a level and the one before i
 | the contact pressure, of which the paper says nothing | [there](#{pressure}) |
 | the abstract estimate (1.11), with the terms (4.2) | [there](#{estimate}) |
 
+## The examples
+
+Γ1 is part of y = 0, and contact begins or ends at the origin unless said otherwise; r and θ are polar
+coordinates there.
+
+| name | u | what it is for |
+|---|---|---|
+| S1 | (1 − x²)(1 − y²) r^1.5 cos 1.5θ | the regularity that a point has where contact ends |
+| A | x³ for x > 0, −y&#124;x&#124;³ for x < 0 | a pressure that fades slowly, hard on active sets |
+| B, C, C2 | r^s cos sθ, s = 1.5, 3.5, 5.5 | harmonic; u is not 0 on Γ0 |
+| D | √r sin(θ/2) | not in H²; Γ0 and Γ1 meet at the origin, no contact |
+| E | not known; f = 2π sin 2πx | the unit square |
+| I | contact begins and ends at x = 1, ½, ⅓, … | infinitely many critical points |
+| L | not known; f = 1 | a re-entrant corner |
+
 ## From figure to command
 
 | figure | command |
