@@ -59,8 +59,8 @@ diameter of a triangle, and rates are those between a level and the one before i
 
 ## The examples
 
-Γ1 is part of y = 0, and contact begins or ends at the origin unless said otherwise; r and θ are polar
-coordinates there.
+Γ1 is part of y = 0, and contact begins or ends at the origin unless said otherwise; r and θ are
+polar coordinates there.
 
 | name | u | what it is for |
 |---|---|---|

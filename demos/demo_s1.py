@@ -20,15 +20,22 @@
 #     mpirun -n 2 python3 demos/demo_s1.py [FOLDER]
 
 # %%
+import textwrap
+
 import numpy as np
 from study import Study, comm, levels_wanted
 
 from signorini_cr import exact, plots, solve_levels
 from signorini_cr.output.report import level_record, table_header, table_row
-from signorini_cr.output.tables import markdown_table
+from signorini_cr.output.tables import certified, legend, markdown_table
 
 study = Study("demo_s1", "S1 on unstructured meshes")
 levels = levels_wanted(6)
+study.tell(
+    """−Δu = f on (−1, 1) × (0, 1), u = 0 on three sides; on the fourth, y = 0, u may
+touch 0 and not cross it: u ≥ 0, ∂u/∂n ≥ 0, and one of them is 0.
+"""
+)
 
 # %% [markdown]
 # ## Solve
@@ -44,6 +51,8 @@ for solution in solve_levels(exact.S1.problem, domain, levels):
         study.tell(table_header(records[0]))
     study.tell(table_row(records[-1], records[0]))
 study.parts.append(markdown_table(records).strip())
+for words in (legend(records[0]), certified(records[-1])):
+    study.tell("\n" + textwrap.fill(words, 80))
 
 # %% [markdown]
 # ## Look
