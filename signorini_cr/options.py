@@ -150,6 +150,18 @@ def read_number(name: str, default: float) -> float:
     return value
 
 
+def read_word(name: str, allowed: Sequence[str]) -> str:
+    """An option that is one of some words; the first is the default.
+
+    Raises:
+        InputError: It is something else.
+    """
+    word = PETSc.Options(PREFIX).getString(name, allowed[0])
+    if word not in allowed:
+        raise InputError(f"-{PREFIX}{name} is {word!r}; allowed are {', '.join(allowed)}")
+    return str(word)
+
+
 @contextmanager
 def explained() -> Iterator[None]:
     """Say what is behind errors of PETSc in a block.

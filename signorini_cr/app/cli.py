@@ -350,39 +350,21 @@ def _solutions(
     restart: Restart | None,
     screen: Screen,
 ) -> Iterator[Solution]:
-    from .. import levels
-    from ..adaptive import solve_adaptive
-
     def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
         facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
         screen.step(f"  level {level}  {facts}")
 
     screen.progress("level 0")
-    max_time, element = args.max_time, args.element.upper()
+    max_time = args.max_time
     if max_time is not None:
         max_time += args.began - time.perf_counter()
-    if case.mode == "uniform":
-        yield from levels.solve_levels(
-            case.problem,
-            domain,
-            case.levels,
-            element,
-            monitor,
-            max_time=max_time,
-            restart=restart,
-        )
-    else:
-        yield from solve_adaptive(
-            case.problem,
-            domain,
-            tolerance=case.tolerance,
-            levels=case.levels,
-            max_dofs=case.max_dofs,
-            element=element,
-            monitor=monitor,
-            max_time=max_time,
-            restart=restart,
-        )
+    return case.solutions(
+        domain,
+        element=args.element.upper(),
+        monitor=monitor,
+        max_time=max_time,
+        restart=restart,
+    )
 
 
 def _write_page(args: argparse.Namespace, comm: Any, folder: Path, report: Any) -> list[str]:
@@ -418,18 +400,21 @@ def _facts(record: dict[str, Any]) -> str:
 
 def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotConverged | None:
     """What stopped an adaptive run before the bound that was asked for was reached."""
-    if case.mode == "uniform" or case.tolerance == 0.0 or not records:
+    tolerance = case.adaptive["tolerance"]
+    if tolerance == 0.0 or not records:
         return None
     from ..errors import NotConverged
 
     bound = records[-1]["bound_h1"]
-    if bound is not None and bound <= case.tolerance:
+    if bound is not None and bound <= tolerance:
         return None
     limit = (
-        f"levels = {case.levels}" if len(records) >= case.levels else f"max_dofs = {case.max_dofs}"
+        f"levels = {case.levels}"
+        if len(records) >= case.levels
+        else f"max_dofs = {case.adaptive['max_dofs']}"
     )
     return NotConverged(
-        f"the certified bound is {bound:.3g}, above the tolerance of {case.tolerance:g}, and"
+        f"the certified bound is {bound:.3g}, above the tolerance of {tolerance:g}, and"
         f" {limit} allows no further mesh",
         records[-1]["level"],
     )

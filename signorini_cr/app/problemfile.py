@@ -7,7 +7,7 @@ what is allowed, the same on all ranks; the command puts the file's name before 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,14 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from ..adaptive import solve_adaptive
 from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, on_root
 from ..fem.problem import Forms, Problem
+from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
+from ..solution import Solution
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
 from .readers import (
@@ -27,7 +30,6 @@ from .readers import (
     get,
     insist_known,
     named,
-    not_negative,
     number,
     one_of,
     parse_toml,
@@ -37,11 +39,10 @@ from .readers import (
     string,
     whole,
 )
-from .reference import SECTIONS, allowed
+from .reference import ADAPTIVE, SECTIONS, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
-MAX_DOFS = 1_000_000
 ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
 ENOUGH = 1000
@@ -62,8 +63,7 @@ class ProblemFile:
         expressions: The data that were written in the file, by key (``data.f`` …).
         mode: "uniform" or "adaptive".
         levels: Number of meshes, the coarsest included.
-        tolerance: Adaptive refinement stops when the certified bound is below it.
-        max_dofs: Adaptive refinement stops before a mesh with more degrees of freedom.
+        adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
         said: All that levels depend on, by key, as it was written.
     """
 
@@ -74,8 +74,7 @@ class ProblemFile:
     expressions: Mapping[str, Expression]
     mode: str
     levels: int
-    tolerance: float
-    max_dofs: int
+    adaptive: Mapping[str, Any]
     said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
@@ -112,6 +111,19 @@ class ProblemFile:
         check_data(forms, domain)
         return doubts(forms, domain)
 
+    def solutions(self, domain: Domain, **arguments: Any) -> Iterator[Solution]:
+        """Solve on the meshes that the file asks for; collective.
+
+        Args:
+            domain: From :meth:`mesh`.
+            **arguments: What `solve_levels` and `solve_adaptive` take beside what the file says.
+        """
+        if self.mode == "uniform":
+            return solve_levels(self.problem, domain, self.levels, **arguments)
+        return solve_adaptive(
+            self.problem, domain, levels=self.levels, **self.adaptive, **arguments
+        )
+
 
 def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     """Read a problem file on rank 0 and check it on every rank; collective.
@@ -138,12 +150,12 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     expressions = _expressions(sections)
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
-    tolerance = get(refine, "refine", "tolerance", not_negative, 0.0)
-    max_dofs = get(refine, "refine", "max_dofs", whole, MAX_DOFS)
-    for key, limit in (("tolerance", tolerance), ("max_dofs", max_dofs)):
+    adaptive = {name: get(refine, "refine", name, *how) for name, how in ADAPTIVE.items()}
+    for key in adaptive:
         if mode == "uniform" and refine.get(key):
+            what = "where adaptive refinement ends" if f"refine.{key}" in ENDS else "for adaptive"
             raise InputError(
-                f"refine.{key}: {shown(limit)} is where adaptive refinement ends;"
+                f"refine.{key}: {shown(adaptive[key])} is {what};"
                 ' mode = "adaptive" is needed beside it'
             )
     return ProblemFile(
@@ -154,8 +166,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         expressions=expressions,
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
-        tolerance=tolerance,
-        max_dofs=max_dofs,
+        adaptive=adaptive,
         said={
             f"{name}.{key}": value
             for name, section in sections.items()

@@ -150,6 +150,14 @@ def not_negative(key: str, value: Any) -> float:
     return result
 
 
+def part(key: str, value: Any) -> float:
+    """Insist on a number above 0 and not above 1."""
+    result = positive(key, value)
+    if result > 1:
+        raise InputError(f"{key}: 1 or less is needed, found {shown(value)}")
+    return result
+
+
 def whole(key: str, value: Any) -> int:
     """Insist on a whole number of 1 or more."""
     if isinstance(value, bool) or not isinstance(value, int):

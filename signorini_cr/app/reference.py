@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from .formula import CONSTANTS, FUNCTIONS, VARIABLES
+from .readers import not_negative, part, whole
 
 
 class Key(NamedTuple):
@@ -17,6 +19,8 @@ class Key(NamedTuple):
         default: What it means to leave it out; "" where it is needed.
         about: What it does.
         example: A line of TOML.
+        argument: How it is read, and what it is when left out, if it is nothing but an argument of
+            `solve_adaptive` by the same name; `problemfile` hands it on.
     """
 
     section: str
@@ -25,6 +29,7 @@ class Key(NamedTuple):
     default: str
     about: str
     example: str
+    argument: tuple[Callable[[str, Any], Any], float] | None = None
 
 
 EXPRESSION = "an expression or a number"
@@ -66,9 +71,12 @@ KEYS = (
     Key("refine", "levels", "a whole number above 0", "1; if adaptive, as many as it takes",
         "Number of meshes, the coarsest included.", "levels = 5"),
     Key("refine", "tolerance", "a number, 0 or above", "0", "Adaptive: stop when the certified "
-        "bound of ‖∇(u − u_h)‖ is below it.", "tolerance = 0.05"),
+        "bound of ‖∇(u − u_h)‖ is below it.", "tolerance = 0.05", (not_negative, 0.0)),
     Key("refine", "max_dofs", "a whole number above 0", "1000000", "Adaptive: stop before a mesh "
-        "with more degrees of freedom.", "max_dofs = 200000"),
+        "with more degrees of freedom.", "max_dofs = 200000", (whole, 1_000_000)),
+    Key("refine", "fraction", "a number above 0, at most 1", "0.5", "Adaptive: the part of the "
+        "squared bound that the cells to be refined hold. Less takes more meshes, and fewer cells "
+        "for the same bound.", "fraction = 0.3", (part, 0.5)),
 )  # fmt: skip
 
 ABOUT = {
@@ -82,6 +90,10 @@ ABOUT = {
 """The sections, and what is said of each."""
 
 SECTIONS = tuple(name for name in ABOUT if name)
+
+
+ADAPTIVE = {key.name: key.argument for key in KEYS if key.argument is not None}
+"""The keys of [refine] that only adaptive refinement has."""
 
 
 def allowed(section: str) -> tuple[str, ...]:

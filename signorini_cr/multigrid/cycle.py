@@ -9,7 +9,7 @@ much, as if it jumped inside coarse cells, they are computed anew from the fines
 Dofs on the obstacle are constrained on every grid: the matrix has the identity there, and a coarse
 function that does not vanish at a constrained dof of the finer grid is constrained too, which
 leaves subspaces of the reduced space. Smoothing is by over-relaxed Gauss-Seidel sweeps, forward
-before and backward after the coarse correction.
+before and backward after the coarse correction, or by what the user asks for (see `smoothing`).
 
 Where there is no coarser mesh, CR stands on P1 of the same one, and that is left to BoomerAMG, or
 to GAMG where PETSc is without hypre: the auxiliary space method. Small bottom grids are solved
@@ -36,7 +36,7 @@ from ..garbage import release
 from .bottom import Bottom, is_small
 from .constrained import ConstrainedMatrix, numbers_of
 from .parents import Layout
-from .smoothing import GaussSeidel
+from .smoothing import smoother
 from .transfer import Transfer
 
 PATIENCE = 40
@@ -52,7 +52,7 @@ NEARLY = 0.2
 """Part of the diagonal by which a coarse matrix may differ from the Galerkin product."""
 
 SWEEPS = 2
-"""Gauss-Seidel sweeps before and after the coarse correction."""
+"""Sweeps of the smoother before and after the coarse correction."""
 
 LONG_SWEEPS = 3
 """The same between CR and P1 of the mesh below, where there is more to smooth."""
@@ -85,7 +85,7 @@ class Grid:
             dofs: Its dofs.
             dirichlet: Its owned dofs on Γ0, local numbers.
             transfer: What writes functions of the next coarser space in this one, if there is one.
-            sweeps: Number of Gauss-Seidel sweeps before and after.
+            sweeps: Number of sweeps of the smoother before and after.
             alone: Whether this takes the place of a chain.
         """
         self.operator, self.dofs, self.dirichlet = operator, dofs, dirichlet
@@ -151,7 +151,7 @@ class TwoGrids:
     def __init__(self, matrix: PETSc.Mat, dofs: Layout, transfer: Transfer, sweeps: int):
         """Prepare the sweeps, as for `Grid`; collective."""
         self._matrix, self._transfer = matrix, transfer
-        self._smoother = GaussSeidel(matrix, dofs, sweeps)
+        self._smoother = smoother(matrix, dofs, sweeps)
         self._residual = matrix.createVecRight()
         self._b_coarse, self._x_coarse = transfer.coarse_vector(), transfer.coarse_vector()
 

@@ -1,11 +1,14 @@
-"""Gauss-Seidel sweeps, local to each rank.
+"""Smoothers: Gauss-Seidel sweeps, local to each rank, or Jacobi's.
 
-A rank sweeps over its own rows, with its neighbours' values of the sweep before, as in every
-parallel algebraic multigrid. PETSc's matrices offer that, too, but copy the right-hand side for
-each sweep; only few rows have entries of other ranks, and they alone are corrected here.
+In Gauss-Seidel a rank sweeps over its own rows, with its neighbours' values of the sweep before, as
+in every parallel algebraic multigrid. PETSc's matrices offer that, too, but copy the right-hand
+side for each sweep; only few rows have entries of other ranks, and they alone are corrected here.
+Jacobi's method takes twice the steps, and the same ones on any number of ranks.
 """
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +16,7 @@ from petsc4py import PETSc
 
 from ..arrays import IndexArray, Int32Array
 from ..garbage import release
+from ..options import read_word
 from .constrained import numbers_of, rows_of
 from .parents import Layout
 
@@ -27,6 +31,31 @@ _BACKWARD = PETSc.Mat.SORType.LOCAL_BACKWARD_SWEEP
 _FROM_ZERO = PETSc.Mat.SORType.ZERO_INITIAL_GUESS
 
 
+class Smoother(Protocol):
+    """Sweeps for A x = b before and, transposed, after the coarse correction."""
+
+    def __init__(self, matrix: PETSc.Mat, dofs: Layout, sweeps: int):
+        """Prepare the sweeps; rows and columns of the matrix may be constrained later; collective.
+
+        Args:
+            matrix: A, symmetric positive definite.
+            dofs: Its rows.
+            sweeps: Number of sweeps of each call.
+        """
+
+    def constrain(self, dofs: Int32Array) -> None:
+        """Note the owned dofs whose rows and columns are the identity's now, and x = 0 there."""
+
+    def forward(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Sweep before the correction, from x = 0."""
+
+    def backward(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Sweep after the correction, from x, for the same b as before."""
+
+    def free(self) -> None:
+        """Free everything but the matrix."""
+
+
 class GaussSeidel:
     """Forward sweeps for A x = b and backward sweeps, which are their transpose.
 
@@ -39,13 +68,7 @@ class GaussSeidel:
     """
 
     def __init__(self, matrix: PETSc.Mat, dofs: Layout, sweeps: int):
-        """Prepare the sweeps; rows and columns of the matrix may be constrained later.
-
-        Args:
-            matrix: A, symmetric positive definite.
-            dofs: Its rows.
-            sweeps: Number of sweeps of each call.
-        """
+        """Prepare the sweeps, as any `Smoother`; collective."""
         self._matrix, self._sweeps = matrix, sweeps
         self.relaxation = OVER_RELAXATION
         self._alone = matrix.getComm().getSize() == 1
@@ -93,6 +116,57 @@ class GaussSeidel:
             x.getLocalVector(self._x)
             self._local.SOR(self._b, self._x, self.relaxation, first if sweep == 0 else way)
             x.restoreLocalVector(self._x)
+
+
+class Jacobi:
+    """Steps x ← x + D⁻¹ (b − A x) with D_ii = Σ_j |a_ij|, which is at least A.
+
+    So each step reduces the error's energy norm, and still does when rows and columns are
+    constrained: that only makes sums smaller.
+    """
+
+    def __init__(self, matrix: PETSc.Mat, dofs: Layout, sweeps: int):
+        """Prepare the sweeps, as any `Smoother`; collective."""
+        self._matrix, self._sweeps = matrix, sweeps
+        start, _, values = matrix.getValuesCSR()
+        self._inverse, self._residual = matrix.createVecRight(), matrix.createVecRight()
+        self._inverse.array[:] = 1.0 / np.add.reduceat(np.abs(values), start[:-1])
+
+    def constrain(self, dofs: Int32Array) -> None:
+        """Do nothing: residuals of rows of the identity are 0 where b and x are."""
+
+    def forward(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Sweep from x = 0."""
+        x.pointwiseMult(self._inverse, b)
+        self._sweep(b, x, self._sweeps - 1)
+
+    def backward(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Sweep from x; the transpose of a sweep is itself."""
+        self._sweep(b, x, self._sweeps)
+
+    def free(self) -> None:
+        """Free everything but the matrix."""
+        release(self._inverse, self._residual)
+
+    def _sweep(self, b: PETSc.Vec, x: PETSc.Vec, times: int) -> None:
+        for _ in range(times):
+            self._matrix.mult(x, self._residual)
+            self._residual.aypx(-1.0, b)
+            self._residual.pointwiseMult(self._inverse, self._residual)
+            x.axpy(1.0, self._residual)
+
+
+SMOOTHERS: dict[str, type[Smoother]] = {"gauss-seidel": GaussSeidel, "jacobi": Jacobi}
+"""By what ``-signorini_smoother`` calls them; the first is the default."""
+
+
+def smoother(matrix: PETSc.Mat, dofs: Layout, sweeps: int) -> Smoother:
+    """Make the smoother that is asked for, as described there; collective.
+
+    Raises:
+        InputError: There is none of that name.
+    """
+    return SMOOTHERS[read_word("smoother", tuple(SMOOTHERS))](matrix, dofs, sweeps)
 
 
 def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[Int32Array, PETSc.Mat, float]:

@@ -14,8 +14,7 @@ import helpers
 import pytest
 from mpi4py import MPI
 
-from signorini_cr import levels
-from signorini_cr.app import cli, commandline
+from signorini_cr.app import cli, commandline, problemfile
 from signorini_cr.errors import NotConverged
 
 pytestmark = pytest.mark.slow
@@ -65,7 +64,10 @@ BAD: dict[str, tuple[str, list[str]]] = {
     ),
     "unknown key": (
         with_("levels", "level"),
-        ["refine.level:", "did you mean levels? Allowed are mode, levels, tolerance, max_dofs"],
+        [
+            "refine.level:",
+            "did you mean levels? Allowed are mode, levels, tolerance, max_dofs, fraction",
+        ],
     ),
     "key in the wrong section": (
         with_("[refine]", "[refine]\nobstacle = 1"),
@@ -98,6 +100,14 @@ BAD: dict[str, tuple[str, list[str]]] = {
     "max_dofs of a uniform sequence": (
         with_("tolerance = 0", "max_dofs = 1234567"),
         ["refine.max_dofs: 1234567 is where", 'mode = "adaptive" is needed'],
+    ),
+    "fraction of a uniform sequence": (
+        with_("tolerance = 0", "fraction = 0.3"),
+        ["refine.fraction: 0.3 is for adaptive", 'mode = "adaptive" is needed'],
+    ),
+    "fraction too large": (
+        with_("tolerance = 0", "fraction = 30"),
+        ["refine.fraction: 1 or less is needed, found 30"],
     ),
     "tolerance nan": (with_("tolerance = 0", "tolerance = nan"), ["tolerance:", "found nan"]),
     "mode": (
@@ -425,7 +435,7 @@ def test_check(write) -> None:
 
 @pytest.mark.parametrize("finished", [0, 2])
 def test_levels_finished_before_a_failure_are_kept(finished: int, write, monkeypatch) -> None:
-    solve_levels = levels.solve_levels
+    solve_levels = problemfile.solve_levels
 
     def failing(problem, domain, number, *rest, **options):
         yield from (
@@ -433,7 +443,7 @@ def test_levels_finished_before_a_failure_are_kept(finished: int, write, monkeyp
         )
         raise NotConverged("DIVERGED_MAX_IT after 50 steps", finished)
 
-    monkeypatch.setattr(levels, "solve_levels", failing if finished else _at_once)
+    monkeypatch.setattr(problemfile, "solve_levels", failing if finished else _at_once)
     path, out = write(CASE), Path("out")
     status, text, err = run("solve", path, "--out", out, "--levels", "4")
     assert status == cli.NOT_CONVERGED
@@ -474,7 +484,7 @@ def _at_once(*_, **__):
 
 @pytest.mark.serial
 def test_the_unexpected_is_told_as_such(write, monkeypatch) -> None:
-    monkeypatch.setattr(levels, "solve_levels", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(problemfile, "solve_levels", lambda *_, **__: 1 / 0)
     status, _, err = run("solve", write(CASE), "--out", "out")
     assert status == cli.FAULT
     assert "ZeroDivisionError" in err and "signorini-cr: unexpected error" in err
@@ -485,7 +495,7 @@ def test_ctrl_c(write, monkeypatch) -> None:
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(levels, "solve_levels", interrupt)
+    monkeypatch.setattr(problemfile, "solve_levels", interrupt)
     status, _, err = run("solve", write(CASE), "--out", "out")
     assert (status, err) == (cli.INTERRUPTED, "signorini-cr: interrupted\n")
 

@@ -57,8 +57,13 @@ def read(shared_tmp_path: Path):
 
 def test_defaults(read) -> None:
     case = read(SQUARE + "[data]\n")
-    assert (case.title, case.mode, case.levels, case.tolerance) == ("case", "uniform", 1, 0.0)
-    assert case.max_dofs >= 10**5
+    assert (case.title, case.mode, case.levels, case.adaptive["tolerance"]) == (
+        "case",
+        "uniform",
+        1,
+        0.0,
+    )
+    assert case.adaptive["max_dofs"] >= 10**5
     problem = case.problem
     assert (problem.f, problem.g, problem.dirichlet, problem.exact) == (None,) * 4
     assert (problem.obstacle, problem.coefficient) == (0.0, 1.0)
@@ -88,18 +93,32 @@ def test_everything_is_taken_over(read) -> None:
         levels = 7
         tolerance = 1e-2
         max_dofs = 5000
+        fraction = 0.7
         """
     )
     assert isinstance(case.domain, Polygon)
     assert len(case.domain.holes) == 1 and case.domain.holes[0].boundary[1] == "dirichlet"
     assert (case.title, case.size) == ("All of it", 0.5)
-    assert (case.mode, case.levels, case.tolerance) == ("adaptive", 7, 0.01)
-    assert case.max_dofs == 5000
+    assert (case.mode, case.levels, case.adaptive["tolerance"]) == ("adaptive", 7, 0.01)
+    assert case.adaptive == {"tolerance": 0.01, "max_dofs": 5000, "fraction": 0.7}
     assert (case.problem.g, case.problem.obstacle) == (3.0, -1.5)
     assert case.problem.f((2.0, 0.0)) == 5.0  # any coordinates will do
     points = np.array([[0.25, 0.0], [0.75, 0.0]])
     assert np.allclose(case.expressions["data.dirichlet"].numpy(points), [0.5, 1.0])
     assert np.allclose(case.expressions["exact.u"].numpy([[1.0, 2.0]]), 2 * np.sin(1.0))
+
+
+def test_the_fraction_decides_what_is_refined(read) -> None:
+    """All cells for 1; the fewest cells that hold so much for less: 2 meshes of each."""
+    cells = []
+    for fraction in (0.1, 0.5, 1.0):
+        text = SQUARE + "[data]\nf = 1\n[refine]\nmode = 'adaptive'\nlevels = 2\n"
+        case = read(text + f"fraction = {fraction}\n")
+        sizes = [
+            s.domain.mesh.topology.index_map(2).size_global for s in case.solutions(case.mesh())
+        ]
+        cells.append(sizes)
+    assert cells[0][1] < cells[1][1] < cells[2][1] == 4 * cells[2][0]
 
 
 def test_expressions_and_numbers_are_the_same(read) -> None:

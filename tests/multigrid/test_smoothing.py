@@ -1,17 +1,18 @@
-"""Gauss-Seidel sweeps, against PETSc's own, and what goes on between the ranks."""
+"""Gauss-Seidel sweeps, against PETSc's own, and what goes on between the ranks; Jacobi's."""
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import Polygon, Problem, exact
+from signorini_cr import InputError, Polygon, Problem, exact, solve_levels
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.multigrid.constrained import rows_of
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
-from signorini_cr.multigrid.smoothing import OVER_RELAXATION, GaussSeidel
+from signorini_cr.multigrid.smoothing import OVER_RELAXATION, GaussSeidel, Jacobi
 from signorini_cr.multigrid.transfer import inclusion
+from signorini_cr.options import PREFIX
 from signorini_cr.vi.level import Level
 
 pytestmark = pytest.mark.ranks
@@ -97,3 +98,47 @@ def test_the_relaxation_leaves_a_cycle_positive_definite(element, domain):
     assert relaxation >= min(OVER_RELAXATION, 0.85 * 2.0 / (1.0 + np.abs(eigenvalues).max()))
     if MPI.COMM_WORLD.size == 1:
         assert relaxation == OVER_RELAXATION
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("domain", [exact.S1.mesh(0.1), FLAT.mesh(0.1)], ids=["square", "flat"])
+def test_jacobi_against_dense_matrices(element, domain):
+    """x + D⁻¹ (b − A x) with D ≥ A, row by row of the matrix as NumPy has it."""
+    own, dofs = system(domain, element)
+    A, owner = dense(own.A)
+    D = np.abs(A).sum(axis=1)
+    scale = 1.0 / np.sqrt(D)
+    assert np.linalg.eigvalsh(scale[:, None] * A * scale)[-1] < 1.0 + 1e-12
+    whole, mine = np.random.default_rng(4).standard_normal(len(A)), owner == MPI.COMM_WORLD.rank
+    b, x = own.A.createVecs()
+    b.array[:], x.array[:] = whole[mine], 7.0
+    smoother = Jacobi(own.A, dofs, 2)
+    expected = np.zeros(len(A))
+    for name in ("forward", "backward"):
+        getattr(smoother, name)(b, x)
+        for _ in range(2):
+            expected += (whole - A @ expected) / D
+        assert np.allclose(x.array_r, expected[mine], rtol=0, atol=1e-13)
+    smoother.free()
+
+
+def test_another_smoother_is_an_option_and_the_forces_are_the_same():
+    """Jacobi takes about twice the CG steps on each mesh, and ends with the same forces."""
+    problem, database = Problem(f=-3.0, obstacle=-0.2), PETSc.Options(PREFIX)
+    forces, steps = {}, {}
+    for name in ("gauss-seidel", "jacobi", "sor"):
+        database["smoother"] = name
+        try:
+            if name == "sor":
+                with pytest.raises(InputError, match="'sor'; allowed are gauss-seidel, jacobi"):
+                    next(solve_levels(problem, exact.S1.mesh(0.25), 1))
+                break
+            run = list(solve_levels(problem, exact.S1.mesh(0.25), 5))
+        finally:
+            del database["smoother"]
+        forces[name] = run[-1].contact.force
+        steps[name] = [solution.iterations.linear for solution in run]
+        assert "multigrid on 5 meshes" in run[-1].iterations.preconditioner
+    assert forces["jacobi"] == pytest.approx(forces["gauss-seidel"], rel=1e-7)
+    ratios = np.array(steps["jacobi"]) / steps["gauss-seidel"]
+    assert 1.0 < ratios.min() and ratios.max() < 3.0
