@@ -244,7 +244,6 @@ def _solve_levels(
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..fem.space import facet_measures
-    from ..mesh.domain import PARTS
     from ..output import plots
     from ..output.files import check_writable, write_files
 
@@ -255,7 +254,7 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     topology = domain.mesh.topology
     screen.line(f"{args.file}: in order")
     screen.text(f"{topology.index_map(topology.dim).size_global} cells on the coarsest mesh")
-    for name, part in PARTS.items():
+    for name, part in domain.parts.items():
         _, lengths = facet_measures(domain.mesh, domain.facets(part))
         number, length = comm.allreduce(len(lengths)), comm.allreduce(float(lengths.sum()))
         screen.text(f"{name}: {number} facets, length {length:.6g}")

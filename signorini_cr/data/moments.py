@@ -353,7 +353,7 @@ class OnFacets:
         """The same for the one unknown of each facet."""
         only = np.zeros(1, dtype=np.int32)
         means, ends = self.means[:, None], self.ends.T[:, :, None]
-        return Imposed(self.condition.key, self.facets, only, means, ends)
+        return Imposed(self.condition.label.removeprefix("data."), self.facets, only, means, ends)
 
     def seen_from(self, cells: Cells) -> OnFacets:
         """Keep the facets of owned cells, those of the part's `Side`."""

@@ -163,12 +163,13 @@ def _sizes(loops: Sequence[FloatArray], facets: Sequence[FloatArray]) -> list[Fl
     return np.split(slow, np.cumsum([len(loop) for loop in loops])[:-1])
 
 
-def read(path: Path, parts: dict[str, int]) -> Triangulation:
+def read(path: Path, parts: dict[str, int], usual: bool = True) -> Triangulation:
     """Read a planar triangle mesh with named physical curves.
 
     Args:
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
+        usual: Whether there must be a contact and a dirichlet curve.
     """
     file = mshfile.load(path)
     _check_cells(file, path)
@@ -176,10 +177,11 @@ def read(path: Path, parts: dict[str, int]) -> Triangulation:
     found: dict[str, list[Int64Array]] = {name: [] for name in parts}
     others: dict[str, list[Int64Array]] = {}
     for tag, name in names:
-        key = name.strip().lower()
+        key = name.strip()
+        key = key if key in parts else key.lower()
         group = found[key] if key in parts else others.setdefault(name or f"{tag}", [])
         group.append(file.elements(_LINE, tag))
-    for needed in ("contact", "dirichlet"):
+    for needed in ("contact", "dirichlet") if usual else tuple(parts)[3:]:
         if not sum(map(len, found[needed])):
             there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
             raise InputError(

@@ -1,13 +1,14 @@
 """Conditions say what they add: one more kind is solved right; data are sampled once a mesh."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import ufl
 
 from signorini_cr import Polygon, Problem, compat, exact, solve, solve_levels
 from signorini_cr.diffusion import Diffusion
-from signorini_cr.fem import problem as forms_of_problem
-from signorini_cr.fem.conditions import KINDS, Condition
+from signorini_cr.fem.conditions import Condition
 from signorini_cr.fem.space import ghosted_vector
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
@@ -18,23 +19,20 @@ SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
 PARTS = ("contact", "neumann", "dirichlet", "dirichlet")
 
 
+@dataclass(frozen=True, eq=False)
 class Spring(Condition):
-    """κ∂ₙu + 3 u = g, the 3 u of it."""
+    """κ∂ₙu + 3 u = g."""
 
-    part, key = "neumann", "spring"
+    g: object = 0.0
     uncertified = "there is a spring"
 
-    @classmethod
-    def of(cls, _):
-        return cls(ufl.as_ufl(3.0))
+    @property
+    def flux(self):
+        return self.g
 
-    def a(self, u, v):
-        return self.value * u * v
-
-
-@pytest.fixture
-def springs(monkeypatch):
-    monkeypatch.setattr(forms_of_problem, "KINDS", (*KINDS, Spring))
+    @property
+    def loss(self):
+        return ufl.as_ufl(3.0)
 
 
 def u(x):
@@ -42,12 +40,14 @@ def u(x):
 
 
 SPRUNG = Problem(
-    exact=u, obstacle=-10.0, g=lambda x: 2.0 * ufl.cos(3.0) * ufl.cosh(x[1]) + 3.0 * u(x)
+    exact=u,
+    obstacle=-10.0,
+    conditions={"neumann": Spring(lambda x: 2.0 * ufl.cos(3.0) * ufl.cosh(x[1]) + 3.0 * u(x))},
 )
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
-def test_another_kind_is_solved_right(springs, element):
+def test_another_kind_is_solved_right(element):
     domain = Polygon(SQUARE, PARTS).mesh(0.25)
     *_, coarse, fine = solve_levels(SPRUNG, domain, 4, element)
     assert coarse.errors and fine.errors
@@ -58,7 +58,7 @@ def test_another_kind_is_solved_right(springs, element):
     assert certificate.bound_h1 is None and certificate.reason == "there is a spring"
 
 
-def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows(springs):
+def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows():
     domain = Polygon(SQUARE, PARTS).mesh(0.3)
     mesh = NestedMesh(Diffusion(SPRUNG, domain.mesh), domain)
     level, (operator, p1, dirichlet) = Level((mesh,)), conforming(mesh)
