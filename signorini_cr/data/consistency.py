@@ -59,7 +59,7 @@ class _Solution:
         self.slope: Any = None if flat else forms.kappa * ufl.grad(self.u)
 
     def complaint(self) -> str | None:
-        """The first of the conditions on Γ1, in Ω and on other parts that u violates; collective."""
+        """The first condition that u violates: on Γ1, in Ω, on other parts; collective."""
         said = None
         for contact in self.forms.bounded:
             said = said or self._on_contact(contact)

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
-from ..data.loads import Edge, Load
-from ..fem.cells import Cells, Side, blocks, dot_rows, pick, poincare, sum_rows
+from ..data.loads import Known, Load, to_cells
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare, sum_rows
 from .beyond import Beyond
 
 if TYPE_CHECKING:
@@ -29,7 +29,8 @@ class Flux:
 
     Attributes:
         excess: Fluxes out of each cell of y − κ_T ∇u_h, shape (d + 1, cells), κ_T the mean of κ.
-        contact: Fluxes through the facets of Γ1, not negative, shape (n,).
+        contact: Contact forces on the facets of Γ1: y's flux less that which is known, not
+            negative, shape (n,).
         touching: Whether the facet of Γ1 is in contact, shape (n,).
         left: ∫_T (f + div y), shape (cells,).
         steepness: ‖∇u_h‖²_T, shape (cells,).
@@ -49,7 +50,7 @@ def equilibrate(
     kappa: FloatArray,
     w: FloatArray,
     load: Load,
-    edge: Edge,
+    edge: Known,
     on_contact: Side,
     gap: FloatArray,
 ) -> Flux:
@@ -57,15 +58,14 @@ def equilibrate(
 
     Seen from T the flux through F is ∫_T κ∇u_h·∇ψ_F − ∫_T f ψ_F − ∫_{∂T∩Γg} g ψ_F, so that the two
     sides of F differ by what the solver left of the equation of F; y takes the mean of the
-    two. On Γ1 it is 0 where
-    there is no contact, on Γg it is ∫_F g.
+    two. On Γg it is ∫_F g; on Γ1 it is that where there is no contact, and not less where there is.
 
     Args:
         cells: The mesh.
         kappa: Mean of κ, shape (cells,) or ().
         w: u_h at the cells' vertices, shape (d + 1, cells).
-        load: Moments of f.
-        edge: Integrals of g.
+        load: Moments of f − c u_h.
+        edge: Integrals of g − b u_h.
         on_contact: The facets of Γ1.
         gap: u_h − α on them, by means, shape (n,).
     """
@@ -79,12 +79,13 @@ def equilibrate(
         steepness[part] = dot_rows(w[:, part], slopes)
         slopes *= -d * pick(kappa, part)
         np.subtract(slopes, shares, out=fluxes[:, part])
-    on_neumann, through = edge.side, edge.shares.sum(axis=0)
-    for i, share in enumerate(edge.to_cells()):
+    side, known = edge.side, np.zeros(len(cells.exterior))
+    known[side.dofs] = edge.shares.sum(axis=0)
+    for i, share in enumerate(to_cells(cells, side, edge.shares)):
         # the facet itself gets all of it further down
-        share = np.where(on_neumann.local == i, 0.0, share)
-        np.subtract.at(excess[i], on_neumann.cells, share)
-        np.subtract.at(fluxes[i], on_neumann.cells, share)
+        share = np.where(side.local == i, 0.0, share)
+        np.subtract.at(excess[i], side.cells, share)
+        np.subtract.at(fluxes[i], side.cells, share)
     half = cells.over_facets(fluxes)
     half *= 0.5
     half[cells.exterior] = 0.0
@@ -93,20 +94,27 @@ def equilibrate(
     there = on_contact.local, on_contact.cells
     # In contact: the primal-dual criterion with the facet's diagonal entry of A
     diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
-    touching = fluxes[there] > np.maximum(diagonal * gap, 0.0)
-    contact = np.where(touching, fluxes[there], 0.0)
-    excess[there] += contact - fluxes[there]
-    there = on_neumann.local, on_neumann.cells
-    excess[there] += through - fluxes[there]
+    force, through = fluxes[there] - known[on_contact.dofs], known[on_contact.dofs]
+    touching = force > np.maximum(diagonal * gap, 0.0)
+    contact = np.where(touching, force, 0.0)
+    excess[there] += contact + through - fluxes[there]
+    natural = ~edge.bounded
+    there = side.local[natural], side.cells[natural]
+    excess[there] += known[side.dofs[natural]] - fluxes[there]
     left = sum_rows(excess)
     left += cells.volume * load.mean
     return Flux(excess, contact, touching, left, steepness)
 
 
 def unbalanced(
-    level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float = 0.0
+    level: Level,
+    cells: Cells,
+    left: FloatArray,
+    kappa_min: FloatArray,
+    size: float = 0.0,
+    reaction: float = 0.0,
 ) -> float:
-    """Bound W with |Σ_T left_T e_T| ≤ W ‖κ^{1/2} ∇e‖ for e ∈ H¹ that vanishes on Γ0.
+    """Bound W with |Σ_T left_T e_T| ≤ W times e's energy norm, for e ∈ H¹ that vanishes on Γ0.
 
     e_T is the mean over T. Level by level, what a cell's children have too much or too little is
     spread over the cell: Poincaré's inequality on the cell bounds the difference. On the coarsest
@@ -118,8 +126,14 @@ def unbalanced(
         left: Integrals over the cells, shape (cells,).
         kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
         size: Of the bound, to which what is carried may be small.
+        reaction: c: ‖c^{1/2} e‖ bounds it, too.
     """
     volume, bound = cells.volume, 0.0
+    taken_up = np.inf
+    if reaction > 0.0:
+        taken_up = float(np.sqrt(cells.total(np.sum(left**2 / volume))[0] / reaction))
+        if taken_up <= WORTH * size:
+            return taken_up
     meshes = level.meshes
     for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
         assert mesh.parents is not None
@@ -140,7 +154,7 @@ def unbalanced(
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if len(meshes) > 1:
         cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
-    return float(bound + _carried(cells, left, kappa_min, size))
+    return min(taken_up, float(bound + _carried(cells, left, kappa_min, size)))
 
 
 def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
@@ -156,7 +170,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     Returns:
         The norm ‖κ^{-1/2} q‖ of what was added; 0 if nothing was.
     """
-    if bound <= WORTH * size:
+    if bound <= WORTH * size or cells.sinks:
         return 0.0
     fluxes, all_reached = _carry(cells, flux.left)
     if not all_reached:
@@ -206,12 +220,17 @@ def _carry(cells: Cells, left: FloatArray) -> tuple[FloatArray, bool]:
 def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float) -> float:
     """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
 
-    Where a walk's q is not small against `size`, one that is nearly the smallest takes its place.
+    Where q leaves through facets with a b, that takes up ‖b^{-1/2} q·n‖ there. Where a walk's q is
+    not small against `size`, one that is nearly the smallest takes its place.
     """
 
     def norm(fluxes: FloatArray) -> float:
-        squares = field_squares(cells, fluxes)
-        return float(np.sqrt(cells.total(np.sum(squares / kappa_min))[0]))
+        square = float(np.sum(field_squares(cells, fluxes) / kappa_min))
+        for part, loss in cells.sinks.items():
+            side = cells.sides[part]
+            out = fluxes[side.local, side.cells]
+            square += float(np.sum(out**2 / (loss * measures(cells, side))))
+        return float(np.sqrt(cells.total(square)[0]))
 
     fluxes, all_reached = _carry(cells, left)
     if not all_reached:

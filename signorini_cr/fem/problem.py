@@ -239,6 +239,17 @@ class Forms:
         return tuple(c for c in self.conditions if c.flux is not None)
 
     @property
+    def reaction_number(self) -> float:
+        """c, where it is a number; else 0."""
+        return number(self.reaction) or 0.0
+
+    @property
+    def sinks(self) -> dict[int, float]:
+        """The parts whose b is a number above 0, and these."""
+        found = {c.number: number(c.loss) for c in self.conditions if c.loss is not None}
+        return {part: loss for part, loss in found.items() if loss}
+
+    @property
     def uncertified(self) -> str | None:
         """Why there is no certificate, if the reaction or some condition has none."""
         if number(self.reaction) is None:

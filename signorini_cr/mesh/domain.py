@@ -126,7 +126,7 @@ class Domain:
             needed |= {CONTACT, DIRICHLET}
         wanted: dict[int, Int32Array] = {}
         for name, own in given.items():
-            usual = PARTS[name] if parts[name] in needed and own is None else []
+            usual: list[int] = [PARTS[name]] if own is None and parts[name] in needed else []
             numbers = np.asarray(usual if own is None else own, dtype=np.int32)
             wanted[parts[name]] = np.unique(np.atleast_1d(numbers))
         called = {value: name for name, value in parts.items()}
