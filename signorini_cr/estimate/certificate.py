@@ -28,7 +28,7 @@ from .companion import Companion, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
-from .flux import Flux, balance, equilibrate, field_squares, unbalanced
+from .flux import Flux, balance, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
 from .sums import Sums
 
@@ -193,6 +193,10 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     return replace(certificate, seconds=time.perf_counter() - began)
 
 
+RELAXED = 8
+"""Steps for a flux that need not balance the load."""
+
+
 class _NoBound(Exception):
     """Why there is none; raised on all ranks."""
 
@@ -255,6 +259,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     of_u = load if reaction == 0.0 else load.less(reaction, w)
     gap = u[alpha.side.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, of_u, edge, alpha.side, gap)
+    flux.taken_up = relax(cells, kappa.mean, flux, reaction, RELAXED)
     size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
     _insist(certain.reason)
@@ -267,10 +272,12 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     change = segments.through - edge.shares.sum(axis=0)
     flux.excess[edge.side.local, edge.side.cells] += change
     np.add.at(flux.left, edge.side.cells, change)
-    left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
-    carried = balance(cells, flux, kappa.low, size, left)
-    if carried:
+    left = carried = 0.0
+    if not flux.taken_up:
         left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
+        carried = balance(cells, flux, kappa.low, size, left)
+        if carried:
+            left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)

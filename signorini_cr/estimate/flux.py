@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
@@ -35,6 +36,7 @@ class Flux:
         left: ∫_T (f + div y), shape (cells,).
         steepness: ‖∇u_h‖²_T, shape (cells,).
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
+        taken_up: Whether c takes up what is left.
     """
 
     excess: FloatArray
@@ -43,6 +45,7 @@ class Flux:
     left: FloatArray
     steepness: FloatArray
     beyond: Beyond | None = None
+    taken_up: bool = False
 
 
 def equilibrate(
@@ -104,6 +107,76 @@ def equilibrate(
     left = sum_rows(excess)
     left += cells.volume * load.mean
     return Flux(excess, contact, touching, left, steepness)
+
+
+def relax(cells: Cells, kappa: FloatArray, flux: Flux, reaction: float, steps: int) -> bool:
+    """Bring y nearer to κ∇u_h where c can take up what it then lacks; collective.
+
+    With f + div y = left_T/|T| on T instead of 0 the bound has ‖c^{-1/2} left_T/|T|‖_T more, and
+    where c h_T² is larger than κ that is less than what ‖κ^{-1/2}(y − κ∇u_h)‖_T falls by. Their
+    squares' sum is minimised by conjugate gradients in the fluxes through inner facets and Γ0.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        flux: y, changed in place.
+        reaction: c.
+        steps: How many steps.
+
+    Returns:
+        Whether it was called for, and c is to take up all that is left.
+    """
+    ratio = float((reaction * cells.diameter2 / kappa).max(initial=0.0)) if reaction else 0.0
+    if cells.tdim != 2 or cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
+        return False
+    held = cells.exterior.astype(np.float64)
+    for part in cells.fixed:
+        held[cells.sides[part].dofs] = 1.0 if part in cells.sinks else 0.0
+    free = cells.share(held) == 0.0
+    owned, weight = slice(cells.owned_facets()), 1.0 / (reaction * cells.volume)
+    # a flux counts as positive out of one of the facet's two cells, the same on all ranks
+    sign = cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]])
+
+    def slopes(P: FloatArray, left: FloatArray) -> FloatArray:
+        return sign * (_field_slopes(cells, P) / kappa + weight * left)
+
+    def assembled(local: FloatArray) -> FloatArray:
+        return np.where(free, cells.over_facets(local), 0.0)
+
+    units = np.eye(3)[:, :, None] * np.ones(cells.number)
+    scale = np.stack([field_squares(cells, unit) for unit in units]) / kappa + weight
+    scale = cells.over_facets(scale)
+    scale[scale == 0.0] = 1.0  # no cell of this rank has the facet
+    down, before = -assembled(slopes(flux.excess, flux.left)), np.inf
+    change, way = np.zeros_like(down), np.zeros_like(down)
+    for _ in range(steps):
+        straight = down / scale
+        now = float(cells.total(down[owned] @ straight[owned])[0])
+        if not now > 0.0:
+            break
+        way = straight + now / before * way
+        fluxes = sign * way[cells.facets]
+        image = assembled(slopes(fluxes, sum_rows(fluxes)))
+        step = now / float(cells.total(way[owned] @ image[owned])[0])
+        change += step * way
+        down -= step * image
+        before = now
+    fluxes = sign * change[cells.facets]
+    flux.excess += fluxes
+    flux.left += sum_rows(fluxes)
+    return True
+
+
+def _field_slopes(cells: Cells, fluxes: FloatArray) -> FloatArray:
+    """½ ∂`field_squares` by each flux, shape (d + 1, cells)."""
+    d, s = cells.tdim, sum_rows(fluxes)
+    a, q = fluxes - s / (d + 1), np.zeros_like(fluxes)
+    for (i, j), length in zip(cells.pairs, cells.lengths, strict=True):
+        q[i] += a[j] * length
+        q[j] += a[i] * length
+    bulk = s * sum_rows(cells.lengths) / ((d + 1) ** 2 * (d + 2))
+    out: FloatArray = bulk + 0.5 * (sum_rows(q) / (d + 1) - q)
+    return out / (d**2 * cells.volume)
 
 
 def unbalanced(
@@ -184,6 +257,8 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     return float(np.sqrt(square))
 
 
+STRONG = 3.0
+"""c h_T²/κ from which on c takes up what y lacks."""
 STEPS = 30
 """Of conjugate gradients, for a small field of given divergence."""
 WORTH = 1e-3

@@ -131,9 +131,18 @@ def integrate(
             sums.energy -= own
             sums.energy_slack += EPS * own
             sums.companion += float(np.sum(apart))
-            share += apart
             sums.apart[part] = apart
             sums.zeroth[part] += apart
+            share += apart
+            if flux.taken_up:
+                given = flux.left[part] ** 2 / (reaction * volume)
+                means = sum_rows(c) / (d + 1)
+                if height is not None:
+                    means += sum_rows(height) / 3
+                sums.load += float(np.sum(given))
+                sums.load_companion += float(flux.left[part] @ means)
+                sums.zeroth[part] += given
+                share += given
         sums.flux += float(np.sum(pp))
         sums.companion += float(np.sum(bb))
         sums.cross += float(np.sum(pb))
