@@ -148,7 +148,15 @@ class Certain:
     reason: str | None = None
 
     @classmethod
-    def of(cls, f: Volume, load: Load, cells: Cells, low: FloatArray, size: float) -> Certain:
+    def of(
+        cls,
+        f: Volume,
+        load: Load,
+        cells: Cells,
+        low: FloatArray,
+        size: float,
+        reaction: float = 0.0,
+    ) -> Certain:
         """Enclose f; collective.
 
         Args:
@@ -157,6 +165,7 @@ class Certain:
             cells: The mesh.
             low: Lower bound of κ, shape (cells,) or ().
             size: Of the bound, to which what is missed should be small.
+            reaction: c.
         """
         if f.number is not None:
             return cls(load)
@@ -172,8 +181,9 @@ class Certain:
         goal = SHARE * size
         weights = np.empty((2, cells.number))
         np.multiply(2.0 / (np.sqrt(low) * goal), cells.volume, out=weights[0])
-        np.multiply((2.0 * poincare(cells.tdim) / goal) ** 2 / low, cells.diameter2, out=weights[1])
-        weights[1] *= cells.volume
+        # J(v) asks for the first of these, the bound for the second
+        norms = mean_to_norm(cells, low, 0.0) * mean_to_norm(cells, low, reaction)
+        np.multiply((2.0 / goal) ** 2 * cells.volume, norms, out=weights[1])
         try:
             found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
         except Unknown as error:
@@ -183,6 +193,22 @@ class Certain:
         bounded = np.isfinite(missed).all() and np.isfinite(rough).all()
         reason = None if cells.comm.allreduce(bool(bounded), op=MPI.LAND) else UNBOUNDED
         return cls(load.refined(fine, cells, found), missed, rough, reason)
+
+
+def mean_to_norm(
+    cells: Cells, low: FloatArray, reaction: float, part: slice | None = None
+) -> FloatArray:
+    """C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the part,).
+
+    Args:
+        cells: The mesh.
+        low: Lower bound of κ, shape (cells,) or ().
+        reaction: c.
+        part: Which cells; None for all.
+    """
+    part = slice(0, cells.number) if part is None else part
+    by_slope = poincare(cells.tdim) * np.sqrt(cells.diameter2[part] / pick(low, part))
+    return np.minimum(by_slope, reaction**-0.5) if reaction else by_slope
 
 
 SHARE = 4e-3

@@ -19,9 +19,9 @@ from dolfinx import fem
 from .. import compat
 from ..arrays import FloatArray
 from ..data.diffusion import diffusion
-from ..data.loads import Certain, Known, Load, Segments
+from ..data.loads import Certain, Known, Load, Segments, mean_to_norm
 from ..data.moments import Coefficient, OnParts
-from ..fem.cells import Cells, blocks, measures, pick, poincare, sum_rows
+from ..fem.cells import Cells, blocks, measures, pick, sum_rows
 from ..jit import compiled
 from .beyond import Beyond
 from .companion import Companion, Masses, companion, on_facet
@@ -261,7 +261,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     flux = equilibrate(cells, kappa.mean, w, of_u, edge, alpha.side, gap)
     flux.taken_up = relax(cells, kappa.mean, flux, reaction, RELAXED)
     size = _size(cells, kappa, w, flux)
-    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
+    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size, reaction)
     _insist(certain.reason)
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
@@ -305,7 +305,8 @@ def _companion(
     segments = known.segments
     lossy = segments.loss > 0.0
     side = segments.facets.picked(lossy)
-    masses = Masses(known.reaction, side, segments.loss[lossy] * measures(cells, side))
+    of_facets = segments.loss[lossy] * measures(cells, side)
+    masses = Masses(not plain, known.reaction, side, of_facets)
     v = companion(cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal, masses)
     sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
     if plain and promising(cells, kappa.mean, flux, sums):
@@ -462,16 +463,18 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         return 0.0, 0.0
     missed, square, change = np.zeros(cells.number), 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
-        missed, constant = certain.missed, poincare(cells.tdim)
+        missed = certain.missed
         assert sums.steepness is not None
         for part in blocks(cells.number):
-            rough = np.sqrt(cells.diameter2[part] / pick(kappa.low, part)) * certain.rough[part]
-            rough *= constant
+            by_slope, rough = (
+                mean_to_norm(cells, kappa.low, c, part) * certain.rough[part]
+                for c in (0.0, known.reaction)
+            )
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
             if cells.tdim == 2:
                 means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3
             steep = np.sqrt(np.maximum(sums.steepness[part], 0.0))
-            change += float(means @ missed[part] + rough @ steep)
+            change += float(means @ missed[part] + by_slope @ steep)
             square += float(rough @ rough)
         if v.cusps is not None:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])

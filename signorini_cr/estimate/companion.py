@@ -47,19 +47,16 @@ class Masses:
     """What E has of terms without gradients: c‖v − u_h‖² on cells, b‖v − u_h‖² on facets.
 
     Attributes:
+        some: Whether there is a c or a b, here or on other ranks.
         reaction: c.
         side: Facets with a b.
         loss: b |F| there, shape (n,).
     """
 
+    some: bool
     reaction: float
     side: Side
     loss: FloatArray
-
-    @property
-    def vanish(self) -> bool:
-        """Whether there are none on this rank."""
-        return self.reaction == 0.0 and not self.loss.any()
 
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
         """Add what heights of bumps are pulled by, in units of 8/3, shape (3, n)."""
@@ -192,7 +189,7 @@ def companion(
         held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
         loose = cells.share(held, 0) == 0.0
         promise += _promise(cells, kappa, excess, bumps, loose)
-        if promise > PROMISE * energy:
+        if promise > PROMISE * energy and not masses.some:
             v[:], bumps[:], cusps = _solved(
                 cells, kappa, steady, w, (v, bumps), (loose, free), contact, (obstacle, middle)
             )
@@ -274,7 +271,7 @@ def _at_vertices(
     def collect(where: Any, values: Any) -> FloatArray:
         return cells.share(np.bincount(where, values, minlength=size).astype(np.float64), 0)
 
-    if kappa.ndim or not masses.vanish:
+    if kappa.ndim or masses.some:
         weights = np.tile(kappa + masses.reaction * cells.volume, (len(w), 1))
         for ends in cells.others[masses.side.local].T:
             np.add.at(weights, (ends, masses.side.cells), masses.loss)
