@@ -193,10 +193,6 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     return replace(certificate, seconds=time.perf_counter() - began)
 
 
-RELAXED = 8
-"""Steps for a flux that need not balance the load."""
-
-
 class _NoBound(Exception):
     """Why there is none; raised on all ranks."""
 
@@ -259,7 +255,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     of_u = load if reaction == 0.0 else load.less(reaction, w)
     gap = u[alpha.side.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, of_u, edge, alpha.side, gap)
-    flux.taken_up = relax(cells, kappa.mean, flux, reaction, RELAXED)
+    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, alpha.side)
     size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, load, cells, kappa.low, size, reaction)
     _insist(certain.reason)

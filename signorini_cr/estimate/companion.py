@@ -280,11 +280,10 @@ def _at_vertices(
     else:
         v = collect(flat, w.ravel())
         v /= np.maximum(collect(flat, None), 1.0)
-    ends = contact.ends.ravel()
-    count = collect(ends, None)
-    value = collect(ends, obstacle.ravel()) / np.maximum(count, 1.0)
+    # where parts with obstacles of their own meet, the higher one counts
+    value = cells.largest_at_vertices(contact.ends, obstacle)
     held = collect(contact.ends[:, touching].ravel(), None) > 0
-    np.copyto(v, np.where(held, value, np.maximum(v, value)), where=count > 0)
+    np.copyto(v, np.where(held, value, np.maximum(v, value)), where=value > -np.inf)
     ends = fixed.ends.ravel()
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ravel()) / np.maximum(count, 1.0), where=count > 0)
@@ -317,12 +316,7 @@ def _solved(
         v at the vertices, the heights, and the cusps.
     """
     (v, bumps), (loose, free), (obstacle, middle) = start, loosened, alpha
-    ends = contact.ends.ravel()
-    total, count = (
-        cells.share(np.bincount(ends, values, minlength=len(v)).astype(np.float64), 0)
-        for values in (obstacle.ravel(), None)
-    )
-    floor = np.where(loose & (count > 0), total / np.maximum(count, 1.0), -np.inf)
+    floor = np.where(loose, cells.largest_at_vertices(contact.ends, obstacle), -np.inf)
     cusps: Cusps | None = None
     best = v, bumps, cusps
     slopes = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)

@@ -37,6 +37,7 @@ class Flux:
         steepness: ‖∇u_h‖²_T, shape (cells,).
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
         taken_up: Whether c takes up what is left.
+        shed: ∫_F (g − b u_h − y·n) for b to take up, in the order of `Known`; None for nothing.
     """
 
     excess: FloatArray
@@ -46,6 +47,7 @@ class Flux:
     steepness: FloatArray
     beyond: Beyond | None = None
     taken_up: bool = False
+    shed: FloatArray | None = None
 
 
 def equilibrate(
@@ -109,59 +111,80 @@ def equilibrate(
     return Flux(excess, contact, touching, left, steepness)
 
 
-def relax(cells: Cells, kappa: FloatArray, flux: Flux, reaction: float, steps: int) -> bool:
+def relax(
+    cells: Cells, kappa: FloatArray, flux: Flux, reaction: float, edge: Known, on_contact: Side
+) -> bool:
     """Bring y nearer to κ∇u_h where c can take up what it then lacks; collective.
 
     With f + div y = left_T/|T| on T instead of 0 the bound has ‖c^{-1/2} left_T/|T|‖_T more, and
-    where c h_T² is larger than κ that is less than what ‖κ^{-1/2}(y − κ∇u_h)‖_T falls by. Their
-    squares' sum is minimised by conjugate gradients in the fluxes through inner facets and Γ0.
+    where c h_T² is larger than κ that is less than what ‖κ^{-1/2}(y − κ∇u_h)‖_T falls by. So it is
+    with b, g − b u_h − y·n and ‖b^{-1/2} ·‖_F. The squares' sum is minimised by conjugate gradients
+    in the fluxes through facets inside, on Γ0, with a b and in contact; forces that come out below
+    0 are 0.
 
     Args:
         cells: The mesh.
         kappa: Mean of κ, shape (cells,) or ().
         flux: y, changed in place.
         reaction: c.
-        steps: How many steps.
+        edge: Integrals of g − b u_h.
+        on_contact: The facets of Γ1.
 
     Returns:
-        Whether it was called for, and c is to take up all that is left.
+        Whether it was called for, and c and b are to take up all that is left.
     """
     ratio = float((reaction * cells.diameter2 / kappa).max(initial=0.0)) if reaction else 0.0
     if cells.tdim != 2 or cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
         return False
-    held = cells.exterior.astype(np.float64)
+    held, lossy = cells.exterior.astype(np.float64), np.zeros(len(cells.exterior))
     for part in cells.fixed:
-        held[cells.sides[part].dofs] = 1.0 if part in cells.sinks else 0.0
+        held[cells.sides[part].dofs] = 0.0
+    lossy[edge.side.dofs] = edge.loss
+    held[on_contact.dofs] = ~flux.touching & (lossy[on_contact.dofs] == 0.0)
+    lossy[on_contact.dofs[flux.touching]] = 0.0
+    sides = edge.side.local, edge.side.cells
+    loss = lossy[edge.side.dofs] * measures(cells, edge.side)
+    of_edge = np.divide(1.0, loss, out=np.zeros_like(loss), where=loss > 0.0)
     free = cells.share(held) == 0.0
     owned, weight = slice(cells.owned_facets()), 1.0 / (reaction * cells.volume)
     # a flux counts as positive out of one of the facet's two cells, the same on all ranks
     sign = cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]])
 
-    def slopes(P: FloatArray, left: FloatArray) -> FloatArray:
-        return sign * (_field_slopes(cells, P) / kappa + weight * left)
+    def slopes(P: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
+        local = _field_slopes(cells, P) / kappa + weight * left
+        np.add.at(local, sides, of_edge * shed)
+        return sign * local
 
     def assembled(local: FloatArray) -> FloatArray:
         return np.where(free, cells.over_facets(local), 0.0)
 
     units = np.eye(3)[:, :, None] * np.ones(cells.number)
     scale = np.stack([field_squares(cells, unit) for unit in units]) / kappa + weight
+    np.add.at(scale, sides, of_edge)
     scale = cells.over_facets(scale)
     scale[scale == 0.0] = 1.0  # no cell of this rank has the facet
-    down, before = -assembled(slopes(flux.excess, flux.left)), np.inf
+    down = -assembled(slopes(flux.excess, flux.left, np.zeros_like(loss)))
     change, way = np.zeros_like(down), np.zeros_like(down)
-    for _ in range(steps):
+    before = first = np.inf
+    for _ in range(STEPS):
         straight = down / scale
         now = float(cells.total(down[owned] @ straight[owned])[0])
-        if not now > 0.0:
+        first = min(first, now)
+        if not now > RELAXED * first:
             break
         way = straight + now / before * way
         fluxes = sign * way[cells.facets]
-        image = assembled(slopes(fluxes, sum_rows(fluxes)))
+        image = assembled(slopes(fluxes, sum_rows(fluxes), fluxes[sides]))
         step = now / float(cells.total(way[owned] @ image[owned])[0])
         change += step * way
         down -= step * image
         before = now
     fluxes = sign * change[cells.facets]
+    there = on_contact.local[flux.touching], on_contact.cells[flux.touching]
+    force = np.maximum(flux.contact[flux.touching] + fluxes[there], 0.0)
+    fluxes[there] = force - flux.contact[flux.touching]
+    flux.contact[flux.touching] = force
+    flux.shed = np.where(loss > 0.0, -fluxes[sides], 0.0)
     flux.excess += fluxes
     flux.left += sum_rows(fluxes)
     return True
@@ -259,6 +282,8 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
 
 STRONG = 3.0
 """c h_T²/κ from which on c takes up what y lacks."""
+RELAXED = 1e-8
+"""Part of the way, squared, at which the flux is good enough that need not balance the load."""
 STEPS = 30
 """Of conjugate gradients, for a small field of given divergence."""
 WORTH = 1e-3

@@ -214,7 +214,7 @@ def integrate_edge(
     jump = on_facet(cells, side, edge.hats, v.vertices, v.bumps)
     jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, side, w))
     if edge.loss.any():
-        _add_loss(cells, w, edge, jump, sums)
+        _add_loss(cells, w, edge, flux, jump, sums)
     if d != 2:
         return sums.neumann
     if flux.beyond is not None:
@@ -262,13 +262,16 @@ def integrate_edge(
     return 0.0
 
 
-def _add_loss(cells: Cells, w: FloatArray, edge: Segments, jump: FloatArray, sums: Sums) -> None:
+def _add_loss(
+    cells: Cells, w: FloatArray, edge: Segments, flux: Flux, jump: FloatArray, sums: Sums
+) -> None:
     """Add b‖v − u_h‖²_F, and ‖q − g_F‖²_F/b where b takes that up.
 
     Args:
         cells: The mesh.
         w: u_h at the cells' vertices, shape (d + 1, cells).
         edge: Values of g − b u_h.
+        flux: y.
         jump: v − u_h at its points, shape (q, n).
         sums: What to add to.
     """
@@ -283,6 +286,12 @@ def _add_loss(cells: Cells, w: FloatArray, edge: Segments, jump: FloatArray, sum
     sums.energy_slack += EPS * size
     sums.companion += float(np.sum(apart))
     given = np.where(edge.given, edge.squares / np.maximum(edge.loss, 1e-300), 0.0)
+    if flux.shed is not None:
+        n = len(edge.loss)
+        area = np.bincount(edge.place, edge.measure, minlength=n)
+        given += flux.shed**2 / (np.maximum(edge.loss, 1e-300) * area)
+        means = np.bincount(edge.place, edge.measure * (edge.weights @ jump), minlength=n) / area
+        sums.load_companion += float(flux.shed @ means)
     sums.load += float(np.sum(given))
     for at, amounts in ((edge.side.cells, apart), (edge.facets.cells, given)):
         np.add.at(sums.indicators, at, amounts)

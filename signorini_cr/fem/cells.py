@@ -14,11 +14,12 @@ from types import MappingProxyType
 
 import numpy as np
 from dolfinx import fem, la
+from petsc4py import PETSc
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import DIRICHLET, Domain
-from .space import facet_entities, shared_sum
+from .space import facet_entities, ghosted, shared_sum
 
 BLOCK = 1 << 14
 """Cells that are worked on at a time: as many as the processor's cache holds."""
@@ -260,6 +261,26 @@ class Cells:
         topology = self.domain.mesh.topology
         index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
         return shared_sum(self.comm, index_map, values)
+
+    def largest_at_vertices(self, ends: IndexArray, values: FloatArray) -> FloatArray:
+        """The largest value that facets of any rank give each vertex, ghosts included; collective.
+
+        Args:
+            ends: The facets' vertices, shape (d, n).
+            values: One for each, shape (d, n).
+
+        Returns:
+            −∞ where there is no facet.
+        """
+        index_map = self.domain.mesh.topology.index_map(0)
+        found: FloatArray = np.full(index_map.size_local + index_map.num_ghosts, -np.inf)
+        np.maximum.at(found, ends, values)
+        if self.comm.size > 1:
+            vector = ghosted(self.comm, index_map, found)
+            vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
+            vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+            vector.destroy()
+        return found
 
     @cached_property
     def between(self) -> IndexArray:
