@@ -72,7 +72,7 @@ class Load:
         total = sum_rows(w)
         middle = total / k
         hats = (w - middle) / (k * (k + 1))  # means of (w − w_T) λ_i
-        variance = dot_rows(w, hats)
+        variance = dot_rows(w - middle, hats)
         rows = [*hats, *((total / 45.0 - w / 15.0) if k == 3 else np.zeros_like(w))]
         if self.hats is None or self.bumps is None or self.variance is None:
             return Load(self.mean - c * middle, -c * np.stack(rows), c**2 * variance)

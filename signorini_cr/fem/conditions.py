@@ -54,6 +54,7 @@ class Condition:
         label: What its main datum is called, for messages: a key of a problem file.
         source: What that is from: the same, or "exact.u".
         uncertified: Why no certificate covers it; None where one does.
+        optional: Whether the main datum may be None, for what follows from an exact solution, or 0.
     """
 
     part: str = ""
@@ -61,6 +62,7 @@ class Condition:
     label: str = ""
     source: str = ""
     uncertified: ClassVar[str | None] = None
+    optional: ClassVar[bool] = True
 
     def made(self, given: Given, part: str, number: int, label: str) -> Self:
         """Make it from expressions, for a part of the boundary.
@@ -71,12 +73,13 @@ class Condition:
             number: Its value in the facet tags.
             label: What the main datum is called.
         """
-        own = {name: getattr(self, name) for name in self.names()}
-        expressions = {
-            name: given.expression(0.0 if value is None else value) for name, value in own.items()
-        }
         source, main = label, self.names()[0]
-        if own[main] is None and (derived := self._derived(given, expressions)) is not None:
+        left_out = self.main is None and self.optional
+        own = {name: getattr(self, name) for name in self.names()} | (
+            {main: 0.0} if left_out else {}
+        )
+        expressions = {name: given.expression(value) for name, value in own.items()}
+        if left_out and (derived := self._derived(given, expressions)) is not None:
             expressions[main], source = derived, "exact.u"
         return replace(self, part=part, number=number, label=label, source=source, **expressions)
 
@@ -98,9 +101,8 @@ class Condition:
     @property
     def data(self) -> dict[str, Any]:
         """All its data by what they are called in messages."""
-        section = self.label.rsplit(".", 1)[0]
         first, *others = self.names()
-        called = {first: self.label, **{name: f"{section}.{name}" for name in others}}
+        called = {first: self.label, **{name: f"boundary.{self.part}.{name}" for name in others}}
         return {called[name]: getattr(self, name) for name in self.names()}
 
     @property
@@ -204,6 +206,7 @@ class Contact(Condition):
         g: A flux into the domain that does not come from the obstacle.
     """
 
+    optional = False
     obstacle: Data = 0.0
     coefficient: Data = field(default=0.0, kw_only=True)
     external: Data = field(default=0.0, kw_only=True)
