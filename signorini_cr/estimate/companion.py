@@ -406,16 +406,18 @@ def _sweep(
     lost[masses.side.dofs] = 0.4 * masses.loss
 
     def image_of(height: FloatArray, part: slice | IndexArray) -> FloatArray:
-        """The matrix of E times heights of local bumps, but for facets with a b."""
-        across = _across(cells, height, part)
-        across *= 2.0 * pick(kappa, part)
+        """The matrix of E times heights of local bumps, which are lost; facets with a b excepted."""
+        image = _across(cells, height, part)
+        image *= 2.0 * pick(kappa, part)
         if c:
-            across += c * cells.volume[part] / 15.0 * sum_rows(height)
-        return diagonal[part] * height + across
+            image += c * cells.volume[part] / 15.0 * sum_rows(height)
+        height *= diagonal[part]
+        image += height
+        return image
 
     near = np.unique(np.concatenate([side.cells for side in (*bumped, masses.side)]))
     flow, height = slope[:, near], bumps[cells.facets[:, near]]
-    change = image_of(height, near)
+    change = image_of(height.copy(), near)
     slope[:, near] = flow - change
     energy -= 4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
     on_lossy = bumps[masses.side.dofs]
