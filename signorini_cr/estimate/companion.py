@@ -406,7 +406,7 @@ def _sweep(
     lost[masses.side.dofs] = 0.4 * masses.loss
 
     def image_of(height: FloatArray, part: slice | IndexArray) -> FloatArray:
-        """The matrix of E times heights of local bumps, which are lost; facets with a b excepted."""
+        """The matrix of E, but for b, times heights of local bumps, which are lost."""
         image = _across(cells, height, part)
         image *= 2.0 * pick(kappa, part)
         if c:
