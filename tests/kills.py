@@ -165,7 +165,8 @@ def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
         faults.append(f"process {pid} is still there: {what}")
         os.kill(pid, signal.SIGKILL)
     said = run.communicate(timeout=30)[0]
-    if number == signal.SIGINT and target != "mpirun" and "Traceback" in said and own:
+    begun = "cli.py" in said  # before that it is Python that is interrupted
+    if number == signal.SIGINT and target != "mpirun" and "Traceback" in said and own and begun:
         faults.append(f"traceback: {said[-600:]}")
     levels, more_faults = _left(out)
     if max(levels, 0) < done:

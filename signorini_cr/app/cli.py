@@ -88,21 +88,17 @@ def _interruptible() -> Iterator[list[int]]:
             latest = time.monotonic()
             raise KeyboardInterrupt
 
-    usual: dict[signal.Signals, Any] = {
-        signal.SIGINT: signal.default_int_handler,
-        signal.SIGTERM: signal.SIG_DFL,
-    }
-    ours = []
+    found: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():  # others can't be interrupted
         # not where it is ignored, as in the background
-        ours = [each for each, handler in usual.items() if signal.getsignal(each) == handler]
-    for each in ours:
-        signal.signal(each, ask)
+        for each in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(each) in (signal.default_int_handler, signal.SIG_DFL):
+                found[each] = signal.signal(each, ask)
     try:
         yield asked
     finally:
-        for each in ours:
-            signal.signal(each, usual[each])
+        for each, handler in found.items():
+            signal.signal(each, handler)
 
 
 def _importing(frame: FrameType | None) -> bool:

@@ -221,7 +221,10 @@ def test_a_rank_without_the_others_does_not_solve_alone(tmp_path: Path, monkeypa
 def test_a_signal_waits_for_an_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library that is being loaded is loaded; then the run ends."""
     (tmp_path / "told_while_loading.py").write_text(
-        "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(0.2)\nloaded = 1\n"
+        "import os, signal, time\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+        "time.sleep(0.2)\n"
+        "loaded = 1\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     with cli._interruptible() as asked:
