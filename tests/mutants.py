@@ -50,6 +50,8 @@ NAMES = {"min": "max", "minimum": "maximum", "any": "all", "low": "high"}
 NAMES |= {new: old for old, new in NAMES.items()}
 ELSEWHERE = ("scatter_forward()", "destroy()")
 """What only other ranks or the memory would notice is not dropped."""
+OTHERS = "comm.size > 1"
+"""What is done on this condition is left alone: here there is one rank, on which it is not run."""
 Mutant = tuple[int, str, Callable[[], None]]
 """Line, what is changed, and the change."""
 
@@ -59,6 +61,8 @@ def mutants(node: ast.AST) -> Iterator[Mutant]:
     yield from _of_node(node)
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list"):
+            continue
+        if field == "body" and isinstance(node, ast.If) and _text(node.test).endswith(OTHERS):
             continue
         for i, child in enumerate(value if isinstance(value, list) else [value]):
             if isinstance(child, ast.expr | ast.stmt):
