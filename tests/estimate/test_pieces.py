@@ -1061,3 +1061,26 @@ def test_what_oscillates_on_thin_cells():
     thirds = np.abs(v.thirds[cells.facets]).sum(axis=0)
     slack = np.sum(np.sqrt(cells.volume * load.rest) * thirds * np.sqrt(cells.volume / 840))
     assert np.isclose(sums.energy_slack, slack)
+
+
+@pytest.mark.serial
+def test_what_oscillates_on_the_edges_of_thin_cells():
+    """As within cells."""
+    g = lambda x: ufl.sin(4 * x[1]) + x[0]  # noqa: E731
+    sides = ("contact", "neumann", "neumann", "dirichlet")
+    level = solve(Problem(f=1.0, g=g), square(2, sides, MPI.COMM_SELF)).level
+    data = diffusion(level.data)
+    cells, rng, kappa, sums = some_cells(16)
+    edge = Segments.of(data.edges[0], data.cells, kappa.low, 1.0)
+    before = {name: getattr(sums, name).copy() for name in ("indicators", "middle", "across")}
+    fluxes = SimpleNamespace(beyond=Beyond(np.zeros(len(cells.exterior)), None))
+    found = gap.integrate_edge(data.cells, kappa, None, None, edge, fluxes, None, sums)
+    at, sizes = edge.oscillation(True)
+    assert found == 0.0 and len(at) == 4 and sizes.min() > 1e-3
+    norms = np.zeros(cells.number)
+    norms[at] = sizes / np.sqrt(kappa.low[at])
+    assert np.isclose(sums.neumann, np.sum(norms**2)) and sums.load == sums.neumann
+    assert np.allclose(sums.indicators, before["indicators"] + norms**2)
+    for name, more in (("middle", sums.near), ("across", sums.far)):
+        assert np.allclose(getattr(sums, name), (np.sqrt(before[name]) + norms) ** 2)
+        assert np.isclose(more, np.sum(2 * np.sqrt(before[name]) * norms))
