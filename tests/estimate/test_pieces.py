@@ -1085,3 +1085,21 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     for name, more in (("middle", sums.near), ("across", sums.far)):
         assert np.allclose(getattr(sums, name), (np.sqrt(before[name]) + norms) ** 2)
         assert np.isclose(more, np.sum(2 * np.sqrt(before[name]) * norms))
+
+
+@pytest.mark.serial
+def test_no_round_leaves_v_below_the_obstacle():
+    """A bump that one round holds there is raised where the next lowers its facet's ends."""
+    sides = ("contact", "dirichlet", "neumann", "dirichlet")
+    problem = Problem(
+        f=-14.3,
+        obstacle=lambda x: 0.282 * ufl.cos(19.04 * x[0]) - 0.292,
+        coefficient=lambda x: ufl.conditional((x[0] - 0.5) * (x[1] - 0.5) > 0, 24.4, 1.0),
+    )
+    solution = solve(problem, square(4, sides, MPI.COMM_SELF))
+    made = certificate.certify(solution)._made
+    data = diffusion(solution.level.data)
+    alpha = data.alpha[0].seen_from(data.cells)
+    side = alpha.side(data.cells)
+    lowest = companion._lowest(made.vertices[side.ends], alpha.ends, alpha.middle)
+    assert np.all(made.bumps[side.dofs] >= lowest - 1e-12)
