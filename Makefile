@@ -6,7 +6,7 @@ limit = timeout --kill-after=20 1500
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz docs quick test test-alone test-pair coverage mutants ranks readers \
+.PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair coverage mutants ranks readers \
     test-package test-wheels lint types clean purge
 
 demo:
@@ -25,6 +25,10 @@ verify:
 fuzz:
 	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --files 20000 --problems 3000
 	$(run) python3 tests/mesh_mutations.py --count 5000
+
+# A thousand solves, refinements, certificates and pictures in one process: does memory grow?
+endurance:
+	$(run) python3 tests/endurance.py
 
 # The site, from docs/ and the docstrings: docs/_build/index.html
 docs:

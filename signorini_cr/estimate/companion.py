@@ -326,7 +326,8 @@ def _solved(
         v, bumps, free = np.maximum(v + step[0], floor), bumps + step[1], free.copy()
         lowest = _lowest(v[contact.ends], obstacle, middle)
         low = free[contact.dofs] & (bumps[contact.dofs] <= lowest)
-        bumps[contact.dofs[low]] = lowest[low]
+        # also where they are held since an earlier round: the facet's ends may have come down
+        bumps[contact.dofs] = np.maximum(bumps[contact.dofs], lowest)
         free[contact.dofs[low]] = False
         down = loose & (v <= floor)
         loose = loose & ~down

@@ -211,10 +211,8 @@ def integrate_edge(
     assert sums.middle is not None and sums.across is not None
     sums.indicators[at] += sizes**2 / low
     sums.neumann = float(np.sum(sizes**2 / low))
-    jump = on_facet(cells, side, edge.hats, v.vertices, v.bumps)
-    jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, side, w))
     if edge.loss.any():
-        _add_loss(cells, w, edge, flux, jump, sums)
+        _add_loss(cells, w, edge, flux, _apart(cells, w, edge, v), sums)
     if d != 2:
         return sums.neumann
     if flux.beyond is not None:
@@ -238,6 +236,7 @@ def integrate_edge(
         row[at] += more
     ends = cells.others[side.local].T, side.cells
     weights = edge.measure * edge.weights[:, None] * edge.rest
+    jump = _apart(cells, w, edge, v)
     sums.load_companion += float(np.sum(weights * jump))
     # The potential of y − κ_T∇u_h, as in _against_potential
     P = flux.excess[:, side.cells]
@@ -260,6 +259,13 @@ def integrate_edge(
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
     return 0.0
+
+
+def _apart(cells: Cells, w: FloatArray, edge: Segments, v: Companion) -> FloatArray:
+    """v − u_h at the points of facets, shape (q, n)."""
+    jump = on_facet(cells, edge.side, edge.hats, v.vertices, v.bumps)
+    jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
+    return jump
 
 
 def _add_loss(

@@ -101,7 +101,7 @@ class Stiffness:
         self._kind = self._classes(grid.operator.diagonal)
         self.number = self._kinds * LEVELS
         self.bounded, self.least = LEVELS * self._kind, np.zeros(self.number)
-        self._window = _windows(grid)
+        self._window: IndexArray | None = None
         self._differences: PETSc.Mat | None = None
         if row_sums is not None and self._kinds > 1:
             self._free, self._class = free, self._classes(entries)
@@ -121,6 +121,8 @@ class Stiffness:
             x: The iterate.
             b: Right-hand side.
         """
+        if self._window is None:
+            self._window = _windows(self._grid)
         made_of = self._grid.operator.flows(x, b)
         around: FloatArray = np.zeros(WINDOWS**3)
         np.maximum.at(around, self._window, made_of)

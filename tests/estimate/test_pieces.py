@@ -14,7 +14,7 @@ from signorini_cr import Polygon, Problem, solve, solve_levels
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
 from signorini_cr.data.moments import OnParts
-from signorini_cr.estimate import certificate, companion, cubic, flux, gap
+from signorini_cr.estimate import certificate, companion, cubic, flux, gap, lifting, shapes
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
@@ -119,18 +119,19 @@ def test_norms_of_liftings(obstacle, cubic):
 @pytest.mark.parametrize("off", [0.01, -0.01])
 @pytest.mark.parametrize("end", [0, 1])
 def test_jumps_at_ends_have_no_lifting(obstacle, off, end):
-    """Data above v at one end only; below it, an obstacle needs none."""
+    """Data above v at one end of one facet; below it, an obstacle needs none."""
     level = solve(Problem(f=-1.0, dirichlet=wave, obstacle=wave), square(3)).level
     data = diffusion(level.data)
     cells, (sampled,) = data.cells, data.alpha if obstacle else data.u_D
     found = sampled.seen_from(cells)
     side = found.side(cells)
     height, zero = found.middle - found.ends.mean(axis=0), np.zeros(len(side.cells))
-    ends = found.ends.copy()
-    ends[end] -= off
-    base = Cubic(ends, height, zero)
-    bound = lift(cells, side, found.trace, base, base, 1.0, 1e-3, obstacle)
-    assert (bound.reason is None) == ((obstacle and off < 0) or not len(zero))
+    for i in range(WORLD.allreduce(len(zero), op=MPI.MAX)):
+        ends = found.ends.copy()
+        ends[end, i : i + 1] -= off
+        base = Cubic(ends, height, zero)
+        bound = lift(cells, side, found.trace, base, base, 1.0, 1e-3, obstacle)
+        assert (bound.reason is None) == ((obstacle and off < 0) or i >= len(zero))
 
 
 def test_an_obstacle_below_needs_no_lifting():
@@ -143,6 +144,130 @@ def test_an_obstacle_below_needs_no_lifting():
     above = Cubic(base.ends + 0.1, base.height, zero)
     bound = lift(data.cells, side, found.trace, base, above, 1.0, 1e-3, True)
     assert not bound.steep.any() and not bound.area.any() and not bound.beyond.any()
+    # nor one that jumps down there
+    base.ends[0] -= 0.01
+    bound = lift(data.cells, side, found.trace, base, above, 1.0, 1e-3, True)
+    assert bound.reason is None and not bound.steep.any()
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("obstacle", [False, True])
+def test_what_jumps_beyond_a_facet_has_a_lifting(obstacle):
+    """And what is rough on a single facet has none."""
+
+    def lifted(f):
+        problem = Problem(f=-1.0, dirichlet=0.0 if obstacle else f, obstacle=f if obstacle else -9)
+        domain = square(3, comm=MPI.COMM_SELF)
+        data = diffusion(solve(problem, domain).level.data)
+        found = (data.alpha if obstacle else data.u_D)[0].seen_from(data.cells)
+        side = found.side(data.cells)
+        base = Cubic(found.ends, found.middle - found.ends.mean(axis=0), np.zeros(len(side.cells)))
+        return lift(data.cells, side, found.trace, base, base, 1.0, 1e-3, obstacle)
+
+    def outside(x):
+        beyond = ufl.Or(ufl.lt(x[0], -1e-10), ufl.gt(x[0], 1 + 1e-10))
+        return ufl.conditional(beyond, 1.0, -1 + x[0] ** 3 / 9)
+
+    assert lifted(outside).reason is None
+    rough = lifted(lambda x: -1 + abs(x[0] - 0.55) ** 0.5)
+    assert "not known to be bounded" in rough.reason
+    assert np.isfinite(rough.steep).any() and not np.isfinite(rough.steep).all()
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("signed", [False, True])
+def test_bounds_by_taylors_formula(signed, monkeypatch):
+    """The best of all that what is known of the data's derivatives says, on each piece."""
+    rng, n = np.random.default_rng(12), 600
+    base, length = Cubic(rng.normal(size=(2, n)), *rng.normal(size=(2, n))), rng.uniform(0.5, 2, n)
+    a, b = np.sort(rng.uniform(size=(2, n)), axis=0)
+    e = length * (b - a) / 2
+    s = (a + b) / 2
+    of_s = [
+        base.ends[0],
+        base.ends[1] - base.ends[0] + 4 * base.height + base.third,
+        -4 * base.height - 3 * base.third,
+        2 * base.third,
+    ]  # coefficients of powers of s
+    q = [
+        of_s[0] + of_s[1] * s + of_s[2] * s**2 + of_s[3] * s**3,
+        (of_s[1] + 2 * of_s[2] * s + 3 * of_s[3] * s**2) / length,
+        (of_s[2] + 3 * of_s[3] * s) / length**2,
+        of_s[3] / length**3,
+    ]
+    at_ends = [of_s[0] + of_s[1] * t + of_s[2] * t**2 + of_s[3] * t**3 for t in (a, b)]
+
+    def some(spread):
+        """Coefficients around those of the cubic, of many sizes, and their radii."""
+        off, rad = (10 ** rng.uniform(-4, spread, size=(2, 4, n))) * rng.uniform(size=(2, 4, n))
+        mid = np.array(q) + np.where(rng.uniform(size=(4, n)) < 0.5, off, -off)
+        rad[1:][rng.uniform(size=(3, n)) < 0.1] = np.nan
+        return mid, rad
+
+    (c, c_rad), (m, m_rad) = some(2), some(0)
+    c_rad[1:, :9] = m_rad[1:, :9] = np.nan
+    low, high = c[0] - c_rad[0], c[0] + c_rad[0]
+    inner = m[0] - m_rad[0], m[0] + m_rad[0]
+    jets = {
+        name: SimpleNamespace(low=ends[0], high=ends[1], rest=SimpleNamespace(on=lambda _, r=r: r))
+        for name, ends, r in (
+            ("over", (low, high), (c[1:], c_rad[1:])),
+            ("there", inner, (m[1:], m_rad[1:])),
+        )
+    }
+    monkeypatch.setattr(lifting, "Enclosure", lambda where: lambda _: jets[where])
+    pieces = SimpleNamespace(
+        boxes=lambda *_, decide: "over",
+        points=lambda *_: "there",
+        parent=np.arange(n),
+        hats=np.stack([np.stack([1 - t, t]) for t in (a, b)]),
+        part=b - a,
+    )
+    trace, scale = SimpleNamespace(deviation=SimpleNamespace(expression=None)), 100.0
+    found = lifting._bounds(trace, pieces, base, None, length, scale, signed)
+    least = np.stack(
+        [
+            low,
+            m[0] - m_rad[0] - e * c_rad[1] / 2,
+            m[0] - m_rad[0] + e**2 / 3 * (c[2] - c_rad[2]),
+            m[0] - m_rad[0]
+            + e**2 / 3 * (m[2] - m_rad[2])
+            - e**3 / 4 * (np.abs(c[3]) + c_rad[3]),
+        ]
+    )  # fmt: skip
+    cube = np.abs(q[3])
+    from_middle = np.abs(m[1] - q[1]) + m_rad[1]
+    steep = np.stack(
+        [
+            np.abs(c[1] - q[1]) + c_rad[1] + 2 * e * np.abs(q[2]) + 3 * e**2 * cube,
+            from_middle + 2 * e * (np.abs(c[2] - q[2]) + c_rad[2] + 3 * e * cube),
+            from_middle
+            + 2 * e * (np.abs(m[2] - q[2]) + m_rad[2])
+            + 3 * e**2 * (np.abs(c[3] - q[3]) + c_rad[3]),
+        ]
+    )
+    for rows, better in ((least, np.nanargmax), (-steep, np.nanargmax)):
+        known = np.isfinite(rows).any(axis=0)
+        best = np.bincount(better(rows[:, known], axis=0))
+        assert len(best) == len(rows) and best.min() > 20
+    best = np.where(np.isnan(steep).all(axis=0), np.inf, np.fmin.reduce(steep))
+    swing = np.abs(q[2]) * e**2 + cube * e**3
+    above = high - np.min([*at_ends, q[0]], axis=0) + swing
+    below = np.max([*at_ends, q[0]], axis=0) - low + swing
+    if signed:
+        by_range, by_middle = above, m[0] - q[0] + m_rad[0] + e * best
+    else:
+        by_range = np.maximum(above, below)
+        by_middle = np.abs(m[0] - q[0]) + m_rad[0] + e * best
+    assert 20 < np.sum(by_range < by_middle) < n - 20
+    assert np.allclose(found[0], np.minimum(by_range, by_middle), rtol=1e-9, atol=1e-12)
+    assert np.isinf(best[:9]).all() and np.allclose(found[1], best, rtol=1e-9)
+    assert np.allclose(found[2], np.fmax.reduce(least), rtol=1e-9)
+    # What is no more than rounding counts as nothing
+    found = lifting._bounds(trace, pieces, base, None, length, 1e14, signed)
+    assert np.array_equal(found[1, :9], np.full(9, np.inf if signed else 0.0))
+    if not signed:
+        assert np.array_equal(found[0] == 0.0, np.isinf(best))
 
 
 # ---- cusps
@@ -454,17 +579,17 @@ def test_rounding():
         of_hats = -2 * cells.stiffness.sum(axis=0)
         found = certificate._rounding(cells, kappa, c, w, load, none)
         expected = np.sqrt(np.sum((kappa.high * of_hats + c * cells.volume) * 9.0))
-        assert np.isclose(found, 64 * 2.0**-52 * expected)
+        assert np.isclose(found, 64 * 2.0**-52 * expected, atol=0.0)
     load = SimpleNamespace(mean=-np.ones(cells.number), variance=np.full(cells.number, 4.0))
     expected = cells.lengths.max(axis=0) * cells.volume * 9.0 / kappa.low
     found = certificate._rounding(cells, kappa, 5.0, 0 * w, load, none)
-    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()))
+    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
     heights = rng.normal(size=len(cells.exterior))
     load.mean[:], load.variance = 0.0, None
     fluxes = SimpleNamespace(beyond=Beyond(heights, None))
     expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.low
     found = certificate._rounding(cells, kappa, 5.0, 0 * w, load, fluxes)
-    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()))
+    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
 
 
 def test_size_of_the_bound():
@@ -574,6 +699,7 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
         squares = field_squares(cells, fluxes, slice(0, cells.number)) / kappa
         return WORLD.allreduce(squares.sum())
 
+    assert not flux._diffused(cells, 0 * left, kappa).any()
     smallest = flux._diffused(cells, left, kappa)
     assert np.allclose(smallest.sum(axis=0), -left, atol=1e-8)
     jumps, free = cells.over_facets(smallest), cells.exterior.copy()
@@ -624,7 +750,7 @@ def local_matrices(cells, matrix):
 
 
 @pytest.mark.serial
-def test_conjugate_gradients_for_heights():
+def test_conjugate_gradients_for_heights(monkeypatch):
     cells, rng, _, _ = some_cells(3)
     a = rng.normal(size=(3, 3, cells.number))
     matrix, pull = np.einsum("ikn,jkn->ijn", a, a), rng.normal(size=(3, cells.number))
@@ -633,8 +759,16 @@ def test_conjugate_gradients_for_heights():
     whole = local_matrices(cells, matrix)[np.ix_(free, free)]
     right = np.zeros(len(free))
     np.add.at(right, cells.facets, pull)
-    assert np.allclose(found[free], np.linalg.solve(whole, right[free]))
+    assert not best_heights(cells, matrix, 0 * pull, free).any()
+    truth = np.linalg.solve(whole, right[free])
+    assert np.allclose(found[free], truth)
     assert not found[~free].any()
+    # each way is conjugate to those before: a step for each height is enough
+    monkeypatch.setattr(shapes, "STEPS", np.sum(free))
+    matrix += 3 * np.eye(3)[:, :, None]
+    found = best_heights(cells, matrix, pull, free)
+    whole = local_matrices(cells, matrix)[np.ix_(free, free)]
+    assert np.allclose(found[free], np.linalg.solve(whole, right[free]))
 
 
 @pytest.mark.parametrize("kappa", [1.0, "random"])
@@ -784,7 +918,14 @@ def test_slack_of_quadrature(few):
 def test_a_line_about_a_certificate():
     found = certificate.Certificate(1.25, 1.5, 2.0, (-3.0, -2.5))
     assert repr(found) == "<Certificate: error at most 1.25, energy in [-3, -2.5]>"
-    assert repr(certificate.Certificate(reason="so")) == "<Certificate: no bound, so>"
+    for found in (
+        certificate.Certificate(reason="so"),
+        certificate.Certificate(1.25, reason="so"),
+        certificate.Certificate(energy=(-3.0, -2.5), reason="so"),
+    ):
+        assert repr(found) == "<Certificate: no bound, so>" and found.seconds == 0.0
+        assert found.flux is None and found.companion is None
+        assert found.companion_at_vertices is None
 
 
 @pytest.mark.serial
@@ -959,3 +1100,146 @@ def test_a_flux_that_need_not_balance_the_load(loss):
     assert WORLD.allreduce(least) < 0.9 * WORLD.allreduce(
         np.sum(field_squares(cells, excess) / kappa) + np.sum(left**2 / (c * cells.volume))
     )
+
+
+@pytest.mark.serial
+def test_bumps_that_touch_the_obstacle():
+    """v − α, a quadratic, is 0 at one point and nowhere less."""
+    rng = np.random.default_rng(13)
+    obstacle, middle = rng.normal(size=(2, 50)), rng.normal(size=50)
+    v = obstacle + rng.uniform(0, 1, size=(2, 50))
+    heights = companion._lowest(v, obstacle, middle)
+    s = np.linspace(0, 1, 20001)[:, None]
+    bump = 4 * s * (1 - s)
+    above = v[0] + s * (v[1] - v[0]) + bump * heights
+    alpha = obstacle[0] + s * (obstacle[1] - obstacle[0]) + bump * (middle - obstacle.mean(axis=0))
+    assert np.allclose((above - alpha).min(axis=0), 0.0, atol=1e-7)
+
+
+def test_size_of_what_v_is_compared_with(monkeypatch):
+    """The largest |v|, also where v is negative."""
+    scales, lift_ = [], companion._lift
+    monkeypatch.setattr(companion, "_lift", lambda *all_: scales.append(all_[5]) or lift_(*all_))
+    solution = solve(Problem(f=-1.0, dirichlet=-3.0, obstacle=-9.0), square(3))
+    v = certificate.certify(solution).companion_at_vertices
+    largest = WORLD.allreduce(np.abs(v).max(initial=0.0), op=MPI.MAX)
+    assert np.allclose(scales, largest) and len(scales) == 2
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("height", [-9.0, 0.0])
+def test_the_best_function_of_degree_two(height, monkeypatch):
+    """Nothing inside could be better, nor on Γ1 where v is above the obstacle.
+
+    Where it is not, what is raised in the last round is not made up for.
+    """
+    monkeypatch.setattr(companion.Cusps, "of", lambda *_: None)
+    domain = square(4, comm=MPI.COMM_SELF)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng = np.random.default_rng(14)
+    kappa, w = rng.uniform(1, 3, cells.number), rng.normal(size=(3, cells.number))
+    rim, contact = np.zeros(cells.vertices.max() + 1), cells.sides[1]
+    for number, side in cells.sides.items():
+        if number != 1:
+            rim[side.ends] = 1.0
+    loose, free = rim == 0.0, np.ones(len(cells.exterior), dtype=bool)
+    for number, side in cells.sides.items():
+        free[side.dofs] &= number == 1
+    alpha = np.full((2, len(contact.cells)), height), np.full(len(contact.cells), height)
+    start = np.zeros(len(rim)), np.zeros(len(free))
+    v, bumps, found = companion._solved(
+        cells, kappa, np.array(True), w, start, (loose, free), contact, alpha
+    )
+    assert found is None
+    after = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
+    before = Slopes.of(cells, kappa, -w, start[1])
+    assert after.energies.sum() < before.energies.sum()
+    pulls = cells.over_vertices(after.vertices), cells.over_facets(after.facets)
+    inside = loose.copy()
+    inside[contact.ends] = False
+    limit = (1e-6 if height < 0 else 0.05) * np.abs(before.vertices).max()
+    assert np.abs(pulls[0][inside]).max() < limit
+    assert np.abs(pulls[1][~cells.exterior]).max() < limit
+    lowest = companion._lowest(v[contact.ends], *alpha)
+    assert np.all(bumps[contact.dofs] >= lowest - 1e-12)
+    held = bumps[contact.dofs] <= lowest + 1e-12
+    assert held.any() == (height == 0.0)
+    assert np.abs(pulls[1][contact.dofs[~held]]).max() < limit
+
+
+@pytest.mark.serial
+def test_what_oscillates_on_thin_cells():
+    """σ for f and for g is known by its norm alone: ‖a‖ + ‖σ‖ is what ‖a + σ‖ may be."""
+    cells, rng, kappa, _ = some_cells(15)
+    number = cells.number
+    kappa.values = kappa.cut = None
+    excess, w = rng.normal(size=(2, 3, number))
+    v = companion.Companion(
+        None, rng.normal(size=len(cells.exterior)), rng.normal(size=(3, number)),
+        None, None, None, None, None, rng.normal(size=len(cells.exterior)),
+    )  # fmt: skip
+    fluxes = SimpleNamespace(excess=excess, beyond=Beyond(0 * v.bumps, None))
+    hats = rng.normal(size=(3, number))
+    load = SimpleNamespace(
+        mean=rng.normal(size=number), hats=hats - hats.mean(axis=0), bumps=0 * hats,
+        variance=rng.uniform(2, 3, number), rest=rng.uniform(1, 2, number),
+    )  # fmt: skip
+    sums = gap.integrate(cells, kappa, w, load, fluxes, v)
+    weights, points = quadrature()[1], quadrature()[0]
+    at = ((kappa.mean, weight, hat) for hat, weight in zip(points, weights, strict=True))
+    pp, bb, pb, *_ = gap._at_points(cells, kappa.mean, slice(0, number), fluxes, v, w, at)
+    norm = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702
+    norm = norm * np.sqrt(cells.volume * load.rest / kappa.low)
+    near, far = (np.sqrt(pp + bb + 2 * sign * pb) for sign in (1, -1))
+    assert np.allclose(sums.middle, (near + norm) ** 2)
+    assert np.allclose(sums.across, (far + norm) ** 2)
+    assert np.isclose(sums.near, np.sum(2 * near * norm))
+    assert np.isclose(sums.far, np.sum(2 * far * norm))
+    assert np.isclose(sums.load, np.sum(norm**2))
+    assert np.allclose(sums.indicators, pp + bb + norm**2)
+    assert sums.load_flux == sums.load_companion == sums.slack == 0.0
+    # ∫ c_F² = |T|/840
+    thirds = np.abs(v.thirds[cells.facets]).sum(axis=0)
+    slack = np.sum(np.sqrt(cells.volume * load.rest) * thirds * np.sqrt(cells.volume / 840))
+    assert np.isclose(sums.energy_slack, slack)
+
+
+@pytest.mark.serial
+def test_what_oscillates_on_the_edges_of_thin_cells():
+    """As within cells."""
+    g = lambda x: ufl.sin(4 * x[1]) + 5 * x[0] ** 3  # noqa: E731
+    sides = ("contact", "neumann", "neumann", "dirichlet")
+    level = solve(Problem(f=1.0, g=g), square(2, sides, MPI.COMM_SELF)).level
+    data = diffusion(level.data)
+    cells, _, kappa, sums = some_cells(16)
+    edge = Segments.of(data.edges[0], data.cells, kappa.low, 1.0)
+    before = {name: getattr(sums, name).copy() for name in ("indicators", "middle", "across")}
+    fluxes = SimpleNamespace(beyond=Beyond(np.zeros(len(cells.exterior)), None))
+    found = gap.integrate_edge(data.cells, kappa, None, None, edge, fluxes, None, sums)
+    at, sizes = edge.oscillation(True)
+    assert found == 0.0 and len(at) == 4 and sizes.min() > 1e-3
+    norms = np.zeros(cells.number)
+    norms[at] = sizes / np.sqrt(kappa.low[at])
+    assert np.isclose(sums.neumann, np.sum(norms**2)) and sums.load == sums.neumann
+    assert np.allclose(sums.indicators, before["indicators"] + norms**2)
+    for name, more in (("middle", sums.near), ("across", sums.far)):
+        assert np.allclose(getattr(sums, name), (np.sqrt(before[name]) + norms) ** 2)
+        assert np.isclose(more, np.sum(2 * np.sqrt(before[name]) * norms))
+
+
+@pytest.mark.serial
+def test_no_round_leaves_v_below_the_obstacle():
+    """A bump that one round holds there is raised where the next lowers its facet's ends."""
+    sides = ("contact", "dirichlet", "neumann", "dirichlet")
+    problem = Problem(
+        f=-14.3,
+        obstacle=lambda x: 0.282 * ufl.cos(19.04 * x[0]) - 0.292,
+        coefficient=lambda x: ufl.conditional((x[0] - 0.5) * (x[1] - 0.5) > 0, 24.4, 1.0),
+    )
+    solution = solve(problem, square(4, sides, MPI.COMM_SELF))
+    made = certificate.certify(solution)._made
+    data = diffusion(solution.level.data)
+    alpha = data.alpha[0].seen_from(data.cells)
+    side = alpha.side(data.cells)
+    lowest = companion._lowest(made.vertices[side.ends], alpha.ends, alpha.middle)
+    assert np.all(made.bumps[side.dofs] >= lowest - 1e-12)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx.la import InsertMode
 from dolfinx.mesh import compute_midpoints, create_box, exterior_facet_indices, meshtags
 from mpi4py import MPI
 
@@ -106,6 +107,9 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
     apart = y - k[:, None, None] * du[..., 0]
     steady = apart[:, 0] - slope[:, None] * np.moveaxis(x, 0, -1)[:, 0]
 
+    divergence = dy.trace(axis1=2, axis2=3) @ weights
+    assert np.allclose(divergence, -data(f, x) @ weights, rtol=1e-6, atol=1e-6)
+
     def potential(cells, x):
         square = 0.5 * slope[cells] * (x**2).sum(axis=0)
         return square + np.einsum("ni,inp->np", steady[cells[:, 0]], x)
@@ -137,11 +141,13 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
             where = at.points(hats)[:, cell][:, None]
             (u_F,), (y_F,), (v_F,) = (at(one, hats, [cell])[0] for one in fields)
             if part == CONTACT:
+                assert facet_weights @ (y_F @ normal) > -1e-9
                 above = v_F[:, 0] - data(obstacle, where)[0]
                 contact[cell] += measure * facet_weights @ ((y_F @ normal) * above)
                 force[cell] += measure * facet_weights @ (y_F @ normal)
             elif g is not None:
                 values = data(g, where)[0]
+                assert np.isclose(facet_weights @ (y_F @ normal - values), 0.0, atol=1e-6)
                 off = values - facet_weights @ values
                 c = poincare * at.h[cell]
                 c = np.sqrt(measure / at.volume[cell] * c * (c + 2 * at.h[cell] / d))
@@ -250,7 +256,7 @@ def again(solution, certificate, kappa=1.0, f=load, g=flow, obstacle=bowl, **mor
 
 
 @pytest.mark.parametrize(
-    "kappa, jitter", [(1.0, 0.2), (2.5, 0.2), (left, 0.0)], ids=["one", "constant", "jump"]
+    "kappa, jitter", [(1.0, 0.2), (0.4, 0.2), (left, 0.0)], ids=["one", "constant", "jump"]
 )
 def test_affine_data(kappa, jitter):
     heavy = lambda x: 6 * load(x)  # noqa: E731
@@ -304,6 +310,27 @@ def test_thin_cells(monkeypatch):
     assert certificate._made.beyond is not None and certificate._made.cusps is None
     found = again(solution, certificate, 2.0, *data.values(), -0.001, carried=True)
     agrees(certificate, found, 1e-6)
+    # No bump of ω that is free could bring y nearer to the middle
+    mesh, u = solution.domain.mesh, solution.u
+    W = fem.functionspace(mesh, ("Lagrange", 2))
+    curl = ufl.as_vector([(by := ufl.grad(ufl.TestFunction(W)))[1], -by[0]])
+    off = certificate.flux - ufl.grad(u + certificate.companion)  # half of κ = 2
+    pull = fem.assemble_vector(fem.form(ufl.inner(off, curl) * ufl.dx))
+    pull.scatter_reverse(InsertMode.add)
+    held = fem.Function(W)
+    for dim in (0, 1):  # ω is 0 at vertices, and given on Γ1 and Γg
+        mesh.topology.create_connectivity(dim, 2)
+        found = [solution.domain.tags.find(part) for part in (CONTACT, NEUMANN)]
+        vertices = np.arange(mesh.topology.index_map(0).size_local, dtype=np.int32)
+        entities = np.concatenate(found) if dim else vertices
+        held.x.array[fem.locate_dofs_topological(W, dim, entities)] = 1.0
+    held.x.scatter_reverse(InsertMode.add)
+    owned = slice(W.dofmap.index_map.size_local)
+    pull, free = np.abs(pull.array[owned]), held.x.array[owned] == 0.0
+    largest, scale = (
+        WORLD.allreduce(values.max(initial=0.0), op=MPI.MAX) for values in (pull[free], pull)
+    )
+    assert largest < 1e-6 * scale
 
 
 def test_data_that_are_not_affine_on_thin_cells(monkeypatch):
@@ -374,6 +401,26 @@ def test_what_a_solver_leaves_is_carried_away(noise):
     assert np.allclose(certificate.energy, found.energy, rtol=1e-7)
 
 
+def test_what_a_coarse_rule_misses_of_the_load_is_carried_by_the_flux():
+    """y has the means of f and g, whatever rule u_h was found with."""
+    data = {"f": lambda x: 3 * x[0] ** 2 - x[1] ** 3, "g": lambda x: 5 * x[1] ** 4}
+    solution = solve(Problem(**data, quadrature_degree=1), square())
+    known = module._equilibrated(solution, solution)
+    cells, flux, side = known.cells, known.flux, known.segments.side
+    mean = known.certain.load.mean
+    assert np.allclose(flux.left, flux.excess.sum(axis=0) + cells.volume * mean, atol=1e-12)
+    through = flux.excess - 2 * cells.apply(known.w, slice(0, cells.number))
+    (low, high) = (solution.domain.mesh.geometry.x[:, 1][i] for i in _nodes(cells, side))
+    expected = np.abs(high**5 - low**5)
+    assert np.allclose(through[side.local, side.cells], expected, rtol=1e-6)
+
+
+def _nodes(cells, side):
+    """The nodes at the ends of some facets."""
+    nodes = cell_nodes(cells.domain.mesh)
+    return nodes[side.cells[:, None], cells.others[side.local]].T
+
+
 @pytest.mark.parametrize("kappa", [2.0, left])
 def test_how_the_bound_is_put_together(kappa, monkeypatch):
     """With made-up shares of rounding, of liftings, of what is missed, of what a solver left."""
@@ -389,13 +436,32 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     }
     for name, value in made_up.items():
         monkeypatch.setattr(module, name, lambda *_, value=value: value)
+    quadrature = {"far": 0.02, "near": 0.03, "slack": 0.04, "energy_slack": 0.015}
+    integrate = module.integrate
+
+    def unsure(*arguments):
+        sums = integrate(*arguments)
+        for name, value in quadrature.items():
+            setattr(sums, name, getattr(sums, name) + share * value)
+        return sums
+
+    make = module._companion
+
+    def unknown_above(solution, base, known, sweeps):
+        """What is known of κ from above makes no difference to gradients."""
+        made = make(solution, base, known, sweeps)
+        known.kappa.high = 2 * known.kappa.high
+        return made
+
+    monkeypatch.setattr(module, "integrate", unsure)
+    monkeypatch.setattr(module, "_companion", unknown_above)
     solution = solve(Problem(f=-12.0, obstacle=bowl, coefficient=kappa), square(4, 0.0))
     certificate = certify(solution)
     found = again(solution, certificate, kappa, -12.0, 0.0)
     total, least = found.total, found.least
     loose = left_over + hidden + rounding
-    far = np.sqrt(total["far"] + lift_far) + loose
-    near = np.sqrt(total["near"] + lift_near) + rounding
+    far = np.sqrt(total["far"] + lift_far + 0.02 + 2 * 0.04) + loose
+    near = np.sqrt(total["near"] + lift_near + 0.03 + 2 * 0.04) + rounding
     rest = np.sqrt(far**2 / 4 + total["contact"])
     bound = near / 2 + loose / 2 + rest
     bound_h1 = np.sqrt(total["of_gradients"]) / 2
@@ -403,7 +469,7 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     assert np.isclose(certificate.bound_energy_norm, bound, rtol=1e-7)
     assert np.isclose(certificate.bound_h1, min(bound_h1, bound / np.sqrt(least)), rtol=1e-7)
     assert np.isclose(certificate.bound_companion, far / 2 + rest + np.sqrt(lift), rtol=1e-7)
-    slack = lift_energy + hidden_energy
+    slack = lift_energy + hidden_energy + 0.015
     slack += rounding * (2 * np.sqrt(total["steepness"]) + rounding)
     low = total["energy"] - slack - far**2 / 2 - total["contact"]
     assert np.allclose(certificate.energy, (low, total["energy"] + slack), rtol=1e-7)
