@@ -10,7 +10,7 @@ import pytest
 from helpers import DEMOS, is_picture, script, start
 from mpi4py import MPI
 
-from signorini_cr import InputError, exact, solve
+from signorini_cr import InputError, exact, solve, solve_adaptive
 from signorini_cr.output.errorplot import plot_error
 
 pytestmark = pytest.mark.slow
@@ -61,6 +61,19 @@ def test_the_first_demo_prints_a_row_a_level(studies):
 def test_demos_of_the_certificate(demo, pictures, shared_tmp_path):
     assert script(DEMOS / demo, shared_tmp_path, SIGNORINI_DEMO_LEVELS="3")[0] == 0
     assert {path.stem for path in shared_tmp_path.glob("*.png") if is_picture(path)} >= pictures
+
+
+def test_the_film_has_a_frame_a_mesh(shared_tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    assert script(DEMOS / "film.py", shared_tmp_path, SIGNORINI_DEMO_LEVELS="6")[0] == 0
+    if COMM.rank == 0:
+        path = shared_tmp_path / "adaptive.gif"
+        *_, last = meshes = list(solve_adaptive(exact.L.problem, exact.L.mesh(0.5, MPI.COMM_SELF),
+                                                max_dofs=500, fraction=0.3))  # fmt: skip
+        assert last.dofs <= 500
+        with image.open(path) as film:
+            assert film.n_frames == len(meshes)
+        assert path.stat().st_size < 1_000_000
 
 
 @pytest.mark.serial
