@@ -19,8 +19,11 @@ PICTURES = {
 }
 STYLE = (
     "body{font:16px/1.5 sans-serif;max-width:60rem;margin:auto;padding:0 1rem;color:#222}"
-    "img{max-width:100%;height:auto}pre,.wide{overflow-x:auto;background:#f4f4f4;padding:.5rem}"
+    "img{max-width:100%;height:auto}figure{margin:1rem 0}"
+    "pre,.wide{overflow-x:auto;background:#f4f4f4;padding:.5rem}"
+    "pre{white-space:pre-wrap;overflow-wrap:anywhere}"
     "table{border-collapse:collapse}td,th{padding:.1rem .5rem;text-align:right}"
+    "@media(max-width:30rem){pre{font-size:.75rem}table{font-size:.65rem}td,th{padding:.1rem}}"
 )
 
 
