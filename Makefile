@@ -12,9 +12,10 @@ readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvist
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
 
-# docs/studies.md with all its tables and pictures
+# docs/studies.md with all its tables and pictures, and the film of docs/tutorial.md
 studies:
 	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 demos docs
+	$(run) $(limit) mpirun -n 2 python3 demos/film.py docs
 
 # docs/verification.md: what the program claims, checked by other code; then the same on two ranks
 verify:

@@ -20,7 +20,7 @@
 
 # %%
 import numpy as np
-from study import Study, canvas, levels_wanted
+from study import Study, canvas, levels_wanted, name_curves
 
 from signorini_cr import Polygon, Problem, exact, plots, solve_adaptive, solve_levels
 from signorini_cr.output.errorplot import plot_error
@@ -100,21 +100,25 @@ def draw(axes):
     colours = dict(zip(CASES, (canvas.BLUE, canvas.RED, canvas.YELLOW), strict=True))
     for (name, kind), rows in curves.items():
         style = "o-" if kind == "adaptive" else "s--"
-        axes.loglog(*rows.T, style, color=colours[name], label=f"{name}, {kind}", markersize=5)
+        axes.loglog(*rows.T, style, color=colours[name], markersize=5)
     dofs = np.array([1e3, max_dofs])
-    axes.loglog(dofs, 0.6 * dofs**-0.5, ":", color="black", label="$N^{-1/2}$")
-    axes.loglog(dofs, 0.25 * dofs ** (-1 / 3), "-.", color="black", label="$N^{-1/3}$")
+    slopes = {"$N^{-1/2}$": 0.6 * dofs**-0.5, "$N^{-1/3}$": 0.25 * dofs ** (-1 / 3)}
+    for line in slopes.values():
+        axes.loglog(dofs, line, ":", color="black")
     axes.set_xlabel("number $N$ of degrees of freedom", fontsize=13)
     axes.set_ylabel(r"certified bound of $\|\nabla_h(u-u_h)\|$", fontsize=13)
     axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=10)
+    axes.set_title("Meshes that adapt do not mind corners", fontsize=14)
+    named = {f"{name}, {kind}": rows.T for (name, kind), rows in curves.items()}
+    named |= {power: (dofs, line) for power, line in slopes.items()}
+    name_curves(axes, named, [*(colours[name] for name, _ in curves), "black", "black"])
 
 
 study.picture(
     "adaptive-convergence.png",
     "Certified bounds on adaptive and on uniform meshes.",
     draw,
-    size=(8.0, 6.0),
+    size=(8.5, 6.0),
 )
 
 # %% [markdown]

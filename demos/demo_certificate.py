@@ -19,7 +19,7 @@
 # %%
 import numpy as np
 from petsc4py import PETSc
-from study import COLOURS, Study, canvas, levels_wanted
+from study import COLOURS, Study, canvas, levels_wanted, name_curves
 
 from signorini_cr import exact, solve, solve_adaptive, solve_levels
 
@@ -84,28 +84,38 @@ for name in ("snes_atol", "ksp_rtol"):
 
 
 # %%
-def draw(left, middle, right):
+def draw(upper, middle, lower):
     """Error and bound, their ratio, and the unfinished solutions."""
-    colours = dict(zip(NAMES, COLOURS, strict=False))
-    for name, colour in colours.items():
+    bounds, quotients = {}, {}
+    for name, colour in zip(NAMES, COLOURS, strict=False):
         for kind, style in (("uniform", "-"), ("adaptive", ":")):
             dofs, error, bound, *_ = curves[name, kind].T
-            middle.semilogx(dofs, bound / error, style, color=colour, label=f"{name}, {kind}")
+            middle.semilogx(dofs, bound / error, style, color=colour, linewidth=1.8)
         dofs, error, bound, *_ = curves[name, "uniform"].T
-        left.loglog(dofs, error, "o", color=colour, label=name)
-        left.loglog(dofs, bound, "-", color=colour)
-    left.set_ylabel(r"$\|\nabla_h(u-u_h)\|$ (dots), certified bound (lines)", fontsize=13)
+        upper.loglog(dofs, error, "o", color=colour)
+        upper.loglog(dofs, bound, "-", color=colour)
+        bounds[name], quotients[name] = (dofs, bound), (dofs, bound / error)
+    upper.set_title("The certified bound (lines) is never below the error (dots)", fontsize=14)
+    upper.set_ylabel(r"$\|\nabla_h(u-u_h)\|$", fontsize=13)
+    middle.set_title("It is soon a few percent above it (dotted: meshes that adapt)", fontsize=14)
     middle.set_ylabel("bound / error", fontsize=13)
     middle.set_ylim(1.0, 1.5)
-    for axes in (left, middle):
+    for axes in (upper, middle):
         axes.set_xlabel("degrees of freedom", fontsize=13)
     size, error, bound, _ = np.array(stopped).T
-    right.loglog(size, error, "o", color=canvas.BLUE, label="error")
-    right.loglog(size, bound, "-", color=canvas.BLUE, label="certified bound")
-    right.set_xlabel("relative residual that the solver left (S1)", fontsize=13)
-    for axes in (left, middle, right):
-        axes.grid(which="both", alpha=0.25)
-        axes.legend(fontsize=9, ncols=2 if axes is middle else 1)
+    lower.loglog(size, error, "o", color=canvas.BLUE)
+    lower.loglog(size, bound, "-", color=canvas.BLUE)
+    lower.set_title("It holds for a solver that is stopped early, too (S1)", fontsize=14)
+    lower.set_xlabel("relative residual that the solver left", fontsize=13)
+    lower.set_ylabel(r"$\|\nabla_h(u-u_h)\|$", fontsize=13)
+    for axes in (upper, middle, lower):
+        axes.tick_params(labelsize=11)
+        axes.grid(which="major", alpha=0.3)
+    name_curves(upper, bounds)
+    name_curves(middle, quotients)
+    name_curves(
+        lower, {"error (dots)": (size, error), "bound (line)": (size, bound)}, [canvas.BLUE]
+    )
 
 
 study.picture(
@@ -113,7 +123,6 @@ study.picture(
     "Errors and bounds, their quotients, and a solver that is stopped early.",
     draw,
     panels=3,
-    size=(17.0 / 3, 5.5),
 )
 
 # %% [markdown]

@@ -114,8 +114,8 @@ def draw(*panels):
             visible = y > 1e-7 * values(rows, "error")
             if visible.sum() > 2:
                 curves[label] = (h[visible], y[visible])
-        loglog(axes, curves, {2.0: "$h^2$", 3.0: "$h^3$"}, title=f"{name}, {family}", y="term",
-               below=0.3)  # fmt: skip
+        loglog(axes, curves, {2.0: "$h^2$", 3.0: "$h^3$"}, y="term", below=0.3,
+               title=f"{name}, {family}: contact falls faster")  # fmt: skip
 
 
 study.picture(
@@ -123,9 +123,9 @@ study.picture(
     "Every term of (1.11): best approximation and interior consistency make up the error, the "
     "contact terms are of higher order.",
     draw,
-    panels=2,
-    rows=2,
-    size=(7.0, 5.4),
+    panels=4,
+    columns=2,
+    size=(5.4, 4.2),
 )
 
 # %% [markdown]

@@ -15,7 +15,7 @@
 
 # %%
 import numpy as np
-from study import COLOURS, MARKERS, Study, levels_wanted, run
+from study import COLOURS, MARKERS, Study, levels_wanted, name_curves, run
 
 study = Study("demo_facet_sets", "The facet sets (2.2) against the discrete active set")
 levels = levels_wanted(8)
@@ -69,20 +69,15 @@ for (name, family), rows in judged.items():
 def draw(left, right):
     """Shares of the facets misjudged, and of those in Γ1h⁻."""
     for axes, what, title in (
-        (left, lambda j: j.misjudged, "misjudged facets"),
-        (right, lambda j: j.mixed, r"facets in $\Gamma_{1h}^-$"),
+        (left, lambda j: j.misjudged, "Few facets are misjudged"),
+        (right, lambda j: j.mixed, r"Few facets are in $\Gamma_{1h}^-$, fewer the finer the mesh"),
     ):
+        curves = {}
         for k, ((name, family), rows) in enumerate(judged.items()):
             share = [what(j) / (j.bound + j.mixed + j.free) for _, j in rows]
-            axes.plot(
-                [h for h, _ in rows],
-                share,
-                "--" if family == "mapped" else "-",
-                color=COLOURS[k],
-                marker=MARKERS[k],
-                linewidth=1.8,
-                label=f"{name}, {family}",
-            )
+            curves[f"{name}, {family}"] = x, y = [h for h, _ in rows], share
+            style = "--" if family == "mapped" else "-"
+            axes.plot(x, y, style, color=COLOURS[k], marker=MARKERS[k], linewidth=1.8)
         axes.set_xscale("log")
         axes.set_yscale("symlog", linthresh=1e-3, linscale=0.4)
         axes.set_ylim(-2e-4, 1)
@@ -90,16 +85,14 @@ def draw(left, right):
         axes.set_xlabel("$h$", fontsize=14)
         axes.set_ylabel("share of the facets on $\\Gamma_1$", fontsize=13)
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=11, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3,
-                    frameon=False)  # fmt: skip
+        name_curves(axes, curves)
 
 
 study.picture(
     "facet-sets.png",
-    "Shares of the contact facets that are misjudged (left) and that hold critical points (right).",
+    "Shares of the contact facets that are misjudged (above) and that hold critical points.",
     draw,
     panels=2,
-    size=(7.5, 5.5),
 )
 
 # %% [markdown]

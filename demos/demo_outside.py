@@ -62,8 +62,14 @@ for element in ("CR", "P1"):
 def draw(left, right):
     """Errors of D and distances of L, both elements."""
     for axes, name, slope, title, label in (
-        (left, "D", {0.5: "$h^{1/2}$"}, r"D: $u=\sqrt{r}\,\sin(\theta/2)$", r"$\|u-u_h\|_h$"),
-        (right, "L", {2 / 3: "$h^{2/3}$"}, "L: re-entrant corner", r"$\|u_{2h}-u_h\|_h$"),
+        (
+            left,
+            "D",
+            {0.5: "$h^{1/2}$"},
+            r"D, $\sqrt{r}\,\sin(\theta/2)$: rate 1/2",
+            r"$\|u-u_h\|_h$",
+        ),
+        (right, "L", {2 / 3: "$h^{2/3}$"}, "L, re-entrant corner: rate 2/3", r"$\|u_{2h}-u_h\|_h$"),
     ):
         curves = {}
         for element in ("CR", "P1"):
@@ -78,7 +84,6 @@ study.picture(
     "Solutions outside H²: the rates are those of the singularities, ½ and ⅔, on both elements.",
     draw,
     panels=2,
-    size=(7.0, 5.0),
 )
 
 # %% [markdown]

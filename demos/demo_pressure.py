@@ -53,7 +53,7 @@ study.table(
 
 # %% [markdown]
 # ## Picture
-# Left the errors, right the pressure of S1 near the critical point, inside a facet of the mapped
+# Above the errors, below the pressure of S1 near the critical point, inside a facet of the mapped
 # mesh.
 
 # %%
@@ -68,7 +68,7 @@ def draw(left, right):
         ", ".join(case): (column(rows, "h"), column(rows, "pressure"))
         for case, rows in results.items()
     }
-    loglog(left, curves, {1.0: "$h$"}, title="error of the pressure",
+    loglog(left, curves, {1.0: "$h$"}, title="The error of the pressure falls like $h$",
            y=r"$\|\lambda-\lambda_h\|_{L^2(\Gamma_1)}$",
            dashed=[label for label in curves if "P1" in label])  # fmt: skip
     x = np.linspace(-1, 1, 2001)
@@ -78,7 +78,7 @@ def draw(left, right):
     right.stairs(table["pressure"], edges, color=canvas.RED, linewidth=1.8, label=r"$\lambda_h$")
     right.set_xlim(-1, 0.25)
     right.set_xlabel("$x$", fontsize=14)
-    right.set_title(f"S1, mapped, {2 * n} facets", fontsize=14)
+    right.set_title(f"S1, mapped: one pressure on each of {2 * n} facets", fontsize=14)
     right.grid(alpha=0.3)
     right.legend(fontsize=13, loc="upper right")
 

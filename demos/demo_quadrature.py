@@ -122,19 +122,20 @@ def draw(left, right):
         for degree, rows in loads.items()
         for label, norm in ((r"$\|u-u_h\|_h$", "h1"), (r"$\|u-u_h\|$", "l2"))
     }
-    loglog(left, curves, {1.0: "$h$", 2.0: "$h^2$"}, title="I: quadrature of the load",
+    loglog(left, curves, {1.0: "$h$", 2.0: "$h^2$"},
+           title="I: a load to degree 4 costs accuracy in $L^2$",
            dashed=[label for label in curves if "degree 4" in label])  # fmt: skip
     curves = {
         name: (h, abs(column(points, "h1") / column(means, "h1") - 1))
         for name, (means, points) in boundary.items()
     }
-    loglog(right, curves, {}, title="midpoint values instead of facet means",
+    loglog(right, curves, {}, title="Midpoints in the place of facet means: the difference fades",
            y=r"relative change of $\|u-u_h\|_h$")  # fmt: skip
 
 
 study.picture(
     "quadrature.png",
-    "Left: an inaccurate load hides the rate in L2. Right: what midpoint values of u_D change.",
+    "Above: an inaccurate load hides the rate in L2. Below: what midpoint values of u_D change.",
     draw,
     panels=2,
 )

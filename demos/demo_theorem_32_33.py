@@ -72,8 +72,8 @@ def draw(left, right):
         for (name, family), rows in results.items()
     }
     dashed = [label for label in curves if "inside" in label]
-    loglog(left, curves, {1.0: "$h$"}, title="errors in the broken norm", y=r"$\|u-u_h\|_h$",
-           dashed=dashed)  # fmt: skip
+    loglog(left, curves, {1.0: "$h$"}, title="Errors fall like $h$, wherever contact ends",
+           y=r"$\|u-u_h\|_h$", dashed=dashed)  # fmt: skip
     curves = {}
     for name in ("S1", "A", "B"):
         rows = results[name, "mapped"]
@@ -81,8 +81,8 @@ def draw(left, right):
         curves[f"{name}: $e/h$"] = (h, error / h)
         curves[rf"{name}: $e/(h|\log h|^{{1/4}})$"] = (h, error / (h * abs(np.log(h)) ** 0.25))
     dashed = [label for label in curves if "log" in label]
-    loglog(right, curves, {}, title="critical point inside a facet", y="", dashed=dashed,
-           scale="linear")  # fmt: skip
+    loglog(right, curves, {}, title="Critical point inside a facet: $e/h$ is level, no logarithm",
+           y="", dashed=dashed, scale="linear")  # fmt: skip
 
 
 study.picture(

@@ -235,8 +235,8 @@ class Study:
         caption: str,
         draw: Callable[..., None],
         panels: int = 1,
-        rows: int = 1,
-        size: tuple[float, float] = (7.5, 6.0),
+        columns: int = 1,
+        size: tuple[float, float] = (8.5, 4.4),
     ) -> None:
         """Draw a picture on rank 0 and keep a reference to it.
 
@@ -244,14 +244,16 @@ class Study:
             file: Name of the PNG.
             caption: What it shows.
             draw: Called with as many axes as there are panels.
-            panels: Axes side by side.
-            rows: Rows of them.
+            panels: Axes, row by row.
+            columns: Axes side by side. A page shows nine inches of a picture in letters that can
+                be read.
             size: Inches of one panel.
         """
 
         def paint() -> None:
-            figure = canvas.new_figure(size[0] * panels, size[1] * rows)
-            draw(*np.atleast_1d(figure.subplots(rows, panels)).ravel())
+            rows = panels // columns
+            figure = canvas.new_figure(size[0] * columns, size[1] * rows)
+            draw(*np.atleast_1d(figure.subplots(rows, columns)).ravel())
             canvas.save(figure, self.folder / file)
 
         on_root(comm, paint)
@@ -311,7 +313,6 @@ def loglog(
             marker=MARKERS[k % len(MARKERS)],
             markersize=6,
             linewidth=1.8,
-            label=label,
         )
     for k, (slope, label) in enumerate(slopes.items()):
         guide(axes, list(curves.values()), slope, label, below * 0.7**k)
@@ -319,14 +320,25 @@ def loglog(
     axes.set_ylabel(y, fontsize=13)
     axes.tick_params(labelsize=11)
     axes.grid(which="major", alpha=0.3)
-    axes.legend(
-        fontsize=11, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, frameon=False
-    )
     if x == "$h$":
         ticks = next(iter(curves.values()))[0]
         axes.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
         axes.set_xticks([], minor=True)
     axes.set_title(title, fontsize=14)
+    name_curves(axes, curves)
+
+
+def name_curves(
+    axes: Axes,
+    curves: dict[str, tuple[Sequence[float], Sequence[float]]],
+    colours: Sequence[str] = COLOURS,
+) -> None:
+    """Write the label of each curve beside its right end; nothing is to be drawn after that."""
+    axes.set_xlim(axes.get_xlim())
+    axes.set_ylim(axes.get_ylim())
+    ends = [max(zip(*curve, strict=True)) for curve in curves.values()]
+    used = [colours[k % len(colours)] for k in range(len(ends))]
+    canvas.label_ends(axes, ends, list(curves), used)
 
 
 def guide(axes: Axes, curves: Sequence[tuple], slope: float, label: str, below: float) -> None:

@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers import DEMOS, is_picture, script, start
+from helpers import DEMOS, command, is_picture, script, start
 from mpi4py import MPI
 
-from signorini_cr import InputError, exact, solve
+from signorini_cr import InputError, exact, solve, solve_adaptive
 from signorini_cr.output.errorplot import plot_error
 
 pytestmark = pytest.mark.slow
@@ -61,6 +61,53 @@ def test_the_first_demo_prints_a_row_a_level(studies):
 def test_demos_of_the_certificate(demo, pictures, shared_tmp_path):
     assert script(DEMOS / demo, shared_tmp_path, SIGNORINI_DEMO_LEVELS="3")[0] == 0
     assert {path.stem for path in shared_tmp_path.glob("*.png") if is_picture(path)} >= pictures
+
+
+def test_the_film_has_a_frame_a_mesh(shared_tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    assert script(DEMOS / "film.py", shared_tmp_path, SIGNORINI_DEMO_LEVELS="6")[0] == 0
+    if COMM.rank == 0:
+        path = shared_tmp_path / "adaptive.gif"
+        *_, last = meshes = list(solve_adaptive(exact.L.problem, exact.L.mesh(0.5, MPI.COMM_SELF),
+                                                max_dofs=500, fraction=0.3))  # fmt: skip
+        assert last.dofs <= 500
+        with image.open(path) as film:
+            assert film.n_frames == len(meshes)
+        assert path.stat().st_size < 1_000_000
+
+
+def in_the_how_to(language, word):
+    """The listing of docs/howto.md that has this word in it."""
+    text = (DEMOS.parent / "docs" / "howto.md").read_text(encoding="utf-8")
+    (found,) = (
+        each for each in re.findall(rf"```{language}\n(.*?)```", text, re.S) if word in each
+    )
+    return found
+
+
+def test_the_script_of_the_documents_runs(shared_tmp_path, monkeypatch):
+    monkeypatch.chdir(shared_tmp_path)
+    path = shared_tmp_path / "my.py"
+    if COMM.rank == 0:
+        path.write_text(in_the_how_to("python", "create_rectangle"), encoding="utf-8")
+    COMM.Barrier()
+    status, printed = script(path)
+    assert status == 0
+    if COMM.rank == 0:
+        force, bound = map(float, printed.split())
+        assert 0 < force < 6 and 0 < bound < 0.5  # the load is 6
+        assert is_picture(shared_tmp_path / "my.png")
+
+
+@pytest.mark.serial
+def test_the_gmsh_file_of_the_documents_is_read(tmp_path):
+    (tmp_path / "dam.geo").write_text(in_the_how_to("text", "Physical"), encoding="utf-8")
+    (tmp_path / "dam.toml").write_text(in_the_how_to("toml", "dam.msh"), encoding="utf-8")
+    (line,) = re.findall(r"python3 -c '(.*?)'", in_the_how_to("sh", "import gmsh"), re.S)
+    assert start("-c", line, cwd=tmp_path).returncode == 0
+    done = command("solve", "dam.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "contact    u ≥ -0.3" in done.stdout
 
 
 @pytest.mark.serial

@@ -212,8 +212,11 @@ def _solve_levels(
     from ..output import report as output
     from ..output.tables import certified, legend, times
     from ..restart import Restart
+    from .statement import statement
 
     case, domain = _read(args, screen, comm)
+    problem = statement(case, domain)
+    screen.line(f"{problem}\n")
     element = args.element.upper()
     said = _said(args, case, comm)
     restart = _resumed(folder, said, records, comm) if args.resume else None
@@ -241,18 +244,20 @@ def _solve_levels(
     except NotConverged as error:
         failure = error
     failure = failure or _above_tolerance(case, records)
-    screen.progress("writing")
     if finest is not None:
-        report = output.make_report(case.title, element, comm, records, failure is None)
+        screen.progress("bounds of the contact force")
+        force = output.force_record(finest)
+        screen.progress("writing")
+        report = output.make_report(case.title, element, comm, records, failure is None, force)
         with _named("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
             if args.html:
-                names += _write_page(args, comm, folder, report)
+                names += _write_page(args, comm, folder, problem, report)
         screen.line("")
         screen.text(legend(records[0]))
         screen.line("")
         screen.text(_facts(records[-1]))
-        screen.text(certified(records[-1]))
+        screen.text(certified(records[-1], force))
         screen.text(times(records))
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
@@ -260,21 +265,16 @@ def _solve_levels(
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
-    from ..fem.space import facet_measures
     from ..output import plots
     from ..output.files import check_writable, write_files
+    from .statement import statement
 
     folder, picture = _folder(args), "mesh.png"
     with _named("--out"):
         check_writable(folder, [picture], comm)
     case, domain = _read(args, screen, comm)
-    topology = domain.mesh.topology
     screen.line(f"{args.file}: in order")
-    screen.text(f"{topology.index_map(topology.dim).size_global} cells on the coarsest mesh")
-    for name, part in domain.parts.items():
-        _, lengths = facet_measures(domain.mesh, domain.facets(part))
-        number, length = comm.allreduce(len(lengths)), comm.allreduce(float(lengths.sum()))
-        screen.text(f"{name}: {number} facets, length {length:.6g}")
+    screen.line(statement(case, domain))
     if not plots.can_draw(comm):
         screen.text("not drawn: Matplotlib is not installed")
         return DONE
@@ -383,7 +383,9 @@ def _solutions(
     )
 
 
-def _write_page(args: argparse.Namespace, comm: Any, folder: Path, report: Any) -> list[str]:
+def _write_page(
+    args: argparse.Namespace, comm: Any, folder: Path, problem: str, report: Any
+) -> list[str]:
     """The run as one page; collective."""
     from ..errors import on_root
     from ..output.files import write_files, write_text
@@ -391,7 +393,8 @@ def _write_page(args: argparse.Namespace, comm: Any, folder: Path, report: Any) 
 
     def make() -> str:
         source = args.file.read_text(encoding="utf-8")
-        return run_page(folder, source, report, args.words, _facts(report["levels"][-1]))
+        fact = _facts(report["levels"][-1])
+        return run_page(folder, source, report, args.words, problem, fact)
 
     name = "report.html"
     write_files(folder, {name: lambda path: on_root(comm, write_text, path, make)}, comm=comm)

@@ -9,12 +9,14 @@ import argparse
 import difflib
 import os
 import sys
+import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
 from .. import __version__
+from ..output.meanings import SECTIONS
 from .screen import WIDTH
 
 PETSC_NOTE = (
@@ -41,6 +43,31 @@ class _Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: Any = None) -> None:
         if launched()[0] == 0:
             super()._print_message(message, file)
+
+
+class _Help(argparse.Action):
+    """Help on the command, or on what its figures mean."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        if values == "columns":
+            parser._print_message(columns(), sys.stdout)
+        else:
+            parser.print_help()
+        parser.exit()
+
+
+def columns() -> str:
+    """What every figure of a run means, for a terminal."""
+    lines: list[str] = []
+    for head, entries in SECTIONS.items():
+        lines += [*textwrap.wrap(head + ":", WIDTH), ""]
+        width = max(map(len, entries)) + 4
+        fold = textwrap.TextWrapper(WIDTH, subsequent_indent=" " * width)
+        for name, meaning in entries.items():
+            fold.initial_indent = f"  {name}".ljust(width)
+            lines.append(fold.fill(meaning))
+        lines.append("")
+    return "\n".join(lines)
 
 
 def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
@@ -102,7 +129,17 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         + " " * 26
         + "[-v] [PETSc options]",
         epilog=f"{PETSC_NOTE} {EXIT_NOTE}",
+        add_help=False,
         **shared,
+    )
+    solve.add_argument(
+        "-h",
+        "--help",
+        action=_Help,
+        nargs="?",
+        metavar="columns",
+        help="show this help and exit; with the word columns, what every printed and written figure"
+        " means",
     )
     check = commands.add_parser(
         "check",
@@ -138,7 +175,8 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         metavar="SECONDS",
         type=_positive,
         help="begin no level that would end later, by what the levels before took; what is left to"
-        " do then is to write fields and pictures",
+        " do then is to bound the contact force, which takes about as long as the last solve did,"
+        " and to write fields and pictures",
     )
     solve.add_argument(
         "--resume",

@@ -21,6 +21,7 @@ from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate
 
+NO_BOUNDS = "the contact force has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
 VARIES = "the coefficient varies within cells"
 LOST = "terms without gradients are not worked out"
@@ -51,13 +52,13 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     certificate = solution.certificate
     made = certificate._made
     if made is None or certificate.bound_h1 is None:
-        raise InputError(f"the contact force has no bounds: {certificate.reason}")
+        raise InputError(f"{NO_BOUNDS}: {certificate.reason}")
     level = made.level
     cells = Cells(level.domain, level.V)
     lost = diffusion(level.data).forms.of_one is not None
     if lost or made.varies or cells.tdim != 2:
         why = LOST if lost else VARIES if made.varies else SPATIAL
-        raise InputError(f"the contact force has no bounds: {why}")
+        raise InputError(f"{NO_BOUNDS}: {why}")
     phi = _weight(solution)
     at_vertices = np.ascontiguousarray(
         phi.x.array[phi.function_space.dofmap.list[: cells.number]].T
@@ -105,7 +106,7 @@ def _weight(solution: Certified) -> fem.Function:
     bounded, fixed = parts
     both = len(np.intersect1d(bounded, fixed))
     if mesh.comm.allreduce(both) > 0:
-        raise InputError(f"the contact force has no bounds: {TOUCHES}")
+        raise InputError(f"{NO_BOUNDS}: {TOUCHES}")
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
     known = np.concatenate(parts)
     marks.x.array[:] = 0.0

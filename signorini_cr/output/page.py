@@ -19,13 +19,21 @@ PICTURES = {
 }
 STYLE = (
     "body{font:16px/1.5 sans-serif;max-width:60rem;margin:auto;padding:0 1rem;color:#222}"
-    "img{max-width:100%;height:auto}pre,.wide{overflow-x:auto;background:#f4f4f4;padding:.5rem}"
+    "img{max-width:100%;height:auto}figure{margin:1rem 0}"
+    "pre,.wide{overflow-x:auto;background:#f4f4f4;padding:.5rem}"
+    "pre{white-space:pre-wrap;overflow-wrap:anywhere}"
     "table{border-collapse:collapse}td,th{padding:.1rem .5rem;text-align:right}"
+    "@media(max-width:30rem){pre{font-size:.75rem}table{font-size:.65rem}td,th{padding:.1rem}}"
 )
 
 
 def run_page(
-    folder: Path, source: str, report: Mapping[str, Any], words: Sequence[str], fact: str
+    folder: Path,
+    source: str,
+    report: Mapping[str, Any],
+    words: Sequence[str],
+    problem: str,
+    fact: str,
 ) -> str:
     """The HTML of a run; of the pictures there are those that lie in the folder.
 
@@ -34,6 +42,7 @@ def run_page(
         source: The text of the problem file.
         report: From `make_report`.
         words: The command line, without the program's name.
+        problem: What is solved, as on the screen.
         fact: What happens on Γ1, as on the screen.
     """
     title, levels = escape(report["title"] or "Signorini problem"), report["levels"]
@@ -42,6 +51,7 @@ def run_page(
         "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
         for kind, row in [("th", head), *(("td", row) for row in rows)]
     )
+    certain = certified(levels[-1], report["force_bounds"])
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     launch = ["mpirun", "-n", str(report["ranks"])] if report["ranks"] > 1 else []
     pictures = "".join(
@@ -55,7 +65,7 @@ def run_page(
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{title}</title><style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n"
-        f"<p>{escape(fact)}</p>\n<p>{escape(certified(levels[-1]))}</p>\n"
+        f"<pre>{escape(problem)}</pre>\n<p>{escape(fact)}</p>\n<p>{escape(certain)}</p>\n"
         f'{pictures}\n<h2>Levels</h2>\n<div class="wide"><table>{table}</table></div>\n'
         f"<p>{escape(legend(levels[0]))}</p>\n<p>{escape(times(levels))}</p>\n"
         f"<h2>Problem file</h2>\n<pre>{escape(source)}</pre>\n"

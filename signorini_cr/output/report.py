@@ -23,8 +23,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .. import __version__
-from ..errors import on_root
+from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
+from ..estimate.force import NO_BOUNDS, force_bounds
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .tables import contact_csv, levels_csv, markdown_table
@@ -117,8 +118,25 @@ def level_record(
     )
 
 
+def force_record(solution: Solution) -> Record:
+    """Bounds of the contact force of u itself, None with a reason where there are none; collective.
+
+    It takes about as long as the solve, and that is why no record of a level has it.
+    """
+    try:
+        lower, upper = force_bounds(solution)
+    except InputError as error:
+        return {"lower": None, "upper": None, "reason": str(error).removeprefix(f"{NO_BOUNDS}: ")}
+    return {"lower": lower, "upper": upper, "reason": None}
+
+
 def make_report(
-    title: str, element: str, comm: MPI.Comm, records: Sequence[Record], complete: bool = True
+    title: str,
+    element: str,
+    comm: MPI.Comm,
+    records: Sequence[Record],
+    complete: bool = True,
+    force: Record | None = None,
 ) -> Record:
     """The whole of report.json from the records of its levels.
 
@@ -128,6 +146,7 @@ def make_report(
         comm: The ranks that solved it.
         records: From `level_record`, coarsest level first.
         complete: Whether these are all the levels that were asked for.
+        force: From `force_record`, of the finest level, at the end of the run.
     """
     versions = {
         "signorini_cr": __version__,
@@ -141,6 +160,7 @@ def make_report(
         "ranks": comm.size,
         "versions": versions,
         "complete": complete,
+        "force_bounds": force or {"lower": None, "upper": None, "reason": "the run has not ended"},
         "levels": list(records),
     }
 

@@ -13,21 +13,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-MEANINGS = {
-    "dofs": "unknowns",
-    "h": "largest diameter of a cell",
-    "newton": "steps of the active set method",
-    "cg": "of its linear solver, in all",
-    "active": "facets in contact",
-    "contact": "their length",
-    "energy": "J(u_h)",
-    "H1 error": "‖∇_h(u − u_h)‖",
-    "rate": "of the error before it, as a power of h",
-    "L2 error": "‖u − u_h‖",
-    "bound": "certified, the H1 error is not above it",
-    "eff.": "bound / error",
-}
-"""The printed columns, but for those that need no word."""
+from .meanings import PRINTED
 
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 
@@ -39,27 +25,40 @@ def table_header(first: Mapping[str, Any]) -> str:
 
 def legend(first: Mapping[str, Any]) -> str:
     """What the printed columns mean."""
-    names = dict.fromkeys(name for name, *_ in _columns(first) if name in MEANINGS)
-    return "; ".join(f"{name}: {MEANINGS[name]}" for name in names)
+    words = {name: PRINTED[name][0] for name, *_ in _columns(first)}
+    return "; ".join(f"{name}: {short}" for name, short in words.items() if short)
 
 
-def certified(record: Mapping[str, Any]) -> str:
-    """What is certain about a level, rounded so that it stays certain."""
+def certified(record: Mapping[str, Any], force: Mapping[str, Any] | None = None) -> str:
+    """What is certain about a level, rounded so that it stays certain.
+
+    Args:
+        record: The level's.
+        force: From `output.report.force_record`, where that has been asked for.
+    """
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
-    text = f"certified: ‖∇_h(u − u_h)‖ is at most {_rounded_up(record['bound_h1']):.3g}"
-    lower, upper = (record["energy_bounds"][end] for end in ("lower", "upper"))
-    if lower is None or upper is None:
-        return text
+    facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {_rounded_up(record['bound_h1']):.3g}"]
+    energy = record["energy_bounds"]
+    if energy["lower"] is not None and energy["upper"] is not None:
+        facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")
+    if force is not None and force["reason"] is None:
+        facts.append(f"the contact force is in {_interval(force['lower'], force['upper'])}")
+    elif force is not None:
+        facts.append(f"the contact force has no bounds: {force['reason']}")
+    return "; ".join(facts)
+
+
+def _interval(lower: float, upper: float) -> str:
+    """An interval that holds [lower, upper], with two digits of its width."""
     width, size = upper - lower, max(abs(lower), abs(upper))
     if not (0.0 < width < math.inf):
-        return f"{text}; J(u) is in [{lower!r}, {upper!r}]"
-    # two digits of what they differ by
+        return f"[{lower!r}, {upper!r}]"
     unit = 10.0 ** (math.floor(math.log10(max(width, 1e-15 * size))) - 1)
     digits = max(math.ceil(math.log10(size / unit)), 1) + 1
     low, high = math.floor(lower / unit) * unit, math.ceil(upper / unit) * unit
     share = f"{_rounded_up(100 * width / size, 2):.2g} % wide"
-    return f"{text}; J(u) is in [{low:.{digits}g}, {high:.{digits}g}], {share}"
+    return f"[{low:.{digits}g}, {high:.{digits}g}], {share}"
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -377,8 +378,9 @@ def test_solve(write) -> None:
         assert text == ""
         return
     lines = text.split("\n")
-    assert lines[0].split()[:4] == ["level", "cells", "dofs", "h"]
-    assert [line.split()[0] for line in lines[1:4]] == ["0", "1", "2"]
+    head = lines.index("") + 1
+    assert lines[head].split()[:4] == ["level", "cells", "dofs", "h"]
+    assert [line.split()[0] for line in lines[head + 1 : head + 4]] == ["0", "1", "2"]
     assert max(map(len, lines)) <= 80
     assert "contact on" in text and "written to" in text
     report = json.loads((out / "report.json").read_text())
@@ -386,6 +388,49 @@ def test_solve(write) -> None:
     assert [level["level"] for level in report["levels"]] == [0, 1, 2]
     assert report["levels"][0]["seconds"]["mesh"] > 0
     assert {"levels.csv", "levels.md", "contact.csv"} <= {file.name for file in out.iterdir()}
+
+
+def test_the_problem_is_stated_before_the_table(write) -> None:
+    wall = '"neumann", "dirichlet", "neumann"'
+    text = with_(LINE, LINE.replace('"dirichlet", "dirichlet", "dirichlet"', wall))
+    long = " + ".join(["0.001*x*y"] * 30)
+    text = text.replace('f = "1 + r"', f'f = "-1 - {long}"\ncoefficient = 2\ng = "r"')
+    status, text, _ = run("solve", write(text), "--out", "out", "--levels", "1")
+    assert status == 0
+    if COMM.rank > 0:
+        return
+    lines = text.split("\n")
+    told = lines[: lines.index("")]
+    assert max(map(len, lines)) <= 80
+    assert [line.split()[0] for line in told if line[0] != " "] == [
+        *("domain", "equation", "dirichlet", "neumann", "contact", "where")
+    ]
+    rows = " ".join(" ".join(told).split())
+    for words in (
+        "cells in [-1, 1] × [0, 1]",
+        "−∇·(κ∇u) = -1 - 0.001*x*y",
+        "…, κ = 2 dirichlet u = 0; 4 facets, length 2",
+        "neumann κ∂ₙu = r; 4 facets, length 2",
+        "contact u ≥ 0, κ∂ₙu ≥ 0, one of them an equality; 4 facets, length 2",
+        "where r = sqrt(x**2 + y**2)",
+    ):
+        assert words in rows
+    found = re.search(r"the contact force is in \[(.*?), (.*?)\]", " ".join(text.split()))
+    low, high = (float(end) for end in found.groups())
+    report = json.loads(Path("out/report.json").read_text())
+    bounds = report["force_bounds"]
+    assert low <= bounds["lower"] <= report["levels"][0]["contact"]["force"] <= bounds["upper"]
+    assert bounds["upper"] <= high
+
+
+def test_where_the_force_has_no_bounds_the_reason_is_told(write) -> None:
+    status, text, _ = run("solve", write(CASE), "--out", "out", "--levels", "1")
+    assert status == 0
+    if COMM.rank == 0:
+        bounds = json.loads(Path("out/report.json").read_text())["force_bounds"]
+        assert bounds["lower"] is None and bounds["upper"] is None
+        assert bounds["reason"].startswith("Γ1 touches Γ0")
+        assert "no bounds: Γ1 touches Γ0" in " ".join(text.split())
 
 
 def test_quiet_and_p1(write) -> None:
@@ -431,9 +476,10 @@ def test_check(write) -> None:
     assert (status, err) == (0, "")
     if COMM.rank == 0:
         assert "case.toml: in order" in text
-        assert "contact: 4 facets, length 2\n" in text
-        assert "dirichlet: 8 facets, length 4\n" in text
-        assert "neumann: 0 facets" in text
+        told = dict(line.split(maxsplit=1) for line in text.split("\n")[1:5])
+        assert told["contact"].endswith("; 4 facets, length 2")
+        assert told["dirichlet"].endswith("; 8 facets, length 4")
+        assert "neumann" not in told
         assert [file.name for file in out.iterdir()] == ["mesh.png"] or "not drawn" in text
 
 
@@ -534,7 +580,9 @@ def test_petsc_takes_them(write) -> None:
 @pytest.mark.serial
 def test_help_answers_without_the_heavy_libraries() -> None:
     program = (
-        "import sys\nfrom signorini_cr.app import cli\nassert cli.main(['solve', '--help']) == 0\n"
+        "import sys\nfrom signorini_cr.app import cli\n"
+        "assert cli.main(['solve', '--help', 'columns']) == 0\n"
+        "assert cli.main(['solve', '--help']) == 0\n"
         "heavy = {'numpy', 'mpi4py', 'petsc4py', 'dolfinx', 'ufl', 'gmsh', 'matplotlib'}\n"
         "if 'dolfinx_solver' in sys.modules:  # the wheels, which load MPI first\n"
         "    heavy.remove('mpi4py')\n"
@@ -547,6 +595,9 @@ def test_help_answers_without_the_heavy_libraries() -> None:
     for word in ("--out DIR", "--levels N", "cr|p1", "--quiet", "PETSc", "FILE-out"):
         assert word in done.stdout
     assert max(map(len, done.stdout.split("\n"))) <= 80
+    columns = helpers.command("solve", "--help=columns").stdout
+    assert max(map(len, columns.split("\n"))) <= 80
+    assert {"active", "rate", "kkt.min_gap", "arc_length"} <= set(columns.split())
     assert helpers.command("--version").stdout.startswith("signorini-cr 0.")
 
 

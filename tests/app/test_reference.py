@@ -1,14 +1,21 @@
-"""The page about the problem file against what the program reads."""
+"""The reference's pages against what the program reads, takes, prints, writes and offers."""
 
+import csv
+import json
+import re
+import runpy
 from pathlib import Path
 
 import pytest
 from helpers import ROOT
 from mpi4py import MPI
 
+import signorini_cr
+from signorini_cr.app.cli import main
+from signorini_cr.app.commandline import _parser
 from signorini_cr.app.datacheck import USED_ON
 from signorini_cr.app.problemfile import load
-from signorini_cr.app.reference import ABOUT, KEYS, page
+from signorini_cr.app.reference import ABOUT, KEYS
 
 BASE = {
     "domain": {
@@ -20,9 +27,86 @@ BASE = {
 }
 
 
-def test_the_page_is_that_of_the_table() -> None:
-    found = (ROOT / "docs" / "problem-file.md").read_text(encoding="utf-8")
-    assert found == page(), "docs/problem-file.md: run docs/reference.py"
+DOCS = ROOT / "docs"
+PAGES = runpy.run_path(str(DOCS / "reference.py"))["PAGES"]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", PAGES)
+def test_the_pages_are_those_of_the_tables(name) -> None:
+    found = (DOCS / name).read_text(encoding="utf-8")
+    assert found == PAGES[name](), f"docs/{name}: run docs/reference.py"
+
+
+@pytest.mark.serial
+def test_every_option_is_in_the_reference() -> None:
+    text = (DOCS / "command.md").read_text(encoding="utf-8")
+    parser, commands = _parser()
+    words = [*commands]
+    for each in (parser, *commands.values()):
+        words += each._option_string_actions
+    assert [word for word in words if not re.search(rf"(?<!\w){word}\b", text)] == []
+
+
+def names_in(head: str) -> list[str]:
+    """The names in a table of the page of figures, in order."""
+    text = (DOCS / "figures.md").read_text(encoding="utf-8")
+    (section,) = (part for part in text.split("\n## ") if part.startswith(head))
+    return re.findall(r"^\| `(.*?)` \|", section, re.M)
+
+
+def dotted(record: dict, before: str = "") -> list[str]:
+    """The keys of a record, those of an object behind a dot."""
+    found = []
+    for key, value in record.items():
+        if isinstance(value, dict):
+            found += dotted(value, f"{before}{key}.")
+        else:
+            found.append(before + key)
+    return found
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_every_figure_is_in_the_reference(known, shared_tmp_path, capsys) -> None:
+    """All that a run prints and writes, and nothing else."""
+    path, folder = shared_tmp_path / "case.toml", shared_tmp_path / "out"
+    lines = [*BASE["domain"].values(), "[data]", *BASE["data"].values()]
+    if known:
+        lines += ["[exact]", 'u = "(1 - x**2)*(1 - y)"']
+    if MPI.COMM_WORLD.rank == 0:
+        path.write_text("\n".join(["[domain]", *lines, ""]), encoding="utf-8")
+    MPI.COMM_WORLD.Barrier()
+    assert main(["solve", str(path), "--out", str(folder)]) == 0
+    if MPI.COMM_WORLD.rank > 0:
+        return
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    (level,) = report["levels"]
+    assert dotted(report) == names_in("Keys of report.json")
+    assert dotted(level) == names_in("Keys of a level")
+    head = next(csv.reader((folder / "levels.csv").read_text(encoding="utf-8").splitlines()))
+    assert head == [name.replace(".", "_") for name in dotted(level)]
+    head = next(csv.reader((folder / "contact.csv").read_text(encoding="utf-8").splitlines()))
+    assert head == names_in("Columns of contact.csv")
+    (head,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("level "))
+    printed = head.replace("H1 error", "H1_error").replace("L2 error", "L2_error").split()
+    known_names = names_in("Columns of the printed table")
+    assert {name.replace("_", " ") for name in printed} <= set(known_names)
+    whole = set(known_names) - {name.replace("_", " ") for name in printed}
+    assert whole == ({"cells", "energy", "contact"} if known else
+                     {"H1 error", "L2 error", "rate", "eff."})  # fmt: skip
+
+
+@pytest.mark.serial
+def test_every_public_name_is_in_the_reference() -> None:
+    text = (DOCS / "python.md").read_text(encoding="utf-8")
+    told = set(re.findall(r"(?::: signorini_cr|`scr)\.(\w+)(?:\n|`)", text))
+    assert set(signorini_cr.__all__) <= told
+    modules = [
+        name
+        for name, place in signorini_cr._MODULES.items()
+        if not re.search(rf":: signorini_cr\.({place}|{name})\b", text)
+    ]
+    assert modules == []
 
 
 @pytest.mark.serial

@@ -74,7 +74,7 @@ def folder(shared_tmp_path, finished):
 
 def test_the_report_has_the_keys_that_others_rely_on(folder):
     report = json.loads((folder / "report.json").read_text())
-    keys = {"title", "element", "ranks", "versions", "complete", "levels"}
+    keys = {"title", "element", "ranks", "versions", "complete", "force_bounds", "levels"}
     assert set(report) == keys and report["complete"] is True
     assert set(report["versions"]) == {"signorini_cr", "dolfinx", "petsc", "gmsh"}
     for record in report["levels"]:

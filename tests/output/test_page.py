@@ -21,9 +21,10 @@ obstacle = "-0.01"
 class Reader(HTMLParser):
     def __init__(self):
         super().__init__()
-        self.open, self.links, self.text, self.metas = [], [], "", []
+        self.open, self.links, self.text, self.metas, self.tags = [], [], "", [], set()
 
     def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
         self.links += [value for name, value in attrs if name in ("src", "href")]
         if tag == "meta":
             self.metas.append(dict(attrs).get("name"))
@@ -51,6 +52,7 @@ def test_the_page_holds_everything_and_points_nowhere(shared_tmp_path):
     assert reader.open == []
     assert len(reader.links) == 4
     assert all(link.startswith("data:image/png;base64,") for link in reader.links)
+    assert not reader.tags & {"script", "link", "iframe", "object"} and "url(" not in page
     assert "viewport" in reader.metas and "max-width:100%" in page
     for part in (
         FILE,
@@ -58,6 +60,7 @@ def test_the_page_holds_everything_and_points_nowhere(shared_tmp_path):
         "--levels 2",
         "dolfinx",
         "certified: ",
+        "equation   −Δu = -1",
         " % wide",
     ):
         assert part in reader.text

@@ -36,6 +36,19 @@ def test_no_bound_no_figures():
     assert certified(record) == "no bound of the error: no flux"
 
 
+@pytest.mark.parametrize("lower, upper", [(0.24871234, 0.25131234), (0.0, 3.1), (0.25, 0.25)])
+def test_the_force_that_is_printed_is_certain(lower, upper):
+    text = certified(RECORD, {"lower": lower, "upper": upper, "reason": None})
+    low, high = map(float, re.search(r"the contact force is in \[(.*?), (.*?)\]", text).groups())
+    assert low <= lower and upper <= high
+    assert high - low <= 1.21 * (upper - lower)
+
+
+def test_no_force_but_a_reason():
+    text = certified(RECORD, {"lower": None, "upper": None, "reason": "they touch"})
+    assert text.endswith("; the contact force has no bounds: they touch")
+
+
 def test_every_printed_column_has_its_word():
     told = {entry.split(":")[0] for entry in legend(RECORD).split("; ")}
     assert set(table_header(RECORD).split()) - {"level", "cells"} == told

@@ -1,0 +1,77 @@
+"""The problem that a file states, in a few lines."""
+
+from __future__ import annotations
+
+import textwrap
+
+import numpy as np
+
+from ..fem.space import facet_measures
+from ..mesh.domain import PARTS, Domain
+from .problemfile import ProblemFile
+from .screen import WIDTH
+
+INDENT = 11
+LONGEST = 50
+"""Characters of an expression; what is longer is cut."""
+
+
+def statement(case: ProblemFile, domain: Domain) -> str:
+    """Say what is solved and where, two lines at most for each part of it; collective.
+
+    Args:
+        case: What the file says.
+        domain: The coarsest mesh.
+    """
+    mesh, said = domain.mesh, case.said
+    comm, tdim, gdim = mesh.comm, mesh.topology.dim, mesh.geometry.dim
+    x = mesh.geometry.x[:, :gdim]
+    low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
+    high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
+    extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
+
+    def data(key: str, derived: str = "") -> str:
+        left_out = f"{derived} of exact.u".strip() if derived and "exact.u" in said else "0"
+        return _short(said.get(f"data.{key}", left_out))
+
+    kappa = "κ" if "data.coefficient" in said else ""
+    equation = f"−∇·(κ∇u) = {data('f', 'that')}, κ = {data('coefficient')}"
+    rows = {
+        "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}",
+        "equation": equation if kappa else f"−Δu = {data('f', 'that')}",
+    }
+    conditions = {
+        "dirichlet": f"u = {data('dirichlet', 'that')}",
+        "neumann": f"{kappa}∂ₙu = {data('g', 'that')}",
+        "contact": f"u ≥ {data('obstacle')}, {kappa}∂ₙu ≥ 0, one of them an equality",
+    }
+    for name, condition in conditions.items():
+        measures = facet_measures(mesh, domain.facets(PARTS[name]))[1]
+        number = comm.allreduce(len(measures))
+        if number > 0:
+            total = comm.allreduce(float(measures.sum()))
+            what = "length" if gdim == 2 else "area"
+            rows[name] = f"{condition}; {number} facets, {what} {total:.6g}"
+    if "exact.u" in said:
+        rows["exact.u"] = _short(said["exact.u"])
+    helpers = [key.removeprefix("define.") for key in said if key.startswith("define.")]
+    if helpers:
+        rows["where"] = ", ".join(f"{name} = {_short(said[f'define.{name}'])}" for name in helpers)
+    return "\n".join(
+        textwrap.fill(
+            text,
+            WIDTH,
+            initial_indent=name.ljust(INDENT),
+            subsequent_indent=" " * INDENT,
+            break_on_hyphens=False,
+            max_lines=2,
+            placeholder=" …",
+        )
+        for name, text in rows.items()
+    )
+
+
+def _short(value: object) -> str:
+    """What was written, on one line."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
