@@ -262,7 +262,7 @@ def integrate_edge(
 
 
 def _apart(cells: Cells, w: FloatArray, edge: Segments, v: Companion) -> FloatArray:
-    """v − u_h at the points of facets, shape (q, n)."""
+    """Return v − u_h at the points of facets, shape (q, n)."""
     jump = on_facet(cells, edge.side, edge.hats, v.vertices, v.bumps)
     jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
     return jump
