@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .adaptive import solve_adaptive
     from .errors import InputError, NotConverged
     from .estimate.certificate import Certificate
+    from .fem.conditions import Contact, Dirichlet, Neumann, Robin
     from .fem.problem import Problem
     from .levels import solve, solve_levels
     from .mesh.domain import Domain, Polygon, read_gmsh
@@ -46,6 +47,10 @@ _ROOMS = {
     "solve_adaptive": "adaptive",
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
+    "Dirichlet": "fem.conditions",
+    "Neumann": "fem.conditions",
+    "Robin": "fem.conditions",
+    "Contact": "fem.conditions",
 }
 # Modules that scripts use by name, wherever they stand.
 _MODULES = {
@@ -62,6 +67,10 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Polygon",
     "read_gmsh",
     "Problem",
+    "Dirichlet",
+    "Neumann",
+    "Robin",
+    "Contact",
     "solve",
     "solve_levels",
     "solve_adaptive",

@@ -128,7 +128,12 @@ def solve_sequence(
         The solutions, coarsest first.
     """
     yield from solve_physics(
-        Diffusion(problem, domain.mesh, element), domain, step, monitor, nested, restart
+        Diffusion(problem, domain.mesh, element, domain.parts),
+        domain,
+        step,
+        monitor,
+        nested,
+        restart,
     )
 
 

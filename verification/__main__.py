@@ -13,6 +13,8 @@ What is independent of what:
 - `bounds`, `sharpness`: solutions in closed form; `exactly.py` integrates their distance from the
   program's u_h on triangles that it splits along the lines where data jump, by rules of its own.
   Of the program it takes the coordinates of the cells and u_h's values at the facets.
+- `terms`: waves written in NumPy and in UFL, derivatives by hand; of the program the coordinates
+  of the cells and u_h's values at the facets are taken.
 - `formulas.py` has each datum once, for UFL and for NumPy: what the program and the reference
   solve is the same problem by construction.
 
@@ -34,6 +36,7 @@ petsc4py.init(["verification", "-options_left", "no", *sys.argv[1:]])
 import bounds  # noqa: E402
 import sharpness  # noqa: E402
 import solves  # noqa: E402
+import terms  # noqa: E402
 from mpi4py import MPI  # noqa: E402
 from report import Group, Row, write  # noqa: E402
 
@@ -45,6 +48,7 @@ GROUPS: dict[str, Callable[[int, bool], Group]] = {
     "bounds": bounds.bounds,
     "sharpness": sharpness.sharpness,
     "thin": solves.thin,
+    "terms": terms.terms,
 }
 
 

@@ -7,6 +7,7 @@ misspelt option answer at once.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -15,6 +16,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
@@ -68,13 +70,23 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _interruptible() -> Iterator[list[int]]:
     """Keep in mind the signals that asked for an end, and turn them into KeyboardInterrupt.
 
-    That may reach us as another error: of PETSc, whose callback it was raised in, or of an import.
+    That may reach us as another error, of PETSc, whose callback it was raised in. An import is left
+    to finish, as libraries that are being loaded may end the process; and whoever is told twice
+    within a second, by the user and by mpirun, say, is told once.
     """
     asked: list[int] = []
+    latest = -math.inf
 
-    def ask(number: int, _: object) -> None:
+    def ask(number: int, frame: FrameType | None) -> None:
+        nonlocal latest
         asked.append(number)
-        raise KeyboardInterrupt
+        if _importing(frame):
+            again = threading.Timer(0.05, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+        elif time.monotonic() - latest > 1.0:
+            latest = time.monotonic()
+            raise KeyboardInterrupt
 
     usual: dict[signal.Signals, Any] = {
         signal.SIGINT: signal.default_int_handler,
@@ -91,6 +103,15 @@ def _interruptible() -> Iterator[list[int]]:
     finally:
         for each in ours:
             signal.signal(each, usual[each])
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Whether what runs has been called by an import."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _stopped_by(asked: Sequence[int]) -> int:
@@ -244,7 +265,6 @@ def _solve_levels(
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..fem.space import facet_measures
-    from ..mesh.domain import PARTS
     from ..output import plots
     from ..output.files import check_writable, write_files
 
@@ -255,7 +275,7 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     topology = domain.mesh.topology
     screen.line(f"{args.file}: in order")
     screen.text(f"{topology.index_map(topology.dim).size_global} cells on the coarsest mesh")
-    for name, part in PARTS.items():
+    for name, part in domain.parts.items():
         _, lengths = facet_measures(domain.mesh, domain.facets(part))
         number, length = comm.allreduce(len(lengths)), comm.allreduce(float(lengths.sum()))
         screen.text(f"{name}: {number} facets, length {length:.6g}")

@@ -11,14 +11,15 @@ from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
 from ..arrays import FloatArray, Int32Array
 from ..errors import InputError
-from ..fem.conditions import KINDS
-from ..mesh.domain import PARTS, Domain, part_name
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from .expressions import Expression
 
 USED_ON: dict[str, int | None] = {
     "data.coefficient": None,
     "data.f": None,
-    **{f"data.{kind.key}": PARTS[kind.part] for kind in KINDS},
+    "data.dirichlet": DIRICHLET,
+    "data.g": NEUMANN,
+    "data.obstacle": CONTACT,
     "exact.u": None,
 }
 """Where each expression is used: a part of the boundary, or None for the whole domain."""
@@ -57,8 +58,8 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
         raise InputError(f"{message}; the coefficient must be above 0 everywhere")
-    part = USED_ON[key]
-    where = "in the domain" if part is None else f"on the {part_name(part)} part"
+    part, named = USED_ON[key], {value: name for name, value in domain.parts.items()}
+    where = "in the domain" if part is None else f"on the {named[part]} part"
     raise InputError(
         f"{message}; it must be finite everywhere {where}"
         " (where(condition, a, b) can set a value apart)"

@@ -107,7 +107,7 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
-        forms = Forms(self.problem, domain.mesh)
+        forms = Forms(self.problem, domain.mesh, parts=domain.parts)
         check_data(forms, domain)
         return doubts(forms, domain)
 

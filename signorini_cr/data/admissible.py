@@ -70,11 +70,47 @@ def check_data(forms: Forms, domain: Domain) -> None:
     """
     comm = domain.mesh.comm
     _raise_first(comm, _bad_coefficient(forms, domain))
-    (dirichlet,), (contact,) = forms.fixed, forms.bounded
-    u_D, fixed = _Values(dirichlet.fixed, domain), _Facets.of(domain, dirichlet.number)
-    _raise_first(comm, _jump(u_D, fixed, dirichlet.source))
-    alpha, bounded = _Values(contact.lower, domain), _Facets.of(domain, contact.number)
-    _raise_first(comm, _crossing(u_D, fixed, alpha, bounded))
+    _raise_first(comm, _negative(_Values(forms.reaction, domain), _middles(domain), REACTION))
+    for condition in forms.conditions:
+        if condition.loss is not None:
+            facets = _Facets.of(domain, condition.number)
+            at = facets.x.mean(axis=1), facets.cells
+            name = f"the coefficient of the part {condition.part!r}"
+            _raise_first(comm, _negative(_Values(condition.loss, domain), at, name))
+    fixed = [(_Values(c.fixed, domain), _Facets.of(domain, c.number)) for c in forms.fixed]
+    for condition, (u_D, facets) in zip(forms.fixed, fixed, strict=True):
+        _raise_first(comm, _jump(u_D, facets, condition.source))
+    if len(fixed) > 1:
+        _raise_first(comm, _between(fixed, None, forms.fixed[-1].source))
+    for contact in forms.bounded:
+        alpha, bounded = _Values(contact.lower, domain), _Facets.of(domain, contact.number)
+        for u_D, facets in fixed:
+            _raise_first(comm, _crossing(u_D, facets, alpha, bounded, contact.label))
+
+
+REACTION = "the reaction"
+
+
+def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
+    """The middles of this rank's cells, and the cells."""
+    tdim = domain.mesh.topology.dim
+    cells = np.arange(domain.mesh.topology.index_map(tdim).size_local, dtype=np.int32)
+    return compute_midpoints(domain.mesh, tdim, cells), cells
+
+
+def _negative(datum: _Values, at: tuple[FloatArray, Int32Array], name: str) -> list[Complaint]:
+    """Where a datum is below 0 that must not be."""
+    x, cells = at
+    found = datum.at(x, cells, datum.precision.points)
+    if found is None:
+        return []
+    values, errors = found
+    complaints = []
+    for i in np.flatnonzero(values < -errors):
+        where = place(x[i], datum.mesh)
+        said = f"{name} is {values[i]:.10g} at {shown(where)}; it must not be below 0"
+        complaints.append((where, said))
+    return complaints
 
 
 def differs(cells: Cells, side: Side, gap: FloatArray, scale: float, *data: Trace) -> bool:
@@ -218,7 +254,7 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     finite = np.abs(values[np.isfinite(values)])
     largest = comm.allreduce(float(finite.max(initial=0.0)), op=MPI.MAX)
     scale = TOLERANCE * largest
-    complaints = _between(u_D, fixed, scale, key) if u_D.tied else []
+    complaints = _between([(u_D, fixed)], scale, key) if u_D.tied else []
 
     segment: IndexArray = np.repeat(np.arange(len(start)), pieces)
     length = np.linalg.norm(way, axis=1)
@@ -294,23 +330,43 @@ def _pole_message(key: str, mesh: Mesh, x: FloatArray) -> Complaint:
     )
 
 
-def _between(u_D: _Values, fixed: _Facets, scale: float, key: str) -> list[Complaint]:
+def _between(
+    given: Sequence[tuple[_Values, _Facets]], scale: float | None, key: str
+) -> list[Complaint]:
     """Vertices at which facets give u_D different values; collective.
 
-    Only Functions can: what else depends on x alone.
+    On one part only Functions can: what else depends on x alone.
+
+    Args:
+        given: u_D and the facets of each part of Γ0.
+        scale: What is no difference; None to tell it by the values.
+        key: For the message.
     """
-    found = u_D.at(fixed.x, fixed.cells, u_D.precision.vertices)
-    assert found is not None
-    mine = [array.ravel() for array in (fixed.nodes, *found)]
-    node, value, error = (np.concatenate(each) for each in zip(*u_D.mesh.comm.allgather(mine)))
+    comm, parts = given[0][0].mesh.comm, []
+    for u_D, fixed in given:
+        found = u_D.at(fixed.x, fixed.cells, u_D.precision.vertices)
+        if comm.allreduce(found is None, op=MPI.LOR):
+            continue
+        assert found is not None
+        parts.append([array.ravel() for array in (fixed.nodes, *found)])
+    if not parts:
+        return []
+    mine = [np.concatenate(each) for each in zip(*parts, strict=True)]
+    node, value, error = (np.concatenate(each) for each in zip(*comm.allgather(mine)))
+    if scale is None:
+        scale = TOLERANCE * float(np.abs(value[np.isfinite(value)]).max(initial=0.0))
     order = np.lexsort((value, node))
     node, value, error = node[order], value[order], error[order]
     same = np.flatnonzero(
         (node[1:] == node[:-1]) & (value[1:] - value[:-1] > scale + error[1:] + error[:-1])
     )
-    places = {int(n): x for n, x in zip(fixed.nodes.ravel(), fixed.x.reshape(-1, 3), strict=True)}
+    places = {
+        int(n): x
+        for _, fixed in given
+        for n, x in zip(fixed.nodes.ravel(), fixed.x.reshape(-1, 3), strict=True)
+    }
     return [
-        _jump_message(key, u_D.mesh, places[int(node[i])], value[i], value[i + 1])
+        _jump_message(key, given[0][0].mesh, places[int(node[i])], value[i], value[i + 1])
         for i in same
         if int(node[i]) in places
     ]
@@ -327,7 +383,9 @@ def _jump_message(key: str, mesh: Mesh, x: FloatArray, a: float, b: float) -> Co
     )
 
 
-def _crossing(u_D: _Values, fixed: _Facets, alpha: _Values, contact: _Facets) -> list[Complaint]:
+def _crossing(
+    u_D: _Values, fixed: _Facets, alpha: _Values, contact: _Facets, label: str
+) -> list[Complaint]:
     """Where Γ0 meets Γ1 with α above u_D, so that K is empty; collective."""
     mesh = u_D.mesh
     comm = mesh.comm
@@ -350,7 +408,7 @@ def _crossing(u_D: _Values, fixed: _Facets, alpha: _Values, contact: _Facets) ->
     return [
         (
             where := place(contact.x[meets][i], mesh),
-            f"data.obstacle: at {shown(where)}, where contact and dirichlet meet, the obstacle is"
+            f"{label}: at {shown(where)}, where contact and dirichlet meet, the obstacle is"
             f" {top[i]:.10g} but the dirichlet value is only {below[i]:.10g}; the obstacle must not"
             " be above it",
         )

@@ -37,7 +37,7 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
     """
     found = []
     for condition in forms.natural:
-        given = _is_given(forms, condition) and number(condition.value) != 0.0
+        given = condition.source != "exact.u" and number(condition.main) != 0.0
         if given and domain.mesh.comm.allreduce(len(domain.facets(condition.number))) == 0:
             found.append(f"{condition.source}: it acts nowhere, for no facet is {condition.part}")
     if forms.exact is not None:
@@ -45,11 +45,6 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
         if said is not None:
             found.append(f"exact.u: {said}: it is not the solution, and errors say how far from it")
     return found
-
-
-def _is_given(forms: Forms, condition: Condition) -> bool:
-    """Tell whether a condition's data are the user's own."""
-    return getattr(forms.problem, condition.key) is not None
 
 
 class _Solution:
@@ -64,11 +59,37 @@ class _Solution:
         self.slope: Any = None if flat else forms.kappa * ufl.grad(self.u)
 
     def complaint(self) -> str | None:
-        """The first of the conditions on Γ1, in Ω, on Γ0 and on Γg that u violates; collective."""
-        (contact,) = self.forms.bounded
+        """The first condition that u violates: on Γ1, in Ω, on other parts; collective."""
+        said = None
+        for contact in self.forms.bounded:
+            said = said or self._on_contact(contact)
+        problem = self.forms.problem
+        if problem.f is not None and not said:
+            tdim = self.mesh.topology.dim
+            number_of = self.mesh.topology.index_map(tdim).size_local
+            cells: Int32Array = np.arange(number_of, dtype=np.int32)
+            x = compute_midpoints(self.mesh, tdim, cells)
+            f = ufl.as_ufl(0.0) if self.forms.asked is None else self.forms.asked
+            given, wanted = self._values(self.forms.f, x, cells), self._values(f, x, cells)
+            said = self._same("data.f", x, given, wanted)
+        for condition in self.forms.conditions:
+            if said or condition.source == "exact.u":
+                continue
+            x, cells, n = self._facets(condition.number)
+            if condition.fixed is not None:
+                given = self._values(condition.fixed, x, cells)
+                said = self._same(condition.label, x, given, self._values(self.u, x, cells))
+            elif condition.lower is None and condition.flux is not None:
+                given = self._values(condition.flux, x, cells)
+                said = self._same(condition.label, x, given, self._flux(condition, x, cells, n))
+        return said
+
+    def _on_contact(self, contact: Condition) -> str | None:
         x, cells, n = self._facets(contact.number)
         u, alpha = self._values(self.u, x, cells), self._values(contact.lower, x, cells)
-        pressure = self._flux(x, cells, n)
+        pressure = self._flux(contact, x, cells, n)
+        if contact.flux is not None:
+            pressure = _difference(pressure, self._values(contact.flux, x, cells))
         gap = _difference(u, alpha)
         height, force = self._size(u, alpha), self._size(pressure)
         said = self._first(
@@ -84,35 +105,12 @@ class _Solution:
         )
         apart = (gap[0] > ENOUGH * height + gap[1]) & (pressure[0] > low)
         words = "the pressure on the obstacle is {:.6g} though u is above it by {:.6g}"
-        said = said or self._first(apart, x, words, pressure, gap)
-        problem = self.forms.problem
-        if problem.f is not None and not said:
-            tdim = self.mesh.topology.dim
-            cells = np.arange(self.mesh.topology.index_map(tdim).size_local, dtype=np.int32)
-            x = compute_midpoints(self.mesh, tdim, cells)
-            f = ufl.as_ufl(0.0) if self.forms.asked is None else self.forms.asked
-            said = self._same(
-                "f", x, self._values(self.forms.f, x, cells), self._values(f, x, cells)
-            )
-        for condition in self.forms.conditions:
-            if said or not _is_given(self.forms, condition):
-                continue
-            x, cells, n = self._facets(condition.number)
-            if condition.fixed is not None:
-                given = self._values(condition.fixed, x, cells)
-                said = self._same(condition.key, x, given, self._values(self.u, x, cells))
-            elif condition.flux is not None:
-                given, wanted = self._values(condition.flux, x, cells), self._flux(x, cells, n)
-                added = condition.a(self.u, ufl.as_ufl(1.0))
-                if added is not None:
-                    wanted = _difference(wanted, self._values(-added, x, cells))
-                said = self._same(condition.key, x, given, wanted)
-        return said
+        return said or self._first(apart, x, words, pressure, gap)
 
     def _same(self, key: str, x: FloatArray, given: Found, wanted: Found) -> str | None:
         gap = _difference(given, wanted)
         wrong = np.abs(gap[0]) > ENOUGH * self._size(given, wanted) + gap[1]
-        words = f"data.{key} is {{:.6g}}, but it asks for {{:.6g}}"
+        words = f"{key} is {{:.6g}}, but it asks for {{:.6g}}"
         return self._first(wrong, x, words, given, wanted)
 
     def _facets(self, part: int) -> tuple[FloatArray, Int32Array, FloatArray]:
@@ -135,12 +133,17 @@ class _Solution:
             return np.full(shape, np.nan), np.full(shape, np.nan)
         return found[0], SAFETY * found[1]
 
-    def _flux(self, x: FloatArray, cells: Int32Array, n: FloatArray) -> Found:
+    def _flux(self, where: Condition, x: FloatArray, cells: Int32Array, n: FloatArray) -> Found:
+        """κ∂ₙu + b u."""
         if self.slope is None:
-            return np.zeros(len(x)), np.zeros(len(x))
-        values, errors = self._values(self.slope, x, cells)
-        n = n[:, : values.shape[1]]
-        return (values * n).sum(axis=1), (errors * np.abs(n)).sum(axis=1)
+            found = np.zeros(len(x)), np.zeros(len(x))
+        else:
+            values, errors = self._values(self.slope, x, cells)
+            n = n[:, : values.shape[1]]
+            found = (values * n).sum(axis=1), (errors * np.abs(n)).sum(axis=1)
+        if where.loss is None:
+            return found
+        return _difference(found, self._values(-where.loss * self.u, x, cells))
 
     def _size(self, *found: Found) -> float:
         """The largest value on any rank."""

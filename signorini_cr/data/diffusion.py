@@ -40,7 +40,8 @@ class DiffusionOnMesh:
     @cached_property
     def cells(self) -> Cells:
         """The mesh as arrays, for the Crouzeix-Raviart element."""
-        return Cells(self.domain, self.V, [condition.number for condition in self.forms.fixed])
+        fixed = [condition.number for condition in self.forms.fixed]
+        return Cells(self.domain, self.V, fixed, self.forms.sinks)
 
     @cached_property
     def load(self) -> Load:

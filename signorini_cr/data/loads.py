@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from mpi4py import MPI
 
-from ..arrays import FloatArray, IndexArray
-from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare
+from ..arrays import BoolArray, FloatArray, IndexArray
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..fem.conditions import number
 from ..fem.space import facet_quadrature
 from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
@@ -59,6 +60,29 @@ class Load:
             out -= d * self.hats[:, part]
         out *= cells.volume[part]
         return out
+
+    def less(self, c: float, w: FloatArray) -> Load:
+        """The same of f − c w, w affine on each cell.
+
+        Args:
+            c: A number.
+            w: Values at the cells' vertices, shape (d + 1, cells).
+        """
+        k = len(w)
+        total = sum_rows(w)
+        middle = total / k
+        hats = (w - middle) / (k * (k + 1))  # means of (w − w_T) λ_i
+        variance = dot_rows(w - middle, hats)
+        rows = [*hats, *((total / 45.0 - w / 15.0) if k == 3 else np.zeros_like(w))]
+        if self.hats is None or self.bumps is None or self.variance is None:
+            return Load(self.mean - c * middle, -c * np.stack(rows), c**2 * variance)
+        variance = self.variance - 2.0 * c * dot_rows(w, self.hats) + c**2 * variance
+        of_f = [*self.hats, *self.bumps]
+        return Load(
+            self.mean - c * middle,
+            np.stack([a - c * b for a, b in zip(of_f, rows, strict=True)]),
+            np.maximum(variance, 0.0),
+        )
 
     @classmethod
     def of(cls, f: Volume, cells: Cells) -> Load:
@@ -124,7 +148,15 @@ class Certain:
     reason: str | None = None
 
     @classmethod
-    def of(cls, f: Volume, load: Load, cells: Cells, low: FloatArray, size: float) -> Certain:
+    def of(
+        cls,
+        f: Volume,
+        load: Load,
+        cells: Cells,
+        low: FloatArray,
+        size: float,
+        reaction: float = 0.0,
+    ) -> Certain:
         """Enclose f; collective.
 
         Args:
@@ -133,6 +165,7 @@ class Certain:
             cells: The mesh.
             low: Lower bound of κ, shape (cells,) or ().
             size: Of the bound, to which what is missed should be small.
+            reaction: c.
         """
         if f.number is not None:
             return cls(load)
@@ -148,8 +181,9 @@ class Certain:
         goal = SHARE * size
         weights = np.empty((2, cells.number))
         np.multiply(2.0 / (np.sqrt(low) * goal), cells.volume, out=weights[0])
-        np.multiply((2.0 * poincare(cells.tdim) / goal) ** 2 / low, cells.diameter2, out=weights[1])
-        weights[1] *= cells.volume
+        # J(v) asks for the first of these, the bound for the second
+        norms = mean_to_norm(cells, low, 0.0) * mean_to_norm(cells, low, reaction)
+        np.multiply((2.0 / goal) ** 2 * cells.volume, norms, out=weights[1])
         try:
             found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
         except Unknown as error:
@@ -161,45 +195,112 @@ class Certain:
         return cls(load.refined(fine, cells, found), missed, rough, reason)
 
 
+def mean_to_norm(
+    cells: Cells, low: FloatArray, reaction: float, part: slice | None = None
+) -> FloatArray:
+    """C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the part,).
+
+    Args:
+        cells: The mesh.
+        low: Lower bound of κ, shape (cells,) or ().
+        reaction: c.
+        part: Which cells; None for all.
+    """
+    part = slice(0, cells.number) if part is None else part
+    by_slope = poincare(cells.tdim) * np.sqrt(cells.diameter2[part] / pick(low, part))
+    return np.minimum(by_slope, reaction**-0.5) if reaction else by_slope
+
+
 SHARE = 4e-3
 """What may be missed of f, in parts of the bound, or thereabouts."""
 UNBOUNDED = "f is not bounded on the mesh, or not known to be"
 
 
 class Edge:
-    """What is needed of g on Γg.
+    """What is needed of g on a part of the boundary.
 
     Attributes:
         side: The facets.
         measure: |F|, shape (n,).
-        values: g at the quadrature points, shape (q, n).
         shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
+        loss: b, where g − b u_h is what is meant in the end; 0 where there is none.
+        bounded: Whether u is bounded there.
     """
 
     def __init__(self, sampled: OnFacets, cells: Cells):
         """Take g's values, and integrate them."""
         g = self.g = sampled.trace
         self.side, self._cells = sampled.side(cells), cells
-        self.values = sampled.seen_from(cells).inside
         self.measure = measures(cells, self.side)
-        self.shares = self.measure * (g.hats.T * g.weights @ self.values)
+        inside = sampled.seen_from(cells).inside
+        self.shares = self.measure * (g.hats.T * g.weights @ inside)
+        condition = sampled.condition
+        self.loss = 0.0 if condition.loss is None else number(condition.loss) or 0.0
+        self.bounded = condition.lower is not None
 
     def to_cells(self) -> FloatArray:
         """∫_F g ψ_i for the Crouzeix-Raviart functions of the facet's cell, shape (d + 1, n).
 
         ψ_i = 1 − d λ_i; on the facet itself λ_i = 0.
         """
-        d = self._cells.tdim
-        out = np.tile(self.shares.sum(axis=0), (d + 1, 1))
-        at = np.arange(len(self.measure))
-        for j, share in zip(self._cells.others[self.side.local].T, self.shares, strict=True):
-            out[j, at] -= d * share
-        return out
+        return to_cells(self._cells, self.side, self.shares)
+
+
+def to_cells(cells: Cells, side: Side, shares: FloatArray) -> FloatArray:
+    """Integrals of g ψ_i over facets from those of g λ_j, see `Edge`."""
+    d = cells.tdim
+    out = np.tile(shares.sum(axis=0), (d + 1, 1))
+    at = np.arange(shares.shape[1])
+    for j, share in zip(cells.others[side.local].T, shares, strict=True):
+        out[j, at] -= d * share
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of the fluxes through the boundary: g − b u_h on all parts with a g or a b.
+
+    Attributes:
+        side: The facets.
+        shares: ∫_F (g − b u_h) λ_j for the facet's ends j, shape (d, n).
+        loss: b, shape (n,).
+        bounded: Whether u is bounded there, shape (n,).
+    """
+
+    side: Side
+    shares: FloatArray
+    loss: FloatArray
+    bounded: BoolArray
+
+    @classmethod
+    def of(cls, edges: Sequence[Edge], cells: Cells, w: FloatArray) -> Known:
+        """Put all parts together.
+
+        Args:
+            edges: g on them.
+            cells: The mesh.
+            w: u_h at the cells' vertices, shape (d + 1, cells).
+        """
+        d = cells.tdim
+        side = Side.joined([edge.side for edge in edges], d)
+        loss = np.concatenate([np.full(len(e.measure), e.loss) for e in edges] or [np.empty(0)])
+        bounded = [np.full(len(edge.measure), edge.bounded) for edge in edges]
+        shares = np.concatenate([np.empty((d, 0)), *(edge.shares for edge in edges)], axis=1)
+        if loss.any():
+            ends = trace_of(cells, side, w)
+            measure = np.concatenate([edge.measure for edge in edges])
+            shares -= loss * measure * (ends + ends.sum(axis=0)) / (d * (d + 1))
+        return cls(side, shares, loss, np.concatenate([np.empty(0, dtype=bool), *bounded]))
+
+
+def trace_of(cells: Cells, side: Side, w: FloatArray) -> FloatArray:
+    """A function's values at the ends of boundary facets, seen from their cells, shape (d, n)."""
+    return w[cells.others[side.local].T, side.cells]
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """g on pieces of the facets of Γg, and what quadrature may have missed of it.
+    """g − b u_h on pieces of facets, and what quadrature may have missed of it.
 
     On each facet there is a q with the moments that these values have, |∫_F (g − q)| ≤ missed
     and ‖g − q‖_F ≤ rough.
@@ -215,6 +316,9 @@ class Segments:
         through: ∫_F g, shape (facets,).
         missed: Shape (facets,).
         rough: Shape (facets,).
+        loss: b, shape (facets,).
+        bounded: Whether u is bounded there, shape (facets,).
+        low: Lower bound of κ, shape (cells,) or ().
         reason: Why there are none, if there are none.
     """
 
@@ -229,11 +333,62 @@ class Segments:
     through: FloatArray
     missed: FloatArray
     rough: FloatArray
+    loss: FloatArray
+    bounded: BoolArray
+    low: FloatArray
     reason: str | None = None
 
     @classmethod
+    def joined(
+        cls, edges: Sequence[Edge], cells: Cells, w: FloatArray, low: FloatArray, size: float
+    ) -> Segments:
+        """Enclose g on several parts, and take b u_h off; collective.
+
+        Args:
+            edges: g on them by the scheme's own rule, on one part or more.
+            cells: The mesh.
+            w: u_h at the cells' vertices, shape (d + 1, cells).
+            low: Lower bound of κ, shape (cells,) or ().
+            size: Of the bound, to which what is missed should be small.
+        """
+        found = [cls.of(edge, cells, low, size) for edge in edges]
+        first = np.cumsum([0, *(len(each.through) for each in found)])
+
+        def rows(name: str, axis: int = -1) -> FloatArray:
+            return np.concatenate([getattr(each, name) for each in found], axis=axis)
+
+        facets = Side.joined([each.facets for each in found], cells.tdim)
+        loss, hats, values, through = rows("loss"), rows("hats"), rows("values"), rows("through")
+        place = np.concatenate([e.place + k for e, k in zip(found, first[:-1], strict=True)])
+        measure = rows("measure")
+        if loss.any():
+            ends = trace_of(cells, facets, w)
+            lost = loss[place] * np.einsum("qdn,dn->qn", hats, ends[:, place])
+            values = values - lost
+            through = through - np.bincount(
+                place, measure * (found[0].weights @ lost), minlength=len(through)
+            )
+        return cls(
+            cells,
+            facets,
+            Side.joined([each.side for each in found], cells.tdim),
+            place,
+            hats,
+            found[0].weights,
+            measure,
+            values,
+            through,
+            rows("missed"),
+            rows("rough"),
+            loss,
+            rows("bounded") > 0,
+            low,
+            next((each.reason for each in found if each.reason), None),
+        )
+
+    @classmethod
     def of(cls, edge: Edge, cells: Cells, low: FloatArray, size: float) -> Segments:
-        """Enclose g; collective.
+        """Enclose g alone; collective.
 
         Args:
             edge: g by the scheme's own rule.
@@ -295,6 +450,9 @@ class Segments:
             total(weights @ values),
             2.0 * total(inside[0]),
             2.0 * np.sqrt(total(inside[1])),
+            np.full(n, edge.loss),
+            np.full(n, edge.bounded),
+            low,
             reasons[0] if reasons else None,
         )
 
@@ -323,13 +481,24 @@ class Segments:
         found = np.bincount(self.place, amounts, minlength=len(self.through))
         return found.astype(np.float64)
 
+    @cached_property
+    def given(self) -> BoolArray:
+        """Where b takes up q − g_F more cheaply than a field in the cell does, shape (facets,)."""
+        low, constant = pick(self.low, self.facets.cells), _trace_constant(self.cells, self.facets)
+        return self.loss * constant**2 > low
+
+    @cached_property
+    def squares(self) -> FloatArray:
+        """‖q − g_F‖²_F, shape (facets,)."""
+        return self._over_facets(self.measure * (self.weights @ self.rest**2))
+
     def oscillation(self, carried: bool) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each.
+        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each, where b does not take that up.
 
         Args:
             carried: Whether y carries q's affine part, and what is left of q − g_F is meant.
         """
-        squares = self._over_facets(self.measure * (self.weights @ self.rest**2))
+        squares = np.where(self.given, 0.0, self.squares)
         if carried:
             squares = squares - self._over_facets(self.measure) * self.slope**2 / 3.0
         return self._by_cell(np.sqrt(np.maximum(squares, 0.0)))
@@ -337,6 +506,25 @@ class Segments:
     def beyond(self) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""
         return self._by_cell(self.rough)
+
+    def at_facets(
+        self, vertices: FloatArray, bumps: FloatArray, w: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """b, and bounds of ‖g − b u_h‖_F and ‖v − u_h‖_F, by facet dof; 0 on other facets.
+
+        Args:
+            vertices: v at the vertices.
+            bumps: Heights of v's bumps.
+            w: u_h at the cells' vertices, shape (d + 1, cells).
+        """
+        found = np.zeros((3, len(self.cells.exterior)))
+        at = self.facets.dofs
+        area = np.bincount(self.place, self.measure, minlength=len(at))
+        ends = np.abs(vertices[self.facets.ends] - trace_of(self.cells, self.facets, w)).max(axis=0)
+        bump = np.abs(bumps[at]) if self.cells.tdim == 2 else 0.0
+        norm = np.sqrt(self._over_facets(self.measure * (self.weights @ self.values**2)))
+        found[:, at] = self.loss, norm + self.rough, np.sqrt(area) * (ends + bump)
+        return found[0], found[1], found[2]
 
     def change(self, vertices: FloatArray, bumps: FloatArray) -> float:
         """How far ∫_Γg q v may be from ∫_Γg g v, v by vertices and bumps; this rank's share."""

@@ -6,6 +6,7 @@ where they are numbers exactly.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -353,7 +354,7 @@ class OnFacets:
         """The same for the one unknown of each facet."""
         only = np.zeros(1, dtype=np.int32)
         means, ends = self.means[:, None], self.ends.T[:, :, None]
-        return Imposed(self.condition.key, self.facets, only, means, ends)
+        return Imposed(self.condition.label.removeprefix("data."), self.facets, only, means, ends)
 
     def seen_from(self, cells: Cells) -> OnFacets:
         """Keep the facets of owned cells, those of the part's `Side`."""
@@ -365,6 +366,46 @@ class OnFacets:
     def side(self, cells: Cells) -> Side:
         """The facets of owned cells, seen from these."""
         return cells.sides[self.condition.number]
+
+
+@dataclass(frozen=True, eq=False)
+class OnParts:
+    """What conditions of one kind say, on the facets of owned cells, part after part.
+
+    Attributes:
+        parts: The parts' data, seen from the cells.
+        side: All facets.
+    """
+
+    parts: tuple[OnFacets, ...]
+    side: Side
+
+    @classmethod
+    def of(cls, sampled: Sequence[OnFacets], cells: Cells) -> OnParts:
+        """Keep the facets of owned cells."""
+        parts = tuple(each.seen_from(cells) for each in sampled)
+        return cls(parts, Side.joined([each.side(cells) for each in parts], cells.tdim))
+
+    @property
+    def ends(self) -> FloatArray:
+        """Values at the vertices, in the order of the cell's closure, shape (d, n)."""
+        none = np.empty((len(self.side.ends), 0))
+        return np.concatenate([none, *(each.ends for each in self.parts)], axis=1)
+
+    @property
+    def middle(self) -> FloatArray:
+        """Values at the midpoints, shape (n,)."""
+        return np.concatenate([np.empty(0), *(each.middle for each in self.parts)])
+
+    @property
+    def means(self) -> FloatArray:
+        """Means over the facets, shape (n,)."""
+        return np.concatenate([np.empty(0), *(each.means for each in self.parts)])
+
+    @property
+    def traces(self) -> list[Trace]:
+        """The data themselves."""
+        return [each.trace for each in self.parts]
 
 
 class Compiled:

@@ -19,16 +19,16 @@ from dolfinx import fem
 from .. import compat
 from ..arrays import FloatArray
 from ..data.diffusion import diffusion
-from ..data.loads import Certain, Load, Segments
-from ..data.moments import Coefficient
-from ..fem.cells import Cells, blocks, pick, poincare, sum_rows
+from ..data.loads import Certain, Known, Load, Segments, mean_to_norm
+from ..data.moments import Coefficient, OnParts
+from ..fem.cells import Cells, blocks, measures, pick, sum_rows
 from ..jit import compiled
 from .beyond import Beyond
-from .companion import Companion, companion, on_facet
+from .companion import Companion, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
-from .flux import Flux, balance, equilibrate, field_squares, unbalanced
+from .flux import Flux, balance, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
 from .sums import Sums
 
@@ -211,8 +211,9 @@ class _Known:
         level: The mesh, with those below it.
         cells: What the certificate needs to know of it.
         kappa: The coefficient.
-        certain: f.
-        segments: g.
+        reaction: c.
+        certain: f − c u_h.
+        segments: g − b u_h.
         flux: y.
         w: u_h at the cells' vertices, shape (d + 1, cells).
         size: About how large the bound will be.
@@ -223,6 +224,7 @@ class _Known:
     level: Level
     cells: Cells
     kappa: Coefficient
+    reaction: float
     certain: Certain
     segments: Segments
     flux: Flux
@@ -245,29 +247,36 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     _insist(data.forms.uncertified)
     if data.compiled.kappa is None:
         raise _NoBound(TENSOR)
-    cells, load, (edge,), (alpha,) = data.cells, data.load, data.edges, data.alpha
-    kappa = Coefficient(data.compiled.kappa, cells)
+    cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
+    kappa, reaction = Coefficient(data.compiled.kappa, cells), data.forms.reaction_number
     _insist(kappa.reason)
-    w, contact_side = vertex_rows(u, cells), alpha.side(cells)
-    gap = u[contact_side.dofs] - alpha.seen_from(cells).means
-    flux = equilibrate(cells, kappa.mean, w, load, edge, contact_side, gap)
+    w = vertex_rows(u, cells)
+    load, edge = data.load, Known.of(data.edges, cells, w)
+    of_u = load if reaction == 0.0 else load.less(reaction, w)
+    gap = u[alpha.side.dofs] - alpha.means
+    flux = equilibrate(cells, kappa.mean, w, of_u, edge, alpha.side, gap)
+    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, alpha.side)
     size = _size(cells, kappa, w, flux)
-    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size)
+    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size, reaction)
     _insist(certain.reason)
-    segments = Segments.of(edge, cells, kappa.low, size)
+    segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
     # y is to have the means that f and g have now
     flux.left += cells.volume * (certain.load.mean - load.mean)
+    if reaction:
+        certain = replace(certain, load=certain.load.less(reaction, w))
     change = segments.through - edge.shares.sum(axis=0)
     flux.excess[edge.side.local, edge.side.cells] += change
     np.add.at(flux.left, edge.side.cells, change)
-    left = unbalanced(level, cells, flux.left, kappa.low, size)
-    carried = balance(cells, flux, kappa.low, size, left)
-    if carried:
-        left = unbalanced(level, cells, flux.left, kappa.low, size)
+    left = carried = 0.0
+    if not flux.taken_up:
+        left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
+        carried = balance(cells, flux, kappa.low, size, left)
+        if carried:
+            left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
-    return _Known(level, cells, kappa, certain, segments, flux, w, size, left, carried)
+    return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
 
 
 def _companion(
@@ -283,14 +292,20 @@ def _companion(
         flux.excess -= cells.tdim * kappa.mean * change
         known.w = own
     data = diffusion(known.level.data)
-    u_D, alpha = (sampled.seen_from(cells) for (sampled,) in (data.u_D, data.alpha))
-    steady = kappa.high - kappa.low <= STEADY * kappa.mean
+    u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
+    plain = data.forms.of_one is None
+    steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
     highest = max(cells.comm.allgather(kappa.high.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     u = base.u.x.array
-    v = companion(cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal)
-    sums = integrate(cells, kappa, known.w, load, flux, v)
-    if promising(cells, kappa.mean, flux, sums):
+    segments = known.segments
+    lossy = segments.loss > 0.0
+    side = segments.facets.picked(lossy)
+    of_facets = segments.loss[lossy] * measures(cells, side)
+    masses = Masses(not plain, known.reaction, side, of_facets)
+    v = companion(cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal, masses)
+    sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
+    if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
             v = cubed(cells, kappa.mean, flux, v)
         improve(cells, kappa.mean, load, known.segments, flux, v)
@@ -300,7 +315,7 @@ def _companion(
             cells, known.w, load, kappa.low, flux, (v.excess, v.bumps), sums
         )
     assert sums.indicators is not None
-    np.add.at(sums.indicators, alpha.side(cells).cells, v.contact)
+    np.add.at(sums.indicators, alpha.side.cells, v.contact)
     return v, sums
 
 
@@ -312,14 +327,14 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     """
     cells, kappa, flux, w = known.cells, known.kappa, known.flux, known.w
     certain, segments = known.certain, known.segments
-    edge_square = integrate_edge(cells, kappa, w, certain.load, segments, flux, v, sums)
-    lift, lift_energy, lift_far, lift_near = _lifted(cells, kappa, certain, v, sums)
+    edge_square = integrate_edge(
+        cells, kappa, w, certain.load, segments, flux, v, sums, known.reaction
+    )
+    lift, lift_energy, lift_far, lift_near = _lifted(known, v, sums)
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
     edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
-    hidden, hidden_energy = _hidden(
-        known.level, cells, kappa, certain, segments, v, sums, known.size
-    )
-    rounding = _rounding(cells, kappa, w, certain.load, flux)
+    hidden, hidden_energy = _hidden(known, v, sums)
+    rounding = _rounding(cells, kappa, known.reaction, w, certain.load, flux)
     assert sums.middle is not None and sums.steepness is not None
     total = sums.over_ranks(cells)
     contact, edge_square, edge_energy, lift, lift_energy, lift_far, lift_near = cells.total(
@@ -403,7 +418,9 @@ ROUNDING = 64 * np.finfo(np.float64).eps
 """Relative error of what a cell adds to the certificate's norms."""
 
 
-def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux: Flux) -> float:
+def _rounding(
+    cells: Cells, kappa: Coefficient, reaction: float, w: FloatArray, load: Load, flux: Flux
+) -> float:
     """What rounding may do to ‖p ± b‖; collective.
 
     Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
@@ -421,43 +438,39 @@ def _rounding(cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux:
         if load.variance is not None:
             of_load += np.sqrt(load.variance[part])
         square += cells.diameter2[part] * cells.volume[part] * of_load**2 / low
+        square += reaction * cells.volume[part] * values**2
         if largest is not None:
             square += trace * largest[part] ** 2 / low
         total += float(np.sum(square))
     return float(ROUNDING * np.sqrt(cells.total(total)[0]))
 
 
-def _hidden(
-    level: Level,
-    cells: Cells,
-    kappa: Coefficient,
-    certain: Certain,
-    segments: Segments,
-    v: Companion,
-    sums: Sums,
-    size: float,
-) -> tuple[float, float]:
+def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
 
     On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
     on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise. Whatever the signs of the first
     terms, they are bounded as if all were the same: by what they are for |e|, which has ∇e's norm.
     """
+    level, cells, kappa, size = known.level, known.cells, known.kappa, known.size
+    certain, segments = known.certain, known.segments
     counts = certain.missed is not None, bool(segments.missed.any())
     if not any(cells.total(*counts)):
         return 0.0, 0.0
     missed, square, change = np.zeros(cells.number), 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
-        missed, constant = certain.missed, poincare(cells.tdim)
+        missed = certain.missed
         assert sums.steepness is not None
         for part in blocks(cells.number):
-            rough = np.sqrt(cells.diameter2[part] / pick(kappa.low, part)) * certain.rough[part]
-            rough *= constant
+            by_slope, rough = (
+                mean_to_norm(cells, kappa.low, c, part) * certain.rough[part]
+                for c in (0.0, known.reaction)
+            )
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
             if cells.tdim == 2:
                 means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3
             steep = np.sqrt(np.maximum(sums.steepness[part], 0.0))
-            change += float(means @ missed[part] + rough @ steep)
+            change += float(means @ missed[part] + by_slope @ steep)
             square += float(rough @ rough)
         if v.cusps is not None:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
@@ -467,7 +480,8 @@ def _hidden(
     change += segments.change(v.vertices, v.bumps)
     square, on_edge, change = cells.total(square, on_edge**2, change)
     loose = np.sqrt(square) + np.sqrt(on_edge)
-    return loose + unbalanced(level, cells, missed, kappa.low, size), float(change)
+    missed_in_all = unbalanced(level, cells, missed, kappa.low, size, known.reaction)
+    return loose + missed_in_all, float(change)
 
 
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
@@ -479,18 +493,17 @@ def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
     return out
 
 
-def _lifted(
-    cells: Cells, kappa: Coefficient, certain: Certain, v: Companion, sums: Sums
-) -> tuple[float, float, float, float]:
+def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, float, float]:
     """Bounds of what ℓ changes, this rank's shares.
 
     Returns:
-        ‖κ^{1/2} ∇ℓ‖², how far J(v + ℓ) may be from J(v), and what ‖p − b‖² and ‖p + b‖² grow by,
-        the last put into the cells' shares.
+        ℓ's energy norm squared, how far J(v + ℓ) may be from J(v), and what ‖p − b‖² and ‖p + b‖²
+        grow by, the last put into the cells' shares.
     """
-    at, slope, size = v.lift
+    at, slope, size, edge = v.lift
     if not len(at):
         return 0.0, 0.0, 0.0, 0.0
+    cells, kappa, certain, reaction = known.cells, known.kappa, known.certain, known.reaction
     which, place = np.unique(at, return_inverse=True)
     high = kappa.high[which] if kappa.high.ndim else kappa.high
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
@@ -503,9 +516,21 @@ def _lifted(
     assert sums.steepness is not None
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
     assert sums.indicators is not None
-    change = before * steep + 0.5 * steep**2 + np.sqrt(cells.volume[which]) * f * area
+    change = before * steep + np.sqrt(cells.volume[which]) * f * area
+    if sums.apart is not None:
+        steep = np.hypot(steep, np.sqrt(reaction) * area)
+        change += np.sqrt(reaction * sums.apart[which]) * area
+    # on facets of Γ1 with a flux that is known
+    loss, known_flux, apart = known.segments.at_facets(v.vertices, v.bumps, known.w)
+    there, on_contact = v.boundary.alpha.side.dofs, place[-len(edge) :] if len(edge) else place[:0]
+    more = edge * (known_flux[there] + loss[there] * apart[there])
+    change += np.bincount(on_contact, more, minlength=len(which))
+    steep = steep + np.bincount(on_contact, np.sqrt(loss[there]) * edge, minlength=len(which))
+    change += 0.5 * steep**2
     assert sums.middle is not None and sums.across is not None
     noise = 1e-14 * sums.indicators[which]
+    if sums.zeroth is not None:
+        noise = noise + 2.0 * sums.zeroth[which]
     far, near = (
         steep * (2.0 * np.sqrt(np.maximum(row[which], 0.0) + noise) + steep)
         for row in (sums.across, sums.middle)

@@ -18,15 +18,15 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
-from ..data.moments import OnFacets
-from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick
+from ..data.moments import OnFacets, OnParts
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, sum_rows
 from .cusps import Cusps
 from .flux import Flux
-from .lifting import Cubic, Lift, affine, lift
+from .lifting import Cubic, Lift, affine, joined, lift
 from .nearest import Slopes, nearest
 from .shapes import bump_slopes, local_thirds, third_slopes
 
-Lifted = tuple[IndexArray, FloatArray, FloatArray]
+Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
 
 JUMP = "u_D jumps where boundary facets meet: no function of finite energy has such values"
 BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
@@ -42,6 +42,32 @@ ROUNDS = 3
 """How often v is solved for; after each time but the last what is below α is held there."""
 
 
+@dataclass(frozen=True, eq=False)
+class Masses:
+    """What E has of terms without gradients: c‖v − u_h‖² on cells, b‖v − u_h‖² on facets.
+
+    Attributes:
+        some: Whether there is a c or a b, here or on other ranks.
+        reaction: c.
+        side: Facets with a b.
+        loss: b |F| there, shape (n,).
+    """
+
+    some: bool
+    reaction: float
+    side: Side
+    loss: FloatArray
+
+    def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
+        """Add what heights of bumps are pulled by, in units of 8/3, shape (3, n)."""
+        return self.reaction * cells.volume[part] / 20.0 * (excess - 2.0 * sum_rows(excess))
+
+    def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
+        """The same of b, on its facets."""
+        ends = excess[others[self.side.local].T, self.side.cells]
+        return -0.25 * self.loss * ends.sum(axis=0)
+
+
 @dataclass(eq=False)
 class Companion:
     """v, and what is needed of it.
@@ -51,7 +77,7 @@ class Companion:
         bumps: Heights of v's bumps by facet dof, ghosts included.
         excess: v − u_h at the cells' vertices, before the bumps, shape (d + 1, cells).
         contact: Σ over Γ1 of ∫_F (y·n)(v + ℓ − α), by facet, shape (n,).
-        lift: Pairs of cells and bounds of ‖∇ℓ‖_T, ‖ℓ‖_T, shapes (n,).
+        lift: Cells, bounds of ‖∇ℓ‖_T and ‖ℓ‖_T on them, shapes (n,); and of ‖ℓ‖_F on Γ1's facets.
         reason: Why v is not admissible, if it isn't.
         boundary: What v has to be on Γ0 and above on Γ1.
         cusps: What v has beyond vertices and bumps; None if nothing, then on all ranks.
@@ -98,11 +124,12 @@ def companion(
     w: FloatArray,
     u: FloatArray,
     flux: Flux,
-    u_D: OnFacets,
-    alpha: OnFacets,
+    u_D: OnParts,
+    alpha: OnParts,
     sweeps: int,
     steady: BoolArray,
     goal: float,
+    masses: Masses,
 ) -> Companion:
     """Make v.
 
@@ -117,17 +144,20 @@ def companion(
         sweeps: How often the bumps are improved.
         steady: Where κ is constant on the cell, shape (cells,) or ().
         goal: What ‖∇ℓ‖ need not be known better than.
+        masses: What E has beside gradients.
     """
-    fixed, contact = u_D.side(cells), alpha.side(cells)
+    fixed, contact = u_D.side, alpha.side
     obstacle, middle = alpha.ends, alpha.middle
     touching = flux.touching
-    v = _at_vertices(cells, kappa, w, fixed, u_D.ends, contact, obstacle, touching)
+    v = _at_vertices(cells, kappa, masses, w, fixed, u_D.ends, contact, obstacle, touching)
     scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
     scale = max(cells.comm.allgather(scale))
     wrong = [
-        JUMP if differs(cells, fixed, np.abs(v[fixed.ends] - u_D.ends), scale, u_D.trace) else None,
+        JUMP
+        if differs(cells, fixed, np.abs(v[fixed.ends] - u_D.ends), scale, *u_D.traces)
+        else None,
         BELOW
-        if differs(cells, contact, obstacle - v[contact.ends], scale, u_D.trace, alpha.trace)
+        if differs(cells, contact, obstacle - v[contact.ends], scale, *u_D.traces, *alpha.traces)
         else None,
     ]
     bumps = np.zeros(len(u))
@@ -151,13 +181,15 @@ def companion(
         np.subtract(v[cells.vertices[:, part]], w[:, part], out=excess[:, part])
     cusps = None
     if cells.tdim == 2 and sweeps > 0:
-        energy, promise = _sweep(cells, kappa, excess, bumps, free, (fixed, contact), sweeps)
+        energy, promise = _sweep(
+            cells, kappa, masses, excess, bumps, free, (fixed, contact), sweeps
+        )
         bumps[contact.dofs] = np.maximum(bumps[contact.dofs], lowest[contact.dofs])
         held = np.zeros(len(v))
         held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
         loose = cells.share(held, 0) == 0.0
         promise += _promise(cells, kappa, excess, bumps, loose)
-        if promise > PROMISE * energy:
+        if promise > PROMISE * energy and not masses.some:
             v[:], bumps[:], cusps = _solved(
                 cells, kappa, steady, w, (v, bumps), (loose, free), contact, (obstacle, middle)
             )
@@ -180,8 +212,8 @@ class Boundary:
         goal: What ‖∇ℓ‖ need not be known better than.
     """
 
-    u_D: OnFacets
-    alpha: OnFacets
+    u_D: OnParts
+    alpha: OnParts
     scale: float
     goal: float
 
@@ -193,9 +225,14 @@ class Boundary:
         Returns:
             `Companion.contact`, `Companion.lift`, and why there are none.
         """
-        fixed, contact = self.u_D.side(cells), self.alpha.side(cells)
+        fixed, contact = self.u_D.side, self.alpha.side
         lifts = [
-            _lift(cells, data, v, bumps, thirds, self.scale, self.goal, obstacle)
+            joined(
+                [
+                    _lift(cells, part, v, bumps, thirds, self.scale, self.goal, obstacle)
+                    for part in data.parts
+                ]
+            )
             for data, obstacle in ((self.u_D, False), (self.alpha, True))
         ]
         # y·n is constant on a facet: the mean of v + ℓ − α
@@ -209,6 +246,7 @@ class Boundary:
                 np.concatenate([fixed.cells, contact.cells]),
                 np.concatenate([lift.steep for lift in lifts]),
                 np.concatenate([lift.area for lift in lifts]),
+                lifts[1].edge,
             ),
             [lift.reason for lift in lifts],
         )
@@ -217,6 +255,7 @@ class Boundary:
 def _at_vertices(
     cells: Cells,
     kappa: FloatArray,
+    masses: Masses,
     w: FloatArray,
     fixed: Side,
     u_D: FloatArray,
@@ -224,7 +263,7 @@ def _at_vertices(
     obstacle: FloatArray,
     touching: BoolArray,
 ) -> FloatArray:
-    """Means of u_h's values at the vertices, weighted by κ, raised to α on Γ1, u_D on Γ0."""
+    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, u_D."""
     index_map = cells.domain.mesh.topology.index_map(0)
     size = index_map.size_local + index_map.num_ghosts
     flat = cells.vertices.ravel()
@@ -232,18 +271,19 @@ def _at_vertices(
     def collect(where: Any, values: Any) -> FloatArray:
         return cells.share(np.bincount(where, values, minlength=size).astype(np.float64), 0)
 
-    if kappa.ndim:
-        weights = np.tile(kappa, len(w))
-        v = collect(flat, weights * w.ravel())
-        v /= np.maximum(collect(flat, weights), np.finfo(float).tiny)
+    if kappa.ndim or masses.some:
+        weights = np.tile(kappa + masses.reaction * cells.volume, (len(w), 1))
+        for ends in cells.others[masses.side.local].T:
+            np.add.at(weights, (ends, masses.side.cells), masses.loss)
+        v = collect(flat, (weights * w).ravel())
+        v /= np.maximum(collect(flat, weights.ravel()), np.finfo(float).tiny)
     else:
         v = collect(flat, w.ravel())
         v /= np.maximum(collect(flat, None), 1.0)
-    ends = contact.ends.ravel()
-    count = collect(ends, None)
-    value = collect(ends, obstacle.ravel()) / np.maximum(count, 1.0)
+    # where parts with obstacles of their own meet, the higher one counts
+    value = cells.largest_at_vertices(contact.ends, obstacle)
     held = collect(contact.ends[:, touching].ravel(), None) > 0
-    np.copyto(v, np.where(held, value, np.maximum(v, value)), where=count > 0)
+    np.copyto(v, np.where(held, value, np.maximum(v, value)), where=value > -np.inf)
     ends = fixed.ends.ravel()
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ravel()) / np.maximum(count, 1.0), where=count > 0)
@@ -276,12 +316,7 @@ def _solved(
         v at the vertices, the heights, and the cusps.
     """
     (v, bumps), (loose, free), (obstacle, middle) = start, loosened, alpha
-    ends = contact.ends.ravel()
-    total, count = (
-        cells.share(np.bincount(ends, values, minlength=len(v)).astype(np.float64), 0)
-        for values in (obstacle.ravel(), None)
-    )
-    floor = np.where(loose & (count > 0), total / np.maximum(count, 1.0), -np.inf)
+    floor = np.where(loose, cells.largest_at_vertices(contact.ends, obstacle), -np.inf)
     cusps: Cusps | None = None
     best = v, bumps, cusps
     slopes = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
@@ -330,17 +365,19 @@ def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArr
 def _sweep(
     cells: Cells,
     kappa: FloatArray,
+    masses: Masses,
     excess: FloatArray,
     bumps: FloatArray,
     free: BoolArray,
     bumped: tuple[Side, ...],
     steps: int,
 ) -> tuple[float, float]:
-    """Conjugate gradients for E = ‖κ^{1/2}(∇v − ∇u_h)‖² in the heights of the bumps.
+    """Conjugate gradients for E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses in the heights of the bumps.
 
     Args:
         cells: The mesh.
         kappa: Mean of κ, shape (cells,) or ().
+        masses: What E has beside that.
         excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
         bumps: Heights, improved in place.
         free: Which of them may be.
@@ -351,21 +388,50 @@ def _sweep(
         E, and what it would fall by if each height were put right as if it were alone.
     """
     slope, diagonal = np.empty_like(excess), np.empty(cells.number)
-    energy = 0.0
+    energy, c = 0.0, masses.reaction
     for part in blocks(cells.number):
         k = pick(kappa, part)
         diagonal[part] = k * cells.trace(part)
         np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
         energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
-    near = np.unique(np.concatenate([side.cells for side in bumped]))
+        if c:
+            volume = c * cells.volume[part]
+            energy += float(np.sum(volume * distance(excess[:, part], None)))
+            slope[:, part] += masses.pull(cells, excess[:, part], part)
+            diagonal[part] += volume / 15.0
+    ends = excess[cells.others[masses.side.local].T, masses.side.cells]
+    energy += float(np.sum(masses.loss * distance(ends, None)))
+    at = masses.side.local, masses.side.cells
+    np.add.at(slope, at, masses.pull_on_facets(excess, cells.others))
+    lost = np.zeros(len(bumps))
+    lost[masses.side.dofs] = 0.4 * masses.loss
+
+    def image_of(height: FloatArray, part: slice | IndexArray) -> FloatArray:
+        """The matrix of E, but for b, times heights of local bumps, which are lost."""
+        image = _across(cells, height, part)
+        image *= 2.0 * pick(kappa, part)
+        if c:
+            image += c * cells.volume[part] / 15.0 * sum_rows(height)
+        height *= diagonal[part]
+        image += height
+        return image
+
+    near = np.unique(np.concatenate([side.cells for side in (*bumped, masses.side)]))
     flow, height = slope[:, near], bumps[cells.facets[:, near]]
-    change = diagonal[near] * height + 2.0 * pick(kappa, near) * _across(cells, height, near)
+    change = image_of(height.copy(), near)
     slope[:, near] = flow - change
     energy -= 4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
+    on_lossy = bumps[masses.side.dofs]
+    energy += 4 / 3 * float(np.sum(lost[masses.side.dofs] * on_lossy**2))
+    np.subtract.at(slope, at, lost[masses.side.dofs] * on_lossy)
     held = np.flatnonzero(~free)
     down = cells.over_facets(slope)
     down[held] = 0.0
-    weight = cells.over_facets(np.tile(diagonal, (len(excess), 1)))
+    weight = np.tile(diagonal, (len(excess), 1))
+    if c:
+        weight += c * cells.volume / 15.0
+    np.add.at(weight, at, lost[masses.side.dofs])
+    weight = cells.over_facets(weight)
     weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
     owned = slice(cells.owned_facets())
     way = down / weight
@@ -374,11 +440,8 @@ def _sweep(
         if not square > 0:
             break
         for part in blocks(cells.number):
-            k, step = pick(kappa, part), way[cells.facets[:, part]]
-            across = _across(cells, step, part)
-            across *= 2.0 * k
-            step *= diagonal[part]
-            np.add(step, across, out=slope[:, part])
+            slope[:, part] = image_of(way[cells.facets[:, part]], part)
+        np.add.at(slope, at, lost[masses.side.dofs] * way[masses.side.dofs])
         image = cells.over_facets(slope)
         image[held] = 0.0
         length = square / cells.total(way[owned] @ image[owned])[0]
@@ -391,6 +454,22 @@ def _sweep(
         way *= square / before
         way += straight
     return float(energy), float(4 / 3 * square)
+
+
+def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
+    """Means of (v − u_h)² over simplices of one, two or three dimensions, shape (n,).
+
+    Args:
+        c: v − u_h at the vertices, shape (k, n).
+        height: Heights of v's bumps on triangles, shape (3, n), if there are any.
+    """
+    k, total = len(c), sum_rows(c)
+    out = (total**2 + dot_rows(c, c)) / (k * (k + 1))
+    if height is not None:
+        whole = sum_rows(height)
+        out += (4.0 * total * whole - 2.0 * dot_rows(c, height)) / 15.0
+        out += 4.0 * (whole**2 + dot_rows(height, height)) / 45.0
+    return np.asarray(out)
 
 
 def _promise(

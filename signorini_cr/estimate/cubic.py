@@ -32,7 +32,7 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         v: Without cusps.
     """
     boundary, thirds = v.boundary, np.zeros(len(cells.exterior))
-    for data in (boundary.u_D, boundary.alpha):
+    for data in (*boundary.u_D.parts, *boundary.alpha.parts):
         side = data.side(cells)
         thirds[side.dofs] = cells.ways_between(*side.ends) * _of_data(data)
     cells.share(thirds)

@@ -68,7 +68,7 @@ def improve(
     side = edge.facets
     left = np.where(side.local == 1, -1.0, 1.0) * cells.turns[side.cells]
     given[side.dofs] = left * edge.slope * measures(cells, side) / 4.0
-    for known in (v.boundary.alpha.side(cells), side):
+    for known in (v.boundary.alpha.side, side):
         held[known.dofs] = 1.0
     given, free = cells.share(given), cells.share(held) == 0.0
     flux.beyond = Beyond(given, rise)

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
-from ..data.loads import Edge, Load
-from ..fem.cells import Cells, Side, blocks, dot_rows, pick, poincare, sum_rows
+from ..data.loads import Known, Load, to_cells
+from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare, sum_rows
 from .beyond import Beyond
 
 if TYPE_CHECKING:
@@ -29,11 +30,14 @@ class Flux:
 
     Attributes:
         excess: Fluxes out of each cell of y − κ_T ∇u_h, shape (d + 1, cells), κ_T the mean of κ.
-        contact: Fluxes through the facets of Γ1, not negative, shape (n,).
+        contact: Contact forces on the facets of Γ1: y's flux less that which is known, not
+            negative, shape (n,).
         touching: Whether the facet of Γ1 is in contact, shape (n,).
         left: ∫_T (f + div y), shape (cells,).
         steepness: ‖∇u_h‖²_T, shape (cells,).
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
+        taken_up: Whether c takes up what is left.
+        shed: ∫_F (g − b u_h − y·n) for b to take up, in the order of `Known`; None for nothing.
     """
 
     excess: FloatArray
@@ -42,6 +46,8 @@ class Flux:
     left: FloatArray
     steepness: FloatArray
     beyond: Beyond | None = None
+    taken_up: bool = False
+    shed: FloatArray | None = None
 
 
 def equilibrate(
@@ -49,7 +55,7 @@ def equilibrate(
     kappa: FloatArray,
     w: FloatArray,
     load: Load,
-    edge: Edge,
+    edge: Known,
     on_contact: Side,
     gap: FloatArray,
 ) -> Flux:
@@ -57,15 +63,14 @@ def equilibrate(
 
     Seen from T the flux through F is ∫_T κ∇u_h·∇ψ_F − ∫_T f ψ_F − ∫_{∂T∩Γg} g ψ_F, so that the two
     sides of F differ by what the solver left of the equation of F; y takes the mean of the
-    two. On Γ1 it is 0 where
-    there is no contact, on Γg it is ∫_F g.
+    two. On Γg it is ∫_F g; on Γ1 it is that where there is no contact, and not less where there is.
 
     Args:
         cells: The mesh.
         kappa: Mean of κ, shape (cells,) or ().
         w: u_h at the cells' vertices, shape (d + 1, cells).
-        load: Moments of f.
-        edge: Integrals of g.
+        load: Moments of f − c u_h.
+        edge: Integrals of g − b u_h.
         on_contact: The facets of Γ1.
         gap: u_h − α on them, by means, shape (n,).
     """
@@ -79,12 +84,13 @@ def equilibrate(
         steepness[part] = dot_rows(w[:, part], slopes)
         slopes *= -d * pick(kappa, part)
         np.subtract(slopes, shares, out=fluxes[:, part])
-    on_neumann, through = edge.side, edge.shares.sum(axis=0)
-    for i, share in enumerate(edge.to_cells()):
+    side, known = edge.side, np.zeros(len(cells.exterior))
+    known[side.dofs] = edge.shares.sum(axis=0)
+    for i, share in enumerate(to_cells(cells, side, edge.shares)):
         # the facet itself gets all of it further down
-        share = np.where(on_neumann.local == i, 0.0, share)
-        np.subtract.at(excess[i], on_neumann.cells, share)
-        np.subtract.at(fluxes[i], on_neumann.cells, share)
+        share = np.where(side.local == i, 0.0, share)
+        np.subtract.at(excess[i], side.cells, share)
+        np.subtract.at(fluxes[i], side.cells, share)
     half = cells.over_facets(fluxes)
     half *= 0.5
     half[cells.exterior] = 0.0
@@ -93,20 +99,118 @@ def equilibrate(
     there = on_contact.local, on_contact.cells
     # In contact: the primal-dual criterion with the facet's diagonal entry of A
     diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
-    touching = fluxes[there] > np.maximum(diagonal * gap, 0.0)
-    contact = np.where(touching, fluxes[there], 0.0)
-    excess[there] += contact - fluxes[there]
-    there = on_neumann.local, on_neumann.cells
-    excess[there] += through - fluxes[there]
+    force, through = fluxes[there] - known[on_contact.dofs], known[on_contact.dofs]
+    touching = force > np.maximum(diagonal * gap, 0.0)
+    contact = np.where(touching, force, 0.0)
+    excess[there] += contact + through - fluxes[there]
+    natural = ~edge.bounded
+    there = side.local[natural], side.cells[natural]
+    excess[there] += known[side.dofs[natural]] - fluxes[there]
     left = sum_rows(excess)
     left += cells.volume * load.mean
     return Flux(excess, contact, touching, left, steepness)
 
 
+def relax(
+    cells: Cells, kappa: FloatArray, flux: Flux, reaction: float, edge: Known, on_contact: Side
+) -> bool:
+    """Bring y nearer to κ∇u_h where c can take up what it then lacks; collective.
+
+    With f + div y = left_T/|T| on T instead of 0 the bound has ‖c^{-1/2} left_T/|T|‖_T more, and
+    where c h_T² is larger than κ that is less than what ‖κ^{-1/2}(y − κ∇u_h)‖_T falls by. So it is
+    with b, g − b u_h − y·n and ‖b^{-1/2} ·‖_F. The squares' sum is minimised by conjugate gradients
+    in the fluxes through facets inside, on Γ0, with a b and in contact; forces that come out below
+    0 are 0.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        flux: y, changed in place.
+        reaction: c.
+        edge: Integrals of g − b u_h.
+        on_contact: The facets of Γ1.
+
+    Returns:
+        Whether it was called for, and c and b are to take up all that is left.
+    """
+    ratio = float((reaction * cells.diameter2 / kappa).max(initial=0.0)) if reaction else 0.0
+    if cells.tdim != 2 or cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
+        return False
+    held, lossy = cells.exterior.astype(np.float64), np.zeros(len(cells.exterior))
+    for part in cells.fixed:
+        held[cells.sides[part].dofs] = 0.0
+    lossy[edge.side.dofs] = edge.loss
+    held[on_contact.dofs] = ~flux.touching & (lossy[on_contact.dofs] == 0.0)
+    lossy[on_contact.dofs[flux.touching]] = 0.0
+    sides = edge.side.local, edge.side.cells
+    loss = lossy[edge.side.dofs] * measures(cells, edge.side)
+    of_edge = np.divide(1.0, loss, out=np.zeros_like(loss), where=loss > 0.0)
+    free = cells.share(held) == 0.0
+    owned, weight = slice(cells.owned_facets()), 1.0 / (reaction * cells.volume)
+    # a flux counts as positive out of one of the facet's two cells, the same on all ranks
+    sign = cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]])
+
+    def slopes(P: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
+        local = _field_slopes(cells, P) / kappa + weight * left
+        np.add.at(local, sides, of_edge * shed)
+        return sign * local
+
+    def assembled(local: FloatArray) -> FloatArray:
+        return np.where(free, cells.over_facets(local), 0.0)
+
+    units = np.eye(3)[:, :, None] * np.ones(cells.number)
+    scale = np.stack([field_squares(cells, unit) for unit in units]) / kappa + weight
+    np.add.at(scale, sides, of_edge)
+    scale = cells.over_facets(scale)
+    scale[scale == 0.0] = 1.0  # no cell of this rank has the facet
+    down = -assembled(slopes(flux.excess, flux.left, np.zeros_like(loss)))
+    change, way = np.zeros_like(down), np.zeros_like(down)
+    before = first = np.inf
+    for _ in range(STEPS):
+        straight = down / scale
+        now = float(cells.total(down[owned] @ straight[owned])[0])
+        first = min(first, now)
+        if not now > RELAXED * first:
+            break
+        way = straight + now / before * way
+        fluxes = sign * way[cells.facets]
+        image = assembled(slopes(fluxes, sum_rows(fluxes), fluxes[sides]))
+        step = now / float(cells.total(way[owned] @ image[owned])[0])
+        change += step * way
+        down -= step * image
+        before = now
+    fluxes = sign * change[cells.facets]
+    there = on_contact.local[flux.touching], on_contact.cells[flux.touching]
+    force = np.maximum(flux.contact[flux.touching] + fluxes[there], 0.0)
+    fluxes[there] = force - flux.contact[flux.touching]
+    flux.contact[flux.touching] = force
+    flux.shed = np.where(loss > 0.0, -fluxes[sides], 0.0)
+    flux.excess += fluxes
+    flux.left += sum_rows(fluxes)
+    return True
+
+
+def _field_slopes(cells: Cells, fluxes: FloatArray) -> FloatArray:
+    """½ ∂`field_squares` by each flux, shape (d + 1, cells)."""
+    d, s = cells.tdim, sum_rows(fluxes)
+    a, q = fluxes - s / (d + 1), np.zeros_like(fluxes)
+    for (i, j), length in zip(cells.pairs, cells.lengths, strict=True):
+        q[i] += a[j] * length
+        q[j] += a[i] * length
+    bulk = s * sum_rows(cells.lengths) / ((d + 1) ** 2 * (d + 2))
+    out: FloatArray = bulk + 0.5 * (sum_rows(q) / (d + 1) - q)
+    return out / (d**2 * cells.volume)
+
+
 def unbalanced(
-    level: Level, cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float = 0.0
+    level: Level,
+    cells: Cells,
+    left: FloatArray,
+    kappa_min: FloatArray,
+    size: float = 0.0,
+    reaction: float = 0.0,
 ) -> float:
-    """Bound W with |Σ_T left_T e_T| ≤ W ‖κ^{1/2} ∇e‖ for e ∈ H¹ that vanishes on Γ0.
+    """Bound W with |Σ_T left_T e_T| ≤ W times e's energy norm, for e ∈ H¹ that vanishes on Γ0.
 
     e_T is the mean over T. Level by level, what a cell's children have too much or too little is
     spread over the cell: Poincaré's inequality on the cell bounds the difference. On the coarsest
@@ -118,8 +222,14 @@ def unbalanced(
         left: Integrals over the cells, shape (cells,).
         kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
         size: Of the bound, to which what is carried may be small.
+        reaction: c: ‖c^{1/2} e‖ bounds it, too.
     """
     volume, bound = cells.volume, 0.0
+    taken_up = np.inf
+    if reaction > 0.0:
+        taken_up = float(np.sqrt(cells.total(np.sum(left**2 / volume))[0] / reaction))
+        if taken_up <= WORTH * size:
+            return taken_up
     meshes = level.meshes
     for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
         assert mesh.parents is not None
@@ -140,7 +250,7 @@ def unbalanced(
         bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
     if len(meshes) > 1:
         cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
-    return float(bound + _carried(cells, left, kappa_min, size))
+    return min(taken_up, float(bound + _carried(cells, left, kappa_min, size)))
 
 
 def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
@@ -156,7 +266,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     Returns:
         The norm ‖κ^{-1/2} q‖ of what was added; 0 if nothing was.
     """
-    if bound <= WORTH * size:
+    if bound <= WORTH * size or cells.sinks:
         return 0.0
     fluxes, all_reached = _carry(cells, flux.left)
     if not all_reached:
@@ -170,6 +280,10 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     return float(np.sqrt(square))
 
 
+STRONG = 3.0
+"""c h_T²/κ from which on c takes up what y lacks."""
+RELAXED = 1e-8
+"""Part of the way, squared, at which the flux is good enough that need not balance the load."""
 STEPS = 30
 """Of conjugate gradients, for a small field of given divergence."""
 WORTH = 1e-3
@@ -206,12 +320,17 @@ def _carry(cells: Cells, left: FloatArray) -> tuple[FloatArray, bool]:
 def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float) -> float:
     """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
 
-    Where a walk's q is not small against `size`, one that is nearly the smallest takes its place.
+    Where q leaves through facets with a b, that takes up ‖b^{-1/2} q·n‖ there. Where a walk's q is
+    not small against `size`, one that is nearly the smallest takes its place.
     """
 
     def norm(fluxes: FloatArray) -> float:
-        squares = field_squares(cells, fluxes)
-        return float(np.sqrt(cells.total(np.sum(squares / kappa_min))[0]))
+        square = float(np.sum(field_squares(cells, fluxes) / kappa_min))
+        for part, loss in cells.sinks.items():
+            side = cells.sides[part]
+            out = fluxes[side.local, side.cells]
+            square += float(np.sum(out**2 / (loss * measures(cells, side))))
+        return float(np.sqrt(cells.total(square)[0]))
 
     fluxes, all_reached = _carry(cells, left)
     if not all_reached:

@@ -23,6 +23,7 @@ from .certificate import Certificate
 
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
 VARIES = "the coefficient varies within cells"
+LOST = "terms without gradients are not worked out"
 SPATIAL = "they are worked out for d = 2 only"
 
 
@@ -53,8 +54,9 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
         raise InputError(f"the contact force has no bounds: {certificate.reason}")
     level = made.level
     cells = Cells(level.domain, level.V)
-    if made.varies or cells.tdim != 2:
-        why = VARIES if made.varies else SPATIAL
+    lost = diffusion(level.data).forms.of_one is not None
+    if lost or made.varies or cells.tdim != 2:
+        why = LOST if lost else VARIES if made.varies else SPATIAL
         raise InputError(f"the contact force has no bounds: {why}")
     phi = _weight(solution)
     at_vertices = np.ascontiguousarray(

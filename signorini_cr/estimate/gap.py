@@ -14,18 +14,27 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..arrays import FloatArray, IndexArray
-from ..data.loads import Load, Segments
+from ..arrays import BoolArray, FloatArray, IndexArray
+from ..data.loads import Load, Segments, trace_of
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
-from .companion import Companion, bump_squares, on_facet
+from .companion import Companion, bump_squares, distance, on_facet
 from .flux import Flux, field_squares
 from .shapes import local_thirds, quadrature
 from .sums import Sums
 
+EPS = 1e-14
+"""What rounding may do to an integral, relative."""
+
 
 def integrate(
-    cells: Cells, kappa: Coefficient, w: FloatArray, load: Load, flux: Flux, v: Companion
+    cells: Cells,
+    kappa: Coefficient,
+    w: FloatArray,
+    load: Load,
+    flux: Flux,
+    v: Companion,
+    reaction: float = 0.0,
 ) -> Sums:
     """Sum up the parts of the gap.
 
@@ -33,13 +42,16 @@ def integrate(
         cells: The mesh.
         kappa: The coefficient.
         w: u_h at the cells' vertices, shape (d + 1, cells).
-        load: Moments of f.
+        load: Moments of f − c u_h.
         flux: y.
         v: v.
+        reaction: c.
     """
     d = cells.tdim
     indicators, steepness, middle, across = np.empty((4, cells.number))
     sums = Sums(indicators=indicators, steepness=steepness, middle=middle, across=across)
+    if reaction > 0.0:
+        sums.zeroth, sums.apart = np.zeros((2, cells.number))
     for part in blocks(cells.number):
         P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
         height = v.bumps[cells.facets[:, part]] if d == 2 else None
@@ -71,6 +83,11 @@ def integrate(
             left = load.variance if flux.beyond is None else load.rest
             square = poincare(d) ** 2 * cells.diameter2[part] * volume * left[part]
             osc = square / pick(kappa.low, part)
+            taken = _taken_up(square, volume * left[part], kappa, part, reaction)
+            if taken is not None and sums.zeroth is not None:
+                osc = np.where(taken, volume * left[part] / reaction, osc)
+                square = np.where(taken, 0.0, square)
+                sums.zeroth[part] = np.where(taken, osc, 0.0)
             share += osc
             sums.load += float(np.sum(osc))
             if v.thirds is not None:
@@ -97,11 +114,35 @@ def integrate(
                     slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
                 work = volume * moment
                 sums.load_companion += float(np.sum(work))
+                if taken is not None:
+                    against, slack, work, osc = (
+                        np.where(taken, 0.0, each) for each in (against, slack, work, osc)
+                    )
                 sums.load_flux += float(np.sum(against))
                 sums.slack += float(np.sum(slack))
                 against += slack
                 around += osc + 2.0 * (against + work)
                 beside += osc + 2.0 * (against - work)
+        if sums.zeroth is not None and sums.apart is not None:
+            size = sum_rows(W) ** 2 + dot_rows(W, W)
+            apart = reaction * volume * distance(c, height)
+            sums.energy += 0.5 * float(np.sum(apart))
+            own = 0.5 * float(np.sum(reaction * volume * size / ((d + 1) * (d + 2))))
+            sums.energy -= own
+            sums.energy_slack += EPS * own
+            sums.companion += float(np.sum(apart))
+            sums.apart[part] = apart
+            sums.zeroth[part] += apart
+            share += apart
+            if flux.taken_up:
+                given = flux.left[part] ** 2 / (reaction * volume)
+                means = sum_rows(c) / (d + 1)
+                if height is not None:
+                    means += sum_rows(height) / 3
+                sums.load += float(np.sum(given))
+                sums.load_companion += float(flux.left[part] @ means)
+                sums.zeroth[part] += given
+                share += given
         sums.flux += float(np.sum(pp))
         sums.companion += float(np.sum(bb))
         sums.cross += float(np.sum(pb))
@@ -109,6 +150,27 @@ def integrate(
         indicators[part], steepness[part] = share, vv
         middle[part], across[part] = around, beside
     return sums
+
+
+def _taken_up(
+    square: FloatArray,
+    variance: FloatArray,
+    kappa: Coefficient,
+    where: slice | IndexArray,
+    reaction: float,
+) -> BoolArray | None:
+    """Where c takes up what f has beyond its mean more cheaply than σ does; None for nowhere.
+
+    Args:
+        square: Bound of ‖σ‖²_T, shape (n,).
+        variance: ‖f − f_T‖²_T, shape (n,).
+        kappa: The coefficient.
+        where: Which cells.
+        reaction: c.
+    """
+    if reaction <= 0.0:
+        return None
+    return np.asarray(variance * pick(kappa.low, where) < reaction * square)
 
 
 def integrate_edge(
@@ -120,21 +182,24 @@ def integrate_edge(
     flux: Flux,
     v: Companion,
     sums: Sums,
+    reaction: float = 0.0,
 ) -> float:
-    """Add what g has beyond its means on Γg.
+    """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
 
     σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
-    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f.
+    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f. Where b
+    is large it takes up g − g_F, as c does with f.
 
     Args:
         cells: The mesh.
         kappa: The coefficient.
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f.
-        edge: Values of g.
+        edge: Values of g − b u_h.
         flux: y.
         v: v.
         sums: What to add to.
+        reaction: c.
 
     Returns:
         This rank's share of the square of what goes into ω.
@@ -146,6 +211,10 @@ def integrate_edge(
     assert sums.middle is not None and sums.across is not None
     sums.indicators[at] += sizes**2 / low
     sums.neumann = float(np.sum(sizes**2 / low))
+    jump = on_facet(cells, side, edge.hats, v.vertices, v.bumps)
+    jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, side, w))
+    if edge.loss.any():
+        _add_loss(cells, w, edge, flux, jump, sums)
     if d != 2:
         return sums.neumann
     if flux.beyond is not None:
@@ -160,14 +229,15 @@ def integrate_edge(
     if load.variance is not None:
         square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
         of_f = poincare(d) * np.sqrt(square)
+        variance = cells.volume[at] * load.variance[at]
+        if (taken := _taken_up(of_f**2, variance, kappa, at, reaction)) is not None:
+            of_f[taken] = 0.0
     more = (2.0 * of_f * sizes + sizes**2) / low
     sums.load += float(np.sum(more))
     for row in (sums.middle, sums.across):
         row[at] += more
     ends = cells.others[side.local].T, side.cells
     weights = edge.measure * edge.weights[:, None] * edge.rest
-    jump = on_facet(cells, side, edge.hats, v.vertices, v.bumps)
-    jump -= np.einsum("qin,in->qn", edge.hats, w[ends])
     sums.load_companion += float(np.sum(weights * jump))
     # The potential of y − κ_T∇u_h, as in _against_potential
     P = flux.excess[:, side.cells]
@@ -180,6 +250,7 @@ def integrate_edge(
     x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
     potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
     potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
+    weights = np.where(edge.given[edge.place], 0.0, weights)
     sums.load_flux += float(np.sum(weights * potential))
     np.add.at(sums.middle, side.cells, 2.0 * (weights * (potential + jump)).sum(axis=0))
     np.add.at(sums.across, side.cells, 2.0 * (weights * (potential - jump)).sum(axis=0))
@@ -189,6 +260,42 @@ def integrate_edge(
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
     return 0.0
+
+
+def _add_loss(
+    cells: Cells, w: FloatArray, edge: Segments, flux: Flux, jump: FloatArray, sums: Sums
+) -> None:
+    """Add b‖v − u_h‖²_F, and ‖q − g_F‖²_F/b where b takes that up.
+
+    Args:
+        cells: The mesh.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        edge: Values of g − b u_h.
+        flux: y.
+        jump: v − u_h at its points, shape (q, n).
+        sums: What to add to.
+    """
+    if sums.zeroth is None:
+        sums.zeroth = np.zeros(cells.number)
+    assert sums.indicators is not None
+    loss = edge.loss[edge.place] * edge.measure
+    apart = loss * (edge.weights @ jump**2)
+    own = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
+    size = 0.5 * float(np.sum(loss * (edge.weights @ own**2)))
+    sums.energy += 0.5 * float(np.sum(apart)) - size
+    sums.energy_slack += EPS * size
+    sums.companion += float(np.sum(apart))
+    given = np.where(edge.given, edge.squares / np.maximum(edge.loss, 1e-300), 0.0)
+    if flux.shed is not None:
+        n = len(edge.loss)
+        area = np.bincount(edge.place, edge.measure, minlength=n)
+        given += flux.shed**2 / (np.maximum(edge.loss, 1e-300) * area)
+        means = np.bincount(edge.place, edge.measure * (edge.weights @ jump), minlength=n) / area
+        sums.load_companion += float(flux.shed @ means)
+    sums.load += float(np.sum(given))
+    for at, amounts in ((edge.side.cells, apart), (edge.facets.cells, given)):
+        np.add.at(sums.indicators, at, amounts)
+        np.add.at(sums.zeroth, at, amounts)
 
 
 def _swollen(squares: FloatArray, more: FloatArray) -> FloatArray:

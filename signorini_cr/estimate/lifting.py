@@ -7,6 +7,7 @@ the facet. What is needed are bounds of |δ| and |δ'|, piece by piece; k is the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,6 +77,7 @@ class Lift:
         area: ‖ℓ‖_T.
         beyond: |∫_F δ|.
         least: Lower bound of the data's mean.
+        edge: ‖ℓ‖_F.
         reason: Why there are none, if there are none; this rank's.
     """
 
@@ -83,7 +85,19 @@ class Lift:
     area: FloatArray
     beyond: FloatArray
     least: FloatArray
+    edge: FloatArray
     reason: str | None = None
+
+
+def joined(lifts: Sequence[Lift]) -> Lift:
+    """Those of several parts, one after the other; with one reason, if there is one."""
+    rows = [
+        np.concatenate([np.empty(0), *(getattr(each, name) for each in lifts)])
+        for name in ("steep", "area", "beyond", "least", "edge")
+    ]
+    reason = next((each.reason for each in lifts if each.reason), None)
+    steep, area, beyond, least, edge = rows
+    return Lift(steep, area, beyond, least, edge, reason)
 
 
 def lift(
@@ -111,7 +125,7 @@ def lift(
     n, name = len(side.cells), "α" if obstacle else "u_D"
     if trace.constant is not None:
         zero = np.zeros(n)
-        return Lift(zero, zero, zero, np.full(n, trace.constant))
+        return Lift(zero, zero, zero, np.full(n, trace.constant), zero)
     apex, (a, b) = corner_points(cells, side)
     length = np.linalg.norm(b - a, axis=1)
     height = 2.0 * cells.volume[side.cells] / length
@@ -144,7 +158,7 @@ def lift(
             clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
     except Unknown as error:
         zero = np.zeros(n)
-        return Lift(zero, zero, zero, zero, NO_RANGE.format(name, error))
+        return Lift(zero, zero, zero, zero, zero, NO_RANGE.format(name, error))
 
     def mean(values: FloatArray) -> FloatArray:
         sums = np.bincount(pieces.parent, pieces.part * values, minlength=n)
@@ -163,6 +177,7 @@ def lift(
         np.sqrt(height * length * norm / (2.0 * power + 2.0)),
         beyond * length,
         mean(least),
+        np.sqrt(length * norm),
         reason,
     )
 
@@ -266,13 +281,13 @@ def affine(
     """
     zero = np.zeros(len(side.cells))
     if trace.constant is not None:
-        return Lift(zero, zero, zero, zero + trace.constant)
+        return Lift(zero, zero, zero, zero + trace.constant, zero)
     whole = Pieces.of_facets(cells, side)
     boxes = whole.boxes(cells, decide=True)
     try:
         jet = Enclosure(boxes)(trace.deviation.expression)
     except Unknown as error:
-        return Lift(zero, zero, zero, zero, NO_RANGE.format("u_D or α", error))
+        return Lift(zero, zero, zero, zero, zero, NO_RANGE.format("u_D or α", error))
     off = zero.copy()
     half = whole.half(boxes)
     for row, mid, rad in zip(jet.rest.rows, jet.rest.mid, jet.rest.rad, strict=True):
@@ -281,4 +296,5 @@ def affine(
             size = np.prod([h**k for h, k in zip(half, index, strict=True)], axis=0)
             off = off + 2.0 * (np.abs(mid) + rad) * size
     curved = not (off <= JUMP * scale).all() or (values - v > JUMP * scale).any()
-    return Lift(zero, zero, zero, values.mean(axis=0) - off, CURVED if curved else None)
+    reason = CURVED if curved else None
+    return Lift(zero, zero, zero, values.mean(axis=0) - off, zero, reason)

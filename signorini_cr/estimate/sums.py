@@ -22,13 +22,16 @@ class Sums:
         load_flux: ∫ κ^{-1/2}σ·p.
         load_companion: ∫ κ^{-1/2}σ·b.
         slack: How far load_flux may be from the truth.
-        energy: ½∫ κ|∇v|² − ∫ f v.
+        energy: ½∫ κ|∇v|² + c v² − ∫ f v.
         energy_slack: How far this may be from the truth.
         neumann: The part of load that comes from g alone.
         indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).
         steepness: ∫_T κ|∇v|², shape (cells,).
         middle: Bounds of ∫_T |p + κ^{-1/2}σ + b|², shape (cells,).
         across: The same of ∫_T |p + κ^{-1/2}σ − b|².
+        zeroth: What the terms without gradients add to the cells' shares, shape (cells,); None
+            where there are none.
+        apart: c‖v − u_h‖²_T, shape (cells,); or None.
     """
 
     flux: float = 0.0
@@ -47,6 +50,8 @@ class Sums:
     steepness: FloatArray | None = None
     middle: FloatArray | None = None
     across: FloatArray | None = None
+    zeroth: FloatArray | None = None
+    apart: FloatArray | None = None
 
     def over_ranks(self, cells: Cells) -> Sums:
         """The totals over all ranks' cells; collective."""

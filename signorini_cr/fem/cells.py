@@ -6,18 +6,20 @@ opposite vertex i.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
+from types import MappingProxyType
 
 import numpy as np
 from dolfinx import fem, la
+from petsc4py import PETSc
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import DIRICHLET, Domain
-from .space import facet_entities, shared_sum
+from .space import facet_entities, ghosted, shared_sum
 
 BLOCK = 1 << 14
 """Cells that are worked on at a time: as many as the processor's cache holds."""
@@ -76,6 +78,23 @@ class Side:
     dofs: IndexArray
     ends: IndexArray
 
+    @classmethod
+    def joined(cls, sides: Sequence[Side], d: int) -> Side:
+        """Those of several parts, one after the other, for cells of dimension d."""
+        none = np.empty(0, dtype=np.intp)
+        sides = [cls(none, none, none, none.reshape(d, 0)), *sides]
+        return cls(
+            np.concatenate([side.cells for side in sides]),
+            np.concatenate([side.local for side in sides]),
+            np.concatenate([side.dofs for side in sides]),
+            np.concatenate([side.ends for side in sides], axis=1),
+        )
+
+    def picked(self, where: BoolArray) -> Side:
+        """Some of the facets."""
+        ends = self.ends[:, where]
+        return Side(self.cells[where], self.local[where], self.dofs[where], ends)
+
     @property
     def entities(self) -> Int32Array:
         """Pairs (cell, local facet), as Expressions want them."""
@@ -95,12 +114,19 @@ class Cells:
         stiffness: |T| ∇λ_i·∇λ_j, shape (pairs, cells).
         volume: |T|, shape (cells,).
         sides: The boundary facets by part.
-        fixed: The parts that make Γ0.
+        sinks: The parts that take up a flux, and their b.
+        fixed: The parts that make Γ0, and these.
     """
 
-    def __init__(self, domain: Domain, V: fem.FunctionSpace, fixed: Sequence[int] = (DIRICHLET,)):
+    def __init__(
+        self,
+        domain: Domain,
+        V: fem.FunctionSpace,
+        fixed: Sequence[int] = (DIRICHLET,),
+        sinks: Mapping[int, float] = MappingProxyType({}),
+    ):
         """Read a domain's mesh; V is its Crouzeix-Raviart space."""
-        mesh, self.fixed = domain.mesh, fixed
+        mesh, self.fixed, self.sinks = domain.mesh, (*fixed, *sinks), sinks
         self.domain, self.V, self.comm = domain, V, mesh.comm
         d = self.tdim = mesh.topology.dim
         n = self.number = mesh.topology.index_map(d).size_local
@@ -235,6 +261,26 @@ class Cells:
         topology = self.domain.mesh.topology
         index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
         return shared_sum(self.comm, index_map, values)
+
+    def largest_at_vertices(self, ends: IndexArray, values: FloatArray) -> FloatArray:
+        """The largest value that facets of any rank give each vertex, ghosts included; collective.
+
+        Args:
+            ends: The facets' vertices, shape (d, n).
+            values: One for each, shape (d, n).
+
+        Returns:
+            −∞ where there is no facet.
+        """
+        index_map = self.domain.mesh.topology.index_map(0)
+        found: FloatArray = np.full(index_map.size_local + index_map.num_ghosts, -np.inf)
+        np.maximum.at(found, ends, values)
+        if self.comm.size > 1:
+            vector = ghosted(self.comm, index_map, found)
+            vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
+            vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+            vector.destroy()
+        return found
 
     @cached_property
     def between(self) -> IndexArray:

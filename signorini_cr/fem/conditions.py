@@ -1,21 +1,32 @@
 """Boundary conditions: what holds on a part of the boundary, and what that adds to the problem.
 
-A kind of condition is a class that overrides what it adds. Whoever assembles, solves or certifies
-asks each condition for that, and none for its kind; so one more kind is one more class in `KINDS`,
-and one more name in `PARTS` where it lies on a part of its own.
+A kind of condition is a class that overrides what it adds. The user makes one from data; `Forms`
+makes the same from expressions, for a part. Whoever assembles, solves or certifies asks each
+condition for what it adds, and none for its kind; so one more kind is one more class.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
+import ufl
 from ufl.core.expr import Expr
 
 from ..arrays import Int32Array
-from ..mesh.domain import PARTS, Domain
+from ..mesh.domain import Domain
+
+Data: TypeAlias = float | Expr | Callable[[Expr], Any]
+"""A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
+
+
+def number(expression: Expr) -> float | None:
+    """The number that an expression is, or None."""
+    if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
+        return float(expression)
+    return None
 
 
 @dataclass(frozen=True)
@@ -23,135 +34,209 @@ class Given:
     """What conditions are made from.
 
     Attributes:
-        problem: The user's data, a `Problem`.
         expression: Turns data into an expression in the coordinates.
         exact: The exact solution u, if it is known.
         flux: κ∂ₙu, if u is known and not constant.
     """
 
-    problem: Any
     expression: Callable[[Any], Expr]
     exact: Expr | None = None
     flux: Expr | None = None
 
-    def or_derived(self, key: str, derived: Expr | None) -> tuple[Expr, str]:
-        """Take the user's data, else what follows from u, else 0; and tell where it is from."""
-        given = getattr(self.problem, key)
-        if given is None and derived is not None:
-            return derived, "exact.u"
-        return self.expression(0.0 if given is None else given), f"data.{key}"
 
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Condition:
     """What holds on one part of the boundary; each kind adds what it overrides.
 
     Attributes:
-        value: Its data, a scalar.
-        source: What the data are from, for messages: a key of a problem file.
-        part: The part's name, a key of `PARTS`.
-        key: The data's name in `Problem`.
+        part: The part's name, once it is known.
+        number: The part's value in the facet tags.
+        label: What its main datum is called, for messages: a key of a problem file.
+        source: What that is from: the same, or "exact.u".
         uncertified: Why no certificate covers it; None where one does.
+        optional: Whether the main datum may be None, for what follows from an exact solution, or 0.
     """
 
-    value: Expr
+    part: str = ""
+    number: int = 0
+    label: str = ""
     source: str = ""
-    part: ClassVar[str]
-    key: ClassVar[str]
     uncertified: ClassVar[str | None] = None
+    optional: ClassVar[bool] = True
+
+    def made(self, given: Given, part: str, number: int, label: str) -> Self:
+        """Make it from expressions, for a part of the boundary.
+
+        Args:
+            given: What goes with the user's data.
+            part: The part's name.
+            number: Its value in the facet tags.
+            label: What the main datum is called.
+        """
+        source, main = label, self.names()[0]
+        left_out = self.main is None and self.optional
+        own = {name: getattr(self, name) for name in self.names()} | (
+            {main: 0.0} if left_out else {}
+        )
+        expressions = {name: given.expression(value) for name, value in own.items()}
+        if left_out and (derived := self._derived(given, expressions)) is not None:
+            expressions[main], source = derived, "exact.u"
+        return replace(self, part=part, number=number, label=label, source=source, **expressions)
 
     @classmethod
-    def of(cls, given: Given) -> Condition | None:
-        """Make it from what the user gives, and what follows from an exact solution.
+    def names(cls) -> tuple[str, ...]:
+        """The names of its data, the main one first."""
+        common = {each.name for each in fields(Condition)}
+        return tuple(each.name for each in fields(cls) if each.name not in common)
 
-        Returns:
-            None where the user asks for no condition of this kind.
-        """
-        raise NotImplementedError
-
-    @property
-    def number(self) -> int:
-        """The part's value in the facet tags."""
-        return PARTS[self.part]
+    def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
+        """What an exact solution says of the main datum, where the user does not."""
+        return None
 
     @property
-    def data(self) -> dict[str, Expr]:
-        """All its data, by their names in `Problem`."""
-        return {self.key: self.value}
+    def main(self) -> Any:
+        """Its main datum."""
+        return getattr(self, self.names()[0])
 
     @property
-    def fixed(self) -> Expr | None:
+    def data(self) -> dict[str, Any]:
+        """All its data by what they are called in messages."""
+        first, *others = self.names()
+        called = {first: self.label, **{name: f"boundary.{self.part}.{name}" for name in others}}
+        return {called[name]: getattr(self, name) for name in self.names()}
+
+    @property
+    def fixed(self) -> Any:
         """What u is set to."""
         return None
 
     @property
-    def lower(self) -> Expr | None:
+    def lower(self) -> Any:
         """What u must not be below."""
         return None
 
     @property
-    def flux(self) -> Expr | None:
-        """What is known of κ∂ₙu: χ(v) gains its integral times v."""
+    def flux(self) -> Any:
+        """What is known of κ∂ₙu + b u: χ(v) gains its integral times v."""
         return None
-
-    def a(self, u: Any, v: Any) -> Expr | None:
-        """Return the integrand that a_h gains on the part; it must not involve derivatives."""
-        return None
-
-
-class Neumann(Condition):
-    """κ∂ₙu = g."""
-
-    part, key = "neumann", "g"
-
-    @classmethod
-    def of(cls, given: Given) -> Neumann:
-        """Take g, or the exact solution's flux."""
-        return cls(*given.or_derived(cls.key, given.flux))
 
     @property
-    def flux(self) -> Expr:
-        """All of g."""
-        return self.value
+    def loss(self) -> Any:
+        """B ≥ 0: a_h(u, v) gains the integral of b u v."""
+        return None
 
 
+@dataclass(frozen=True, eq=False)
 class Dirichlet(Condition):
-    """u = u_D."""
+    """u = u_D.
 
-    part, key = "dirichlet", "dirichlet"
+    Attributes:
+        value: u_D; None for the exact solution where there is one, else 0.
+    """
 
-    @classmethod
-    def of(cls, given: Given) -> Dirichlet:
-        """Take u_D, or the exact solution."""
-        return cls(*given.or_derived(cls.key, given.exact))
+    value: Data | None = None
+
+    def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
+        return given.exact
 
     @property
-    def fixed(self) -> Expr:
+    def fixed(self) -> Any:
         """All of u_D."""
         return self.value
 
 
-class Contact(Condition):
-    """u ≥ α, κ∂ₙu ≥ 0, and one of them with equality."""
+@dataclass(frozen=True, eq=False)
+class Neumann(Condition):
+    """κ∂ₙu = g.
 
-    part, key = "contact", "obstacle"
+    Attributes:
+        g: The flux; None for the exact solution's where there is one, else 0.
+    """
 
-    @classmethod
-    def of(cls, given: Given) -> Contact:
-        """Take α."""
-        return cls(given.expression(given.problem.obstacle), "data.obstacle")
+    g: Data | None = None
+
+    def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
+        return given.flux
 
     @property
-    def lower(self) -> Expr:
+    def flux(self) -> Any:
+        """All of g."""
+        return self.g
+
+
+@dataclass(frozen=True, eq=False)
+class Robin(Condition):
+    """κ∂ₙu + b (u − u_ext) = g.
+
+    Attributes:
+        g: The flux into the domain; None for what an exact solution has on the left, else 0.
+        coefficient: b ≥ 0.
+        external: u_ext.
+    """
+
+    g: Data | None = None
+    coefficient: Data = field(default=0.0, kw_only=True)
+    external: Data = field(default=0.0, kw_only=True)
+
+    def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
+        if given.exact is None:
+            return None
+        gain = expressions["coefficient"] * (given.exact - expressions["external"])
+        return gain if given.flux is None else gain + given.flux
+
+    @property
+    def flux(self) -> Any:
+        """What does not depend on u."""
+        return _known(self)
+
+    @property
+    def loss(self) -> Any:
+        """All of b."""
+        return self.coefficient
+
+
+@dataclass(frozen=True, eq=False)
+class Contact(Condition):
+    """u ≥ α, λ ≥ 0, and one of them with equality, for λ = κ∂ₙu + b (u − u_ext) − g.
+
+    Attributes:
+        obstacle: α.
+        coefficient: b ≥ 0.
+        external: u_ext.
+        g: A flux into the domain that does not come from the obstacle.
+    """
+
+    optional = False
+    obstacle: Data = 0.0
+    coefficient: Data = field(default=0.0, kw_only=True)
+    external: Data = field(default=0.0, kw_only=True)
+    g: Data = field(default=0.0, kw_only=True)
+
+    @property
+    def lower(self) -> Any:
         """All of α."""
-        return self.value
+        return self.obstacle
+
+    @property
+    def flux(self) -> Any:
+        """What does not depend on u; None where there is neither that nor a b."""
+        known = _known(self)
+        return known if self.loss is not None or number(known) != 0.0 else None
+
+    @property
+    def loss(self) -> Any:
+        """All of b; None where it is 0."""
+        return None if number(self.coefficient) == 0.0 else self.coefficient
+
+
+def _known(condition: Any) -> Any:
+    """G + b u_ext."""
+    if number(condition.coefficient) == 0.0:
+        return condition.g
+    return condition.g + condition.coefficient * condition.external
 
 
 def facets_of(domain: Domain, conditions: Sequence[Condition]) -> Int32Array:
     """Local indices of the owned facets under some conditions, ascending, shape (n,)."""
     facets = [domain.facets(condition.number) for condition in conditions]
     return np.sort(np.concatenate([np.empty(0, dtype=np.int32), *facets]))
-
-
-KINDS: tuple[type[Condition], ...] = (Dirichlet, Neumann, Contact)
-"""The kinds there are; a problem has at most one condition of each."""

@@ -1,19 +1,20 @@
 """The data of the Signorini problem and the forms of the paper.
 
-Find u with −∇·(κ∇u) = f in Ω, u = u_D on Γ0, κ∂ₙu = g on Γg and, on the contact boundary Γ1,
+Find u with −∇·(κ∇u) + c u = f in Ω, u = u_D on Γ0, κ∂ₙu = g on Γg and, on the contact boundary Γ1,
 
     u ≥ α,  κ∂ₙu ≥ 0,  κ∂ₙu (u − α) = 0                                              (1.4)
 
-with κ = 1 unless a coefficient is given.
+with κ = 1 and c = 0 unless they are given. Other parts of the boundary, and others of these kinds,
+have conditions of their own (see `conditions`).
 """
 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import basix.ufl
 import numpy as np
@@ -25,13 +26,10 @@ from ufl.core.expr import Expr
 from ..arrays import Int32Array
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import Domain
-from .conditions import KINDS, Condition, Given
+from ..mesh.domain import PARTS, Domain
+from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, number
 from .simplified import simplified
 from .space import facet_entities, ufl_element
-
-Data: TypeAlias = float | Expr | Callable[[Expr], Any]
-"""A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +42,9 @@ class Problem:
         obstacle: α, the lower bound of u on Γ1.
         dirichlet: u_D, the value of u on Γ0.
         coefficient: κ, positive scalar (or symmetric positive definite tensor).
+        reaction: c, not below 0.
+        conditions: What holds on parts of the boundary, by their names in the domain; g, obstacle
+            and dirichlet are for the parts neumann, contact and dirichlet where they aren't here.
         exact: The exact solution, where it is known. f, g and u_D that are None are then
             derived from it by differentiation; without it, None means 0.
         quadrature_degree: Polynomial degree up to which loads and coefficient are integrated
@@ -56,6 +57,8 @@ class Problem:
     obstacle: Data = 0.0
     dirichlet: Data | None = None
     coefficient: Data = 1.0
+    reaction: Data = 0.0
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
     exact: Data | None = None
     quadrature_degree: int = 4
     error_degree: int = 6
@@ -65,6 +68,8 @@ class Problem:
         given = []
         for each in fields(self):
             value = getattr(self, each.name)
+            if each.name == "conditions":
+                value = list(value) or each.default
             if value is not each.default and value != each.default:
                 given.append(
                     f"{each.name}={getattr(value, '__name__', None) or reprlib.repr(value)}"
@@ -151,16 +156,24 @@ class Forms:
         problem: The data.
         mesh: A mesh of the kind they will be used on; data tied to a mesh must be tied to this one.
         element: "CR" or "P1".
+        parts: The parts of the boundary by name, and their values in facet tags.
 
     Attributes:
         f: Volume load.
+        reaction: c.
         asked: The load that an exact solution asks for; None if there is none, or a constant.
         kappa: κ.
         exact: The exact solution, if it is known.
         conditions: What holds on the parts of the boundary.
     """
 
-    def __init__(self, problem: Problem, mesh: Mesh, element: str = "CR"):
+    def __init__(
+        self,
+        problem: Problem,
+        mesh: Mesh,
+        element: str = "CR",
+        parts: Mapping[str, int] = PARTS,
+    ):
         self.problem, self.mesh, self.element = problem, mesh, element
         cell = mesh.ufl_domain()
         self.space = ufl.FunctionSpace(cell, ufl_element(mesh, element))
@@ -176,11 +189,18 @@ class Forms:
         flux = None if level else self.kappa * ufl.grad(self.exact)
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
-        given = Given(problem, lambda data: as_expression(data, self.x), self.exact, outward)
         self.asked = None if flux is None else simplified(-ufl.div(flux))
-        self.f, _ = given.or_derived("f", self.asked)
-        made = (kind.of(given) for kind in KINDS)
-        self.conditions: tuple[Condition, ...] = tuple(c for c in made if c is not None)
+        self.reaction = as_expression(problem.reaction, self.x)
+        if self.exact is not None and number(self.reaction) != 0.0:
+            gain = self.reaction * self.exact
+            self.asked = gain if self.asked is None else simplified(self.asked + gain)
+        own = problem.f
+        if own is None and self.asked is not None:
+            self.f = self.asked
+        else:
+            self.f = as_expression(0.0 if own is None else own, self.x)
+        given = Given(lambda data: as_expression(data, self.x), self.exact, outward)
+        self.conditions = _conditions(problem, given, parts)
         d = mesh.geometry.dim
         for key, data in self._data.items():
             if data.ufl_shape != () and (key, data.ufl_shape) != ("coefficient", (d, d)):
@@ -194,7 +214,12 @@ class Forms:
         data = {
             "coefficient": self.kappa,
             "f": self.f,
-            **{key: value for c in self.conditions for key, value in c.data.items()},
+            "reaction": self.reaction,
+            **{
+                key.removeprefix("data."): value
+                for c in self.conditions
+                for key, value in c.data.items()
+            },
         }
         return data if self.exact is None else data | {"exact": self.exact}
 
@@ -214,9 +239,27 @@ class Forms:
         return tuple(c for c in self.conditions if c.flux is not None)
 
     @property
+    def reaction_number(self) -> float:
+        """c, where it is a number; else 0."""
+        return number(self.reaction) or 0.0
+
+    @property
+    def sinks(self) -> dict[int, float]:
+        """The parts whose b is a number above 0, and these."""
+        found = {c.number: number(c.loss) for c in self.conditions if c.loss is not None}
+        return {part: loss for part, loss in found.items() if loss}
+
+    @property
     def uncertified(self) -> str | None:
-        """Why there is no certificate, if some condition has none."""
-        return next((c.uncertified for c in self.conditions if c.uncertified), None)
+        """Why there is no certificate, if the reaction or some condition has none."""
+        if number(self.reaction) is None:
+            return "the reaction is no number: its part of the energy has no enclosure"
+        for condition in self.conditions:
+            if condition.uncertified:
+                return condition.uncertified
+            if condition.loss is not None and number(condition.loss) is None:
+                return f"{condition.part}: its coefficient is no number, and has no enclosure"
+        return None
 
     @cached_property
     def a(self) -> Kernel:
@@ -285,8 +328,9 @@ class Forms:
     def _without_gradients(self, u: Expr, v: Expr) -> list[ufl.Form]:
         """What a_h has beside κ∇u·∇v."""
         degree = {"quadrature_degree": self.problem.quadrature_degree}
-        added = [(c.a(u, v), self.ds(c.number, metadata=degree)) for c in self.conditions]
-        return [a * measure for a, measure in added if a is not None]
+        terms = [(self.reaction, self.dx)]
+        terms += [(c.loss, self.ds(c.number)) for c in self.conditions if c.loss is not None]
+        return [b * u * v * measure(metadata=degree) for b, measure in terms if number(b) != 0.0]
 
     @cached_property
     def _squared_errors(self) -> Kernel:
@@ -320,8 +364,36 @@ class Forms:
         return float(h1), float(l2)
 
 
-def number(expression: Expr) -> float | None:
-    """The number that an expression is, or None."""
-    if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
-        return float(expression)
-    return None
+def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tuple[Condition, ...]:
+    """What holds on each part of the boundary.
+
+    Raises:
+        InputError: A part has no condition, or a condition no part.
+    """
+    usual: dict[str, tuple[Condition, str]] = {
+        "dirichlet": (Dirichlet(problem.dirichlet), "data.dirichlet"),
+        "neumann": (Neumann(problem.g), "data.g"),
+        "contact": (Contact(problem.obstacle), "data.obstacle"),
+    }
+    for name, condition in problem.conditions.items():
+        if name not in parts:
+            raise InputError(
+                f"conditions: no part of the boundary is called {name!r}; there are"
+                f" {', '.join(parts)}"
+            )
+        if not isinstance(condition, Condition):
+            raise InputError(
+                f"conditions: {name!r} is {condition!r}; Dirichlet, Neumann, Robin or Contact is"
+                " needed"
+            )
+    made = []
+    for name, value in parts.items():
+        if name in problem.conditions:
+            condition = problem.conditions[name]
+            label = f"boundary.{name}.{condition.names()[0]}"
+        elif name in usual:
+            condition, label = usual[name]
+        else:
+            raise InputError(f"conditions: the part {name!r} of the boundary has none")
+        made.append(condition.made(given, name, value, label))
+    return tuple(made)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -37,29 +37,31 @@ from .polygon import check_labels, check_loops, coordinates
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
-"""Names of the parts of a boundary, and their values in facet tags."""
+"""Names that parts of a boundary have by themselves, and their values in facet tags."""
 REST = NEUMANN
 """The part of the exterior facets that nobody names: the weak form's natural condition."""
 
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """A mesh whose exterior facets are sorted into Γ0, Γ1 and Γg.
+    """A mesh whose exterior facets are sorted into Γ0, Γ1, Γg and other parts.
 
     Attributes:
         mesh: Affine simplices; no ghost cells when we make it.
-        tags: Facet tags; each exterior facet has one value of `PARTS`.
+        tags: Facet tags; each exterior facet has the value of one part.
+        parts: The parts' names, and their values in the tags.
         seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
     mesh: Mesh
     tags: MeshTags
     seconds: float = 0.0
+    parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
         cells = self.mesh.topology.index_map(self.mesh.topology.dim).size_global
-        facets = ", ".join(f"{len(self.facets(part))} {name}" for name, part in PARTS.items())
+        facets = ", ".join(f"{len(self.facets(part))} {name}" for name, part in self.parts.items())
         here = f" on rank {self.mesh.comm.rank}" if self.mesh.comm.size > 1 else ""
         return f"<Domain: {cells} cells; facets{here}: {facets}>"
 
@@ -67,7 +69,7 @@ class Domain:
         """Local indices of the facets of one part that this rank owns.
 
         Args:
-            part: A value of `PARTS`.
+            part: A value of `parts`.
         """
         found = self.tags.find(part)
         return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
@@ -76,11 +78,12 @@ class Domain:
     def all_facets(self) -> dict[int, Int32Array]:
         """Local indices of the facets of each part, ghosts included, ascending; collective."""
         mark = la.vector(self.mesh.topology.index_map(self.mesh.topology.dim - 1))
-        for part in PARTS.values():
+        for part in self.parts.values():
             mark.array[self.facets(part)] = part
         mark.scatter_forward()
         return {
-            part: np.flatnonzero(mark.array == part).astype(np.int32) for part in PARTS.values()
+            part: np.flatnonzero(mark.array == part).astype(np.int32)
+            for part in self.parts.values()
         }
 
     @classmethod
@@ -89,8 +92,8 @@ class Domain:
         mesh: Mesh,
         facet_tags: MeshTags,
         *,
-        contact: int | Sequence[int] = CONTACT,
-        dirichlet: int | Sequence[int] = DIRICHLET,
+        contact: int | Sequence[int] | None = None,
+        dirichlet: int | Sequence[int] | None = None,
         neumann: int | Sequence[int] | None = None,
         **others: int | Sequence[int],
     ) -> Domain:
@@ -98,34 +101,39 @@ class Domain:
 
         Exterior facets that are neither contact nor Dirichlet are Neumann facets, the weak
         form's natural condition. Other values on interior facets are ignored. Each contact
-        and Dirichlet value must be there; and where Neumann values are given, they must be all that
-        is left, but for facets without a tag or with the value 0.
+        and Dirichlet value must be there; and where Neumann values or further parts are given, they
+        must be all that is left, but for facets without a tag or with the value 0. With further
+        parts, whose conditions are in `Problem.conditions`, there need be no contact and no
+        Dirichlet part.
 
         Args:
             mesh: Triangles or tetrahedra, straight-sided, any ghost mode.
             facet_tags: Values on facets.
-            contact: The value or values that stand for Γ1.
-            dirichlet: The value or values that stand for Γ0.
+            contact: The value or values that stand for Γ1; 1 if there are no further parts.
+            dirichlet: The value or values that stand for Γ0; 2 if there are no further parts.
             neumann: The value or values that stand for Γg; named so that they can be checked.
-            **others: The same for further parts, by the names in `PARTS`.
+            **others: The same for further parts, by names of your own.
 
         Raises:
             InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
         fdim = mesh.topology.dim - 1
-        given = {"contact": contact, "dirichlet": dirichlet, **others}
-        given["neumann"] = [] if neumann is None else neumann
-        if unknown := [name for name in given if name not in PARTS]:
-            raise InputError(f"no part is called {unknown[0]!r}; allowed: {_list(PARTS)}")
-        wanted = {
-            PARTS[name]: np.unique(np.atleast_1d(np.asarray(values, dtype=np.int32)))
-            for name, values in given.items()
-        }
+        given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
+        parts = numbered(others)
+        needed = {parts[name] for name, own in given.items() if own is not None} - {REST}
+        if not others:
+            needed |= {CONTACT, DIRICHLET}
+        wanted: dict[int, Int32Array] = {}
+        for name, own in given.items():
+            usual: list[int] = [PARTS[name]] if own is None and parts[name] in needed else []
+            numbers = np.asarray(usual if own is None else own, dtype=np.int32)
+            wanted[parts[name]] = np.unique(np.atleast_1d(numbers))
+        called = {value: name for name, value in parts.items()}
         for a, b in itertools.combinations(wanted, 2):
             if len(both := np.intersect1d(wanted[a], wanted[b])):
                 raise InputError(
-                    f"the facet value {both[0]} stands for {part_name(a)} and for {part_name(b)}: "
+                    f"the facet value {both[0]} stands for {called[a]} and for {called[b]}: "
                     "a value can stand for one part only"
                 )
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
@@ -141,7 +149,7 @@ class Domain:
             values[chosen] = part
             if np.any(inside[chosen]):
                 complaint = (
-                    f"{np.count_nonzero(inside[chosen])} facets tagged {part_name(part)} lie "
+                    f"{np.count_nonzero(inside[chosen])} facets tagged {called[part]} lie "
                     "inside the domain: only exterior facets can be tagged"
                 )
         raise_together(mesh.comm, complaint)
@@ -152,24 +160,25 @@ class Domain:
         for part, numbers in wanted.items():
             known.update(int(value) for value in numbers)
             missing = [int(value) for value in numbers if value not in there]
-            if part != REST and (missing or not len(numbers)):
+            if part in needed and (missing or not len(numbers)):
                 raise InputError(
-                    f"no exterior facet is tagged {part_name(part)} (value {_list(missing)}): the"
+                    f"no exterior facet is tagged {called[part]} (value {_list(missing)}): the"
                     f" values there are {_list(sorted(there))}"
                 )
-        if neumann is not None and (left := sorted(there - known)):
-            words = [f"{part_name(part)} {_list(numbers)}" for part, numbers in wanted.items()]
+        if (neumann is not None or others) and (left := sorted(there - known)):
+            words = [f"{called[part]} {_list(numbers)}" for part, numbers in wanted.items()]
             words[0] = words[0].replace(" ", " is ", 1)
             raise InputError(
                 f"exterior facets are tagged {_list(left)}, which stands for nothing:"
                 f" {', '.join(words[:-1])} and {words[-1]}"
             )
-        return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]))
+        return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]), parts=parts)
 
 
-def part_name(part: int) -> str:
-    """The key of `PARTS` that a number stands for."""
-    return next(name for name, value in PARTS.items() if value == part)
+def numbered(names: Iterable[str]) -> dict[str, int]:
+    """Give values in facet tags to the usual parts and to further ones, by name."""
+    own = [name for name in dict.fromkeys(names) if name not in PARTS]
+    return PARTS | {name: len(PARTS) + 1 + i for i, name in enumerate(own)}
 
 
 def _list(items: Iterable[object]) -> str:
@@ -211,8 +220,11 @@ class Polygon:
 
     Attributes:
         vertices: Shape (n, 2), in either orientation.
-        boundary: Part of edge i, which runs from vertex i to vertex i + 1: a key of `PARTS`.
+        boundary: Part of edge i, which runs from vertex i to vertex i + 1: a key of `PARTS`, or one
+            of `names`.
         holes: Polygons inside this one, apart from each other.
+        names: Further parts that there may be, whose conditions are in `Problem.conditions`. With
+            some, there need be no edge that is contact, and none that is dirichlet.
 
     Raises:
         InputError: An outline crosses itself or another one, or a label is not known.
@@ -221,19 +233,26 @@ class Polygon:
     vertices: FloatArray
     boundary: tuple[str, ...]
     holes: tuple[Polygon, ...] = ()
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Take lists as well as arrays and check everything that can be checked at once."""
         object.__setattr__(self, "vertices", coordinates(self.vertices))
         object.__setattr__(self, "boundary", tuple(self.boundary))
         object.__setattr__(self, "holes", tuple(self.holes))
-        check_labels(self.boundary, len(self.vertices), tuple(PARTS))
+        object.__setattr__(self, "names", tuple(self.names))
+        check_labels(self.boundary, len(self.vertices), (*PARTS, *self.names))
         check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
         if any(hole.holes for hole in self.holes):
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
     def check_parts(self) -> None:
-        """Insist on a Dirichlet and a contact part (a hole alone needs neither)."""
+        """Insist on a Dirichlet and a contact part, unless there may be others.
+
+        A hole alone needs neither.
+        """
+        if self.names:
+            return
         labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
         for part in ("contact", "dirichlet"):
             if part not in labels:
@@ -266,11 +285,19 @@ class Polygon:
         self.check_parts()
         loops = [self.vertices, *(hole.vertices for hole in self.holes)]
         names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
-        labels = np.array([PARTS[name] for name in names], dtype=np.int32)
-        return _distribute(comm, gmshmesh.triangulate, loops, labels, float(size))
+        labels = np.array([self.parts[name] for name in names], dtype=np.int32)
+        return _distribute(comm, self.parts, gmshmesh.triangulate, loops, labels, float(size))
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """The parts that there may be, and their values in facet tags."""
+        names = itertools.chain(self.names, *(hole.names for hole in self.holes))
+        return numbered(names)
 
 
-def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
+def read_gmsh(
+    path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, names: Sequence[str] = ()
+) -> Domain:
     """Read a gmsh file (2.2 or 4.1, ASCII or binary) with named physical curves; collective.
 
     The physical curves named dirichlet, contact and neumann (in any case) are Γ0, Γ1 and Γg.
@@ -280,15 +307,21 @@ def read_gmsh(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
     Args:
         path: A planar mesh of straight-sided triangles.
         comm: The ranks that share the mesh.
+        names: Further curves to look for, whose conditions are in `Problem.conditions`. With some,
+            there need be no curve named contact, and none named dirichlet.
 
     Raises:
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
-    return _distribute(comm, gmshmesh.read, Path(path), PARTS)
+    parts = numbered(names)
+    return _distribute(comm, parts, gmshmesh.read, Path(path), parts, not names)
 
 
 def _distribute(
-    comm: MPI.Comm, make: Callable[..., gmshmesh.Triangulation], *args: object
+    comm: MPI.Comm,
+    parts: Mapping[str, int],
+    make: Callable[..., gmshmesh.Triangulation],
+    *args: object,
 ) -> Domain:
     """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
     began = time.perf_counter()
@@ -319,4 +352,4 @@ def _distribute(
     values = np.full(_count(mesh, 1), REST, dtype=np.int32)
     values[found.indices] = found.values
     tags = meshtags(mesh, 1, exterior, values[exterior])
-    return Domain(mesh, tags, time.perf_counter() - began)
+    return Domain(mesh, tags, time.perf_counter() - began, parts)

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
 from ..errors import InputError
-from .domain import PARTS, Domain, Polygon, _distribute
+from .domain import Domain, Polygon, _distribute
 from .gmshmesh import Triangulation
 
 
@@ -52,7 +52,7 @@ def structured(
         raise InputError(
             f"shift is {shift} and jitter {jitter}: less than 0.5 and 0.25 keep triangles upright"
         )
-    return _distribute(comm, _squares, polygon, n, shift, jitter, seed)
+    return _distribute(comm, polygon.parts, _squares, polygon, n, shift, jitter, seed)
 
 
 def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -> Triangulation:
@@ -103,7 +103,7 @@ def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, Int32Array]:
     starts = np.concatenate([loop.vertices for loop in loops])
     ends = np.concatenate([np.roll(loop.vertices, -1, axis=0) for loop in loops])
     names = [name for loop in loops for name in loop.boundary]
-    return starts, ends, np.array([PARTS[name] for name in names], dtype=np.int32)
+    return starts, ends, np.array([polygon.parts[name] for name in names], dtype=np.int32)
 
 
 def _contains(starts: FloatArray, ends: FloatArray, points: FloatArray) -> BoolArray:

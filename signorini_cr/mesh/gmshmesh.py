@@ -22,6 +22,7 @@ from .planar import overlap, pieces
 
 _MOST_TRIANGLES = 2e7
 _MOST_FACETS = 1e5  # on the boundary
+_MOST_GRADED = 3e4  # on edges beside short ones: gmsh takes a minute for so many
 _UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
 _GROWTH = 0.3  # of the size, per length, away from short facets
@@ -118,11 +119,19 @@ def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) ->
         )
     facets = [length / count for length, count in zip(lengths, counts)]
     shortest = min(map(np.min, facets))
+    near_vertices = _sizes(loops, facets)
+    graded = _graded(lengths, facets, near_vertices)
+    if graded > _MOST_GRADED:
+        raise InputError(
+            f"an edge has facets of {shortest:.3g} beside much longer edges: those that grow from"
+            f" there along these would be about {graded:.1e}, and {_MOST_GRADED:g} are allowed;"
+            " longer edges are needed, or a mesh file"
+        )
     with _session() as gmsh:
         geo = gmsh.model.geo
         curves: list[int] = []
         rings = []
-        for loop, facet, count, near in zip(loops, facets, counts, _sizes(loops, facets)):
+        for loop, facet, count, near in zip(loops, facets, counts, near_vertices):
             even = np.minimum(near, np.roll(near, -1)) > _UNEVEN * facet
             points = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(loop, near)]
             lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1])]
@@ -150,6 +159,18 @@ def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) ->
         )
 
 
+def _graded(
+    lengths: Sequence[FloatArray], facets: Sequence[FloatArray], sizes: Sequence[FloatArray]
+) -> float:
+    """About how many facets there are on edges that are graded, sizes linear between their ends."""
+    total = 0.0
+    for length, facet, near in zip(lengths, facets, sizes, strict=True):
+        low, high = np.sort([near, np.roll(near, -1)], axis=0)
+        mean = (high - low) / np.log(np.maximum(high / low, 1 + 1e-9))
+        total += float(np.sum((length / np.maximum(mean, low))[low <= _UNEVEN * facet]))
+    return total
+
+
 def _sizes(loops: Sequence[FloatArray], facets: Sequence[FloatArray]) -> list[FloatArray]:
     """Facet length at every vertex: the shorter of its edges', growing slowly.
 
@@ -163,12 +184,13 @@ def _sizes(loops: Sequence[FloatArray], facets: Sequence[FloatArray]) -> list[Fl
     return np.split(slow, np.cumsum([len(loop) for loop in loops])[:-1])
 
 
-def read(path: Path, parts: dict[str, int]) -> Triangulation:
+def read(path: Path, parts: dict[str, int], usual: bool = True) -> Triangulation:
     """Read a planar triangle mesh with named physical curves.
 
     Args:
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
+        usual: Whether there must be a contact and a dirichlet curve.
     """
     file = mshfile.load(path)
     _check_cells(file, path)
@@ -176,10 +198,11 @@ def read(path: Path, parts: dict[str, int]) -> Triangulation:
     found: dict[str, list[Int64Array]] = {name: [] for name in parts}
     others: dict[str, list[Int64Array]] = {}
     for tag, name in names:
-        key = name.strip().lower()
+        key = name.strip()
+        key = key if key in parts else key.lower()
         group = found[key] if key in parts else others.setdefault(name or f"{tag}", [])
         group.append(file.elements(_LINE, tag))
-    for needed in ("contact", "dirichlet"):
+    for needed in ("contact", "dirichlet") if usual else tuple(parts)[3:]:
         if not sum(map(len, found[needed])):
             there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
             raise InputError(

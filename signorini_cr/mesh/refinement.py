@@ -67,7 +67,7 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
         topology.create_connectivity(1, 2)
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
-    return Domain(fine, _child_tags(domain, fine, facets)), parent
+    return Domain(fine, _child_tags(domain, fine, facets), parts=domain.parts), parent
 
 
 def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, Int32Array]:
@@ -134,7 +134,7 @@ def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]
     facet = _table(fine.topology.connectivity(2, 1))[cell, j][value > 0]
     order = np.argsort(facet)
     tags = meshtags(fine, 1, facet[order], value[value > 0][order])
-    return Domain(fine, tags), parent
+    return Domain(fine, tags, parts=domain.parts), parent
 
 
 def _count(index_map: Any) -> int:

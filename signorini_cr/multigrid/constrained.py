@@ -77,7 +77,9 @@ class ConstrainedMatrix:
         everything, self._at_columns = A.createVecRight(), PETSc.Vec().createSeq(len(columns))
         self._to_columns = PETSc.Scatter().create(everything, theirs, self._at_columns, None)
         everything.array[dofs] = 1.0
-        kept = np.isin(row, numbers) | self._seen(everything)[place]
+        own = np.isin(row, numbers)
+        self._of_own = np.searchsorted(numbers, row[own]), place[own], value[own]
+        kept = own | self._seen(everything)[place]
         release(theirs, everything)
         self._row, self._column, self._value = row[kept], column[kept], value[kept]
         self._place = place[kept]
@@ -126,6 +128,19 @@ class ConstrainedMatrix:
         rows.mult(sizes, self._product)
         release(rows, sizes)
         return self._product.array_r.copy()
+
+    def flows(self, x: PETSc.Vec, b: PETSc.Vec) -> FloatArray:
+        """What a row of A x − b is made of but for constants in x, in the same dofs, shape (n,).
+
+        That is Σ_j |a_ij| |x_j − x_i| + |Σ_j a_ij x_i − b_i|; collective.
+        """
+        self._to_columns.scatter(x, self._at_columns)
+        row, place, value = self._of_own
+        own = x.array_r[self.dofs]
+        flows = np.abs(value * (self._at_columns.array_r[place] - own[row]))
+        sums, rows = (np.bincount(row, each, minlength=len(own)) for each in (flows, value))
+        found: FloatArray = sums + np.abs(rows * own - b.array_r[self.dofs])
+        return found
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the matrix."""

@@ -9,7 +9,6 @@ import numpy as np
 from .. import compat
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
-from ..mesh.domain import PARTS
 from ..solution import Solution
 from .canvas import chains, draw_lines, grouped, headline, log_ticks, plane_axes, save
 
@@ -41,7 +40,8 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
     area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     density = np.sqrt(np.maximum(certificate.indicators, 0.0) / area)
     ends = [
-        facet_measures(mesh, solution.domain.facets(part))[0][..., :2] for part in PARTS.values()
+        facet_measures(mesh, solution.domain.facets(part))[0][..., :2]
+        for part in solution.domain.parts.values()
     ]
     pieces = mesh.comm.gather((corners, density, np.concatenate(ends)), root=0)
 

@@ -9,6 +9,7 @@ None elsewhere, and a notebook shows it.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
@@ -21,7 +22,7 @@ from mpi4py import MPI
 from ..arrays import FloatArray
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from .canvas import (
     BLUE,
     GREY,
@@ -54,8 +55,8 @@ STYLES: dict[int, dict[str, Any]] = {
     NEUMANN: {"color": YELLOW, "linewidth": 3.5, "label": r"$\Gamma_g$: Neumann"},
     CONTACT: {"color": RED, "linewidth": 4.5, "label": r"$\Gamma_1$: contact"},
 }
-for _name, _part in PARTS.items():  # others as they come
-    STYLES.setdefault(_part, {"color": "black", "linewidth": 3.0, "label": _name})
+OTHERS = ("#009e73", "#cc79a7", "#56b4e9", "#e69f00", "black")
+"""Colours of further parts, one after the other."""
 SERIES = {
     "error_h1": {"color": BLUE, "marker": "o", "label": r"$\|\nabla_h(u-u_h)\|$"},
     "bound_h1": {
@@ -68,6 +69,16 @@ SERIES = {
 }
 MOST_EDGES = 40_000
 """A mesh with more edges is drawn without those inside."""
+
+
+def _styles(domain: Domain) -> dict[int, dict[str, Any]]:
+    """How the parts of the boundary are drawn."""
+    own = [(name, part) for name, part in domain.parts.items() if part not in STYLES]
+    colors = itertools.cycle(OTHERS)
+    return STYLES | {
+        part: {"color": color, "linewidth": 3.5, "label": name}
+        for (name, part), color in zip(own, colors, strict=False)
+    }
 
 
 def can_draw(comm: MPI.Comm) -> bool:
@@ -91,12 +102,12 @@ def plot_mesh(
     """
     mesh = _plane(domain)
     cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
-    parts = {part: _segments(domain, part) for part in STYLES}
+    parts = {part: _segments(domain, part) for part in domain.parts.values()}
 
     def draw() -> Figure | SubFigure:
         figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2), ax=ax)
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
-        for part, style in STYLES.items():
+        for part, style in _styles(domain).items():
             if len(parts[part]):
                 lines = chains(parts[part])
                 draw_lines(axes, lines, zorder=3, capstyle="round", joinstyle="round", **style)
@@ -126,7 +137,7 @@ def plot_solution(
     domain, contact = solution.domain, solution.contact
     mesh = _plane(domain)
     image, box, limits = raster(solution.u)
-    boundary = np.concatenate([_segments(domain, part) for part in STYLES])
+    boundary = np.concatenate([_segments(domain, part) for part in domain.parts.values()])
     touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
     free = _gather(mesh.comm, contact.vertices[~contact.active][..., :2])
 

@@ -36,7 +36,7 @@ def errors(solution: Solution, degree: int) -> tuple[float, float]:
         ‖u − u_h‖_h in the broken norm (1.6) and ‖u − u_h‖ in L2.
     """
     problem = replace(solution.problem, error_degree=degree)
-    forms = Forms(problem, solution.domain.mesh, solution.element)
+    forms = Forms(problem, solution.domain.mesh, solution.element, solution.domain.parts)
     return forms.errors(solution.domain, solution.u)
 
 

@@ -25,6 +25,7 @@ from ..multigrid.cycle import PATIENCE, SLOW, Grid, Multigrid
 from ..options import PREFIX, REDUCED, defaults, read
 from .active import ActiveSet
 from .stopping import FORCES, LOST, NOISE, Stiffness
+from .system import Vectors
 
 LINEAR_SHARE = 0.9
 """What the linear solver leaves at the end, in parts of what the residual may be."""
@@ -95,7 +96,7 @@ class ReducedSolver:
         cycle: Multigrid,
         lower: FloatArray,
         snes: PETSc.SNES,
-        vectors: tuple[PETSc.Vec, PETSc.Vec],
+        vectors: Vectors,
         atol: float,
         stiffness: Stiffness,
         loose: float = 1.0,
@@ -106,13 +107,13 @@ class ReducedSolver:
             cycle: The preconditioner, with the matrix on its finest grid.
             lower: Bounds of that grid's bounded dofs, shape (n,).
             snes: The solver that it works for, which knows the active set.
-            vectors: Where SNES keeps the iterate and the residual.
+            vectors: Right-hand side, and where SNES keeps the iterate and the residual.
             atol: What the linear solver may leave at the end.
             stiffness: Classes of these dofs.
             loose: How many times more than usual may be wrong with the forces.
         """
         self._cycle, self._lower, self._snes = cycle, lower, snes
-        self._x, self._residual = vectors
+        self._x, self._residual, self._b = vectors.x, vectors.residual, vectors.b
         self._stiffness, self._share = stiffness, loose * FORCES
         self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(lower), dtype=bool))
         self.reached, self.reduction, self.iterations = np.inf, SET_SHARE, 0
@@ -150,6 +151,7 @@ class ReducedSolver:
 
     def solve(self, outer: PETSc.KSP, _: PETSc.Vec, reduced: PETSc.Vec) -> None:
         """Solve the reduced system; its right-hand side is the residual that SNES keeps."""
+        self._stiffness.sort(self._x, self._b)
         first, end = self.matrix.getOwnershipRange()
         inactive = self._snes.getVIInactiveSet().array - first
         self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, end - first)
@@ -200,7 +202,7 @@ class Outlook:
         unsettled: Whether any dof could still change sides: its indicator is less than what it
             changed by last.
         moved: Change of the forces on active dofs, summed over each class of stiffness.
-        forces: Sum of these forces themselves.
+        forces: What these are measured against: their sums, and not less than `Stiffness.least`.
     """
 
     wrong: float
@@ -257,6 +259,7 @@ class ReducedSystem:
         )
         facts = self.x.getComm().tompi4py().allreduce(facts)
         moved, forces = np.split(facts[2:], 2)
+        forces = np.maximum(forces, self.stiffness.least)
         return Outlook(float(np.sqrt(facts[0])), bool(facts[1]), moved, forces)
 
     def rounding(self) -> float:

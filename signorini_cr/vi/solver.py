@@ -62,7 +62,7 @@ class Iterations:
         linear: Linear (CG) iterations.
         preconditioner: The one taken, in words.
         force_error: What may be wrong with the contact forces, in parts of their sum: the largest
-            of all classes of stiffness.
+            of all classes, see `stopping`.
         imbalance: Largest residual of a class of stiffness in parts of its flows; 0 where there is
             one class only.
     """
@@ -111,7 +111,7 @@ def solve_vi(
         cycle,
         vectors.lower.array_r[cycle.operator.dofs],
         snes,
-        (vectors.x, vectors.residual),
+        vectors,
         LINEAR_SHARE * wanted,
         stiffness,
         max(1.0, wanted / target),
@@ -314,8 +314,10 @@ class NewtonTest:
                 (misclassified, np.abs(forces)),
             )
         ]
-        squares, *sums = self._cycle.matrix.getComm().tompi4py().allreduce(np.array(facts))
-        return _ContactFacts(active, float(np.sqrt(squares.sum())), *sums)
+        facts = self._cycle.matrix.getComm().tompi4py().allreduce(np.array(facts))
+        squares, sums, moved, wrong = facts
+        sums = np.maximum(sums, self._stiffness.least)
+        return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, moved, wrong)
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +328,7 @@ class _ContactFacts:
         active: The active set of the iterate.
         misclassified_norm: Norm of the residual in the dofs that the last system had in the other
             set.
-        forces: Sum of the forces on active dofs.
+        forces: Sum of the forces on active dofs, and not less than `Stiffness.least`.
         moved: Sum of what they have changed by since the step before.
         misclassified: Sum of the forces on misclassified dofs.
     """

@@ -26,12 +26,27 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..garbage import release
 from ..multigrid.cycle import Grid
 
 DECADES = 2.0
 """Dofs whose diagonal entries are within so many powers of ten make a class."""
+
+LEVELS = 6
+"""So many classes of dofs on Γ1 that are made of much or of little; the last has all the rest."""
+
+LEVEL = 3.0
+"""So many powers of ten make one."""
+
+WINDOWS = 16
+"""Neighbourhoods are squares, so many of them along the longest extent of Γ1: the end of a contact
+zone, or a corner, where forces fall to 0 is no part of its own."""
+
+PART = 1e-2
+"""What forces are measured against at least, in parts of what the rows of their class are made of;
+but in the first, which are made of most."""
 
 FORCES = 1e-7
 """What may be wrong with the contact forces, in parts of their sum."""
@@ -60,9 +75,10 @@ class Stiffness:
     as what dof j gets from dof i is what i gives to j.
 
     Attributes:
-        number: How many classes there are, over all ranks; some may be empty.
+        number: How many classes of dofs with a bound there are, over all ranks; some may be empty.
         contrast: Largest diagonal entry over the smallest.
         bounded: Class of each dof with a bound, shape (n,).
+        least: What forces are measured against at least, shape (classes,).
     """
 
     def __init__(self, grid: Grid, row_sums: Callable[[], FloatArray] | None = None):
@@ -81,10 +97,13 @@ class Stiffness:
         low = self._comm.allreduce(float(entries.min(initial=np.inf, where=free)), op=MPI.MIN)
         high = self._comm.allreduce(float(entries.max(initial=0.0, where=free)), op=MPI.MAX)
         self._smallest, self.contrast = low, max(high / low, 1.0)
-        self.number = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
-        self.bounded = self._classes(grid.operator.diagonal)
+        self._kinds = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
+        self._kind = self._classes(grid.operator.diagonal)
+        self.number = self._kinds * LEVELS
+        self.bounded, self.least = LEVELS * self._kind, np.zeros(self.number)
+        self._window = _windows(grid)
         self._differences: PETSc.Mat | None = None
-        if row_sums is not None and self.number > 1:
+        if row_sums is not None and self._kinds > 1:
             self._free, self._class = free, self._classes(entries)
             self._diagonal = entries.copy()
             self._row_sums = row_sums()
@@ -94,6 +113,24 @@ class Stiffness:
     def _classes(self, diagonal: FloatArray) -> IndexArray:
         decades = np.log10(diagonal / self._smallest) / DECADES
         return np.maximum(decades, 0.0).astype(np.intp)
+
+    def sort(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
+        """Sort the bounded dofs by what their rows are made of now; collective.
+
+        Args:
+            x: The iterate.
+            b: Right-hand side.
+        """
+        made_of = self._grid.operator.flows(x, b)
+        around: FloatArray = np.zeros(WINDOWS**3)
+        np.maximum.at(around, self._window, made_of)
+        self._comm.Allreduce(MPI.IN_PLACE, around, op=MPI.MAX)
+        top, around = float(around.max()), around[self._window]
+        decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
+        level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
+        self.bounded = LEVELS * self._kind + level
+        self.least = PART * self._comm.allreduce(self.sums(made_of))
+        self.least[::LEVELS] = 0.0
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Sum values of the bounded dofs over this rank's part of each class, shape (classes,)."""
@@ -147,7 +184,7 @@ class Stiffness:
         counted = self._free.copy()
         counted[active] = False
         facts = [
-            np.bincount(self._class[counted], values[counted] ** 2, minlength=self.number)
+            np.bincount(self._class[counted], values[counted] ** 2, minlength=self._kinds)
             for values in (
                 r.array_r,
                 sizes.array_r + np.abs(self._row_sums * x.array_r - b.array_r),
@@ -161,6 +198,22 @@ class Stiffness:
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free the differences."""
         release(self._differences)
+
+
+def _windows(grid: Grid) -> IndexArray:
+    """The number of the square, or cube, around each dof with a bound, shape (n,); collective."""
+    layout, comm = grid.dofs, grid.matrix.getComm().tompi4py()
+    nodes = grid.operator.dofs // layout.block
+    cell = np.zeros(layout.local // layout.block, dtype=np.intp)
+    cell[layout.cells] = np.arange(len(layout.cells))[:, None]
+    corners = layout.mesh.geometry.x[compat.cell_nodes(layout.mesh)[cell[nodes]]]
+    x = corners.mean(axis=1)
+    ends = np.stack([x.min(axis=0, initial=np.inf), -x.max(axis=0, initial=-np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
+    low, size = ends[0], -(ends[0] + ends[1]).min()
+    place = np.clip((x - low) * (WINDOWS / max(size, 1e-300)), 0, WINDOWS - 1).astype(np.intp)
+    window: IndexArray = place @ WINDOWS ** np.arange(3)
+    return window
 
 
 def _differences(A: PETSc.Mat) -> tuple[PETSc.Mat, FloatArray]:

@@ -120,6 +120,10 @@ BAD: dict[str, tuple[str, list[str]]] = {
     "size negative": (with_("size = 0.5", "size = -0.5"), ["domain.size:", "found -0.5"]),
     "size infinite": (with_("size = 0.5", "size = inf"), ["domain.size:", "found inf"]),
     "size far too small": (with_("size = 0.5", "size = 1e-12"), ["domain:", "size is 1e-12"]),
+    "a strip too thin for its ends": (
+        with_("[1, 1], [-1, 1]", "[1, 1e-6], [-1, 1e-6]"),
+        ["domain:", "facets of 1e-06", "about 4", "30000 are allowed"],
+    ),
     "vertices no list": (
         with_("vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]", "vertices = 4"),
         ["domain.vertices: a list is needed, found 4"],

@@ -1,10 +1,12 @@
 """What is left where a run is ended from outside, or by lack of memory."""
 
+import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import helpers
@@ -213,3 +215,32 @@ def test_a_rank_without_the_others_does_not_solve_alone(tmp_path: Path, monkeypa
     status = cli.main(["solve", str(tmp_path / "case.toml"), "--out", str(tmp_path / "out")])
     assert status == cli.BAD_INPUT
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.serial
+def test_a_signal_waits_for_an_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A library that is being loaded is loaded; then the run ends."""
+    (tmp_path / "told_while_loading.py").write_text(
+        "import os, signal, time\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+        "time.sleep(0.2)\n"
+        "loaded = 1\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with cli._interruptible() as asked:
+        module = importlib.import_module("told_while_loading")
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(5.0)
+    assert module.loaded == 1 and set(asked) == {signal.SIGTERM}
+
+
+@pytest.mark.serial
+def test_told_twice_is_told_once() -> None:
+    """By the terminal and by mpirun: the second must not disturb what ends the run."""
+    with cli._interruptible() as asked:
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5.0)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.1)
+    assert asked == [signal.SIGINT, signal.SIGTERM]

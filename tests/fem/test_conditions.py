@@ -1,13 +1,34 @@
 """Conditions say what they add: one more kind is solved right; data are sampled once a mesh."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 import ufl
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_unit_square,
+    exterior_facet_indices,
+    meshtags,
+)
+from mpi4py import MPI
 
-from signorini_cr import Polygon, Problem, compat, exact, solve, solve_levels
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Domain,
+    InputError,
+    Neumann,
+    Polygon,
+    Problem,
+    Robin,
+    compat,
+    exact,
+    solve,
+    solve_levels,
+)
 from signorini_cr.diffusion import Diffusion
-from signorini_cr.fem import problem as forms_of_problem
-from signorini_cr.fem.conditions import KINDS, Condition
+from signorini_cr.fem.conditions import Condition
 from signorini_cr.fem.space import ghosted_vector
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
@@ -18,23 +39,20 @@ SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
 PARTS = ("contact", "neumann", "dirichlet", "dirichlet")
 
 
+@dataclass(frozen=True, eq=False)
 class Spring(Condition):
-    """κ∂ₙu + 3 u = g, the 3 u of it."""
+    """κ∂ₙu + 3 u = g."""
 
-    part, key = "neumann", "spring"
+    g: object = 0.0
     uncertified = "there is a spring"
 
-    @classmethod
-    def of(cls, _):
-        return cls(ufl.as_ufl(3.0))
+    @property
+    def flux(self):
+        return self.g
 
-    def a(self, u, v):
-        return self.value * u * v
-
-
-@pytest.fixture
-def springs(monkeypatch):
-    monkeypatch.setattr(forms_of_problem, "KINDS", (*KINDS, Spring))
+    @property
+    def loss(self):
+        return ufl.as_ufl(3.0)
 
 
 def u(x):
@@ -42,12 +60,14 @@ def u(x):
 
 
 SPRUNG = Problem(
-    exact=u, obstacle=-10.0, g=lambda x: 2.0 * ufl.cos(3.0) * ufl.cosh(x[1]) + 3.0 * u(x)
+    exact=u,
+    obstacle=-10.0,
+    conditions={"neumann": Spring(lambda x: 2.0 * ufl.cos(3.0) * ufl.cosh(x[1]) + 3.0 * u(x))},
 )
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
-def test_another_kind_is_solved_right(springs, element):
+def test_another_kind_is_solved_right(element):
     domain = Polygon(SQUARE, PARTS).mesh(0.25)
     *_, coarse, fine = solve_levels(SPRUNG, domain, 4, element)
     assert coarse.errors and fine.errors
@@ -58,7 +78,7 @@ def test_another_kind_is_solved_right(springs, element):
     assert certificate.bound_h1 is None and certificate.reason == "there is a spring"
 
 
-def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows(springs):
+def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows():
     domain = Polygon(SQUARE, PARTS).mesh(0.3)
     mesh = NestedMesh(Diffusion(SPRUNG, domain.mesh), domain)
     level, (operator, p1, dirichlet) = Level((mesh,)), conforming(mesh)
@@ -75,6 +95,120 @@ def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows(springs):
         for dofs in (level.system.held, level.system.dirichlet)
     )
     assert held > fixed
+
+
+NAMES = ("floor", "air", "roof", "wall")
+
+
+def waves(x):
+    return ufl.sin(2.0 * x[0] + 1.0) * ufl.cosh(x[1]) + 1.0
+
+
+def on_the_square(conditions, size=0.25, **data):
+    """A problem with each edge a part of its own, and its domain."""
+    domain = Polygon(SQUARE, NAMES, names=NAMES).mesh(size)
+    return Problem(conditions=dict(zip(NAMES, conditions, strict=True)), **data), domain
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+@pytest.mark.parametrize("c", [0.0, 30.0])
+def test_all_kinds_at_once_converge_as_theory_says(element, c):
+    """Robin, two contact parts with obstacles of their own, one of them touched, no Γ0.
+
+    On the floor u is the obstacle, κ∂ₙu + 2 (u − 1) − g is 1.5 there; on the wall it is free.
+    """
+
+    def force(x):
+        return -ufl.sin(2.0 * x[0] + 1.0) * ufl.sinh(x[1]) * 3.0 + 2.0 * (waves(x) - 1.0)
+
+    problem, domain = on_the_square(
+        (
+            Contact(waves, coefficient=2.0, external=1.0, g=lambda x: force(x) - 1.5),
+            Robin(coefficient=4.0, external=-1.0),
+            Neumann(),
+            Contact(-9.0, g=lambda x: -6.0 * ufl.cos(1.0) * ufl.cosh(x[1])),
+        ),
+        exact=waves,
+        coefficient=3.0,
+        reaction=c,
+    )
+    *_, coarse, fine = solve_levels(problem, domain, 4, element)
+    h1, l2 = np.log2(np.array(coarse.errors) / np.array(fine.errors))
+    assert h1 == pytest.approx(1.0, abs=0.03) and l2 == pytest.approx(2.0, abs=0.1)
+    assert fine.contact.force == pytest.approx(1.5, rel=2e-3)
+    assert fine.contact.active.sum() < len(fine.contact.active) or fine.domain.mesh.comm.size > 1
+    if element == "CR":
+        error, certificate = fine.errors[0], fine.certificate
+        assert error < certificate.bound_h1 < 1.1 * error
+
+
+def test_a_loss_on_all_sides_balances_the_load_exactly():
+    """u = f / c where that suits all conditions; u = f |Ω| / (b |∂Ω|) is not far for small b.
+
+    With b → 0 the mean of b u over the boundary is ∫ f: the energy's balance, by hand.
+    """
+    lossy = [Robin(coefficient=1e-6) for _ in range(3)]
+    problem, domain = on_the_square((Contact(-1e9), *lossy), f=2.0)
+    solution = solve(problem, domain)
+    assert solution.u.x.array.min() == pytest.approx(2.0 / 3e-6, rel=1e-4)
+    problem, domain = on_the_square(
+        (Contact(-1.0), Neumann(), Neumann(), Neumann()), f=6.0, reaction=3
+    )
+    solution = solve(problem, domain)
+    assert np.allclose(solution.u.x.array, 2.0, atol=1e-9)
+    assert solution.certificate.bound_energy_norm < 1e-6
+
+
+def test_a_stiff_spring_is_a_dirichlet_condition():
+    """b → ∞: the same force as with u = u_ext, but for what the facets of the side resolve."""
+    forces = []
+    for side in (Dirichlet(0.5), Robin(coefficient=1e9, external=0.5)):
+        problem, domain = on_the_square((Contact(0.0), side, side, side), 0.1, f=-9.0)
+        forces.append(solve(problem, domain).contact.force)
+    assert forces[0] > 0.5 and forces[1] == pytest.approx(forces[0], rel=5e-3)
+
+
+def test_parts_and_conditions_must_match():
+    flat = [Contact(0.0), Neumann(), Neumann(), Dirichlet()]
+    problem, domain = on_the_square(flat)
+    with pytest.raises(InputError, match="the part 'wall' of the boundary has none"):
+        solve(replace(problem, conditions=dict(list(problem.conditions.items())[:3])), domain)
+    with pytest.raises(InputError, match="no part of the boundary is called 'ground'"):
+        solve(replace(problem, conditions={**problem.conditions, "ground": Neumann()}), domain)
+    with pytest.raises(InputError, match="'wall' is 3; Dirichlet, Neumann, Robin or Contact"):
+        solve(replace(problem, conditions={**problem.conditions, "wall": 3}), domain)
+    for key, wrong in (("reaction", {"reaction": -1.0}), ("'air'", {})):
+        conditions = problem.conditions | ({} if wrong else {"air": Robin(coefficient=-2.0)})
+        with pytest.raises(InputError, match=f"{key}.* must not be below 0"):
+            solve(replace(problem, conditions=conditions, **wrong), domain)
+    jump = {**problem.conditions, "roof": Dirichlet(1.0)}
+    with pytest.raises(InputError, match=r"at \(0, 1\) the dirichlet value jumps from 0 to 1"):
+        solve(replace(problem, conditions=jump), domain)
+
+
+def test_parts_of_the_users_own_by_tags():
+    """Facet values by name; what nobody names is an error, and refinement keeps them."""
+    mesh = create_unit_square(MPI.COMM_WORLD, 4, 4)
+    facets = exterior_facet_indices_of(mesh)
+    x = compute_midpoints(mesh, 1, facets)
+    values = np.select([x[:, 1] < 1e-9, x[:, 0] > 1 - 1e-9, x[:, 1] > 1 - 1e-9], [7, 8, 9], 10)
+    tags = meshtags(mesh, 1, facets, values.astype(np.int32))
+    domain = Domain.from_tags(mesh, tags, floor=7, rest=(8, 9, 10))
+    problem = Problem(f=-9.0, conditions={"floor": Contact(-0.1), "rest": Dirichlet()})
+    *_, fine = solve_levels(problem, domain, 2)
+    usual = Domain.from_tags(mesh, tags, contact=7, dirichlet=(8, 9, 10))
+    *_, same = solve_levels(Problem(f=-9.0, obstacle=-0.1), usual, 2)
+    assert fine.contact.force == pytest.approx(same.contact.force, rel=1e-9) and same.contact.force
+    assert set(fine.domain.parts) == {"contact", "dirichlet", "neumann", "floor", "rest"}
+    with pytest.raises(InputError, match=r"tagged 10, which stands for nothing"):
+        Domain.from_tags(mesh, tags, floor=7, rest=(8, 9))
+    with pytest.raises(InputError, match=r"no exterior facet is tagged rest \(value 5\)"):
+        Domain.from_tags(mesh, tags, floor=7, rest=(5, 8, 9, 10))
+
+
+def exterior_facet_indices_of(mesh):
+    mesh.topology.create_connectivity(1, 2)
+    return exterior_facet_indices(mesh.topology)
 
 
 def test_boundary_data_are_sampled_once_a_mesh(monkeypatch):

@@ -351,3 +351,38 @@ def test_a_piece_pressed_onto_the_obstacle(slope, element, nested):
         assert contact.midpoints[contact.active, 0].max(initial=2.0) < 2.6
     if element == "CR":
         assert "Γ0" in solution.certificate.reason
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e6, 1e10])
+def test_a_part_that_presses_little_is_known_as_well(scale):
+    """Two contact parts, 24 heights of the strip apart: they know of each other by e^{−24π}.
+
+    So the forces on the right are those that there are with nothing on the left, facet by facet,
+    however much presses there; so it is where α has a peak at one end of a single part.
+    """
+    corners = [[0, 0], [2, 0], [8, 0], [14, 0], [14, 0.25], [0, 0.25]]
+    parts = ["contact", "neumann", "contact", "neumann", "dirichlet", "neumann"]
+    domain = Polygon(corners, parts).mesh(0.25)
+
+    def right(height):
+        def alpha(x):
+            return ufl.conditional(
+                ufl.lt(x[0], 5.0),
+                height * (x[0] - 0.7) if height else -9.0,
+                -0.02 - 0.002 * (x[0] - 8.0),
+            )
+
+        *_, solution = solve_levels(Problem(f=-1.0, obstacle=alpha), domain, 3)
+        contact = solution.contact
+        there = contact.midpoints[:, 0] > 5.0
+        total = MPI.COMM_WORLD.allreduce(float((contact.pressure * contact.measure)[~there].sum()))
+        return contact.active[there], (contact.pressure * contact.measure)[there], total
+
+    alone, expected, nothing = right(0.0)
+    active, forces, much = right(scale)
+    assert nothing == 0.0 and much > scale
+    assert np.array_equal(active, alone)
+    wrong, whole = (
+        MPI.COMM_WORLD.allreduce(float(np.abs(f).sum())) for f in (forces - expected, expected)
+    )
+    assert whole > 0.1 and wrong < 2e-6 * whole

@@ -1,0 +1,319 @@
+"""Terms without gradients and several parts of each kind: bounds against errors.
+
+u is a sum of waves, smooth; on each contact part λ = max(s, 0) and u − α = max(−s, 0) with a wave s
+along the edge, so that contact begins and ends where s has its zeros; g there is what that takes.
+All integrals are of smooth functions on triangles and between those zeros, by Gauss's rules.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ufl
+from bounds import MISSING, NEARLY, Outcome, Tally
+from mpi4py import MPI
+from report import Group, Row, told
+
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    InputError,
+    Neumann,
+    NotConverged,
+    Polygon,
+    Problem,
+    Robin,
+    Solution,
+    families,
+    solve_adaptive,
+    solve_levels,
+)
+
+COMM = MPI.COMM_WORLD
+SIDES = ("floor", "right", "top", "left")
+CORNERS = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+KINDS = ["contact", "dirichlet", "neumann", "robin"]
+NORMALS = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+SIZES = (0.0, 1.0, 1e2, 1e4, 1e6, 1e8)
+"""What c and b are."""
+GAP = 0.1
+"""How far u is above the obstacle, in parts of what the pressure is where they touch."""
+MOST = 1.3
+"""Bound over error in the energy norm where u is smooth."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """What holds on an edge of the square.
+
+    Attributes:
+        kind: "contact", "dirichlet", "neumann" or "robin".
+        b: The coefficient.
+        external: u_ext.
+        wave: Amplitude, frequency and phase of s along the edge.
+    """
+
+    kind: str
+    b: float
+    external: float
+    wave: tuple[float, float, float]
+
+
+class Case:
+    """A problem with its solution, for UFL and for NumPy.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        self.amplitudes, self.phases = rng.uniform(-1, 1, 3), rng.uniform(0, 6, 3)
+        self.waves = rng.uniform(-3, 3, (3, 2))
+        self.kappa, self.c = float(rng.choice([1.0, 1.0, 1e-2, 1e3])), float(rng.choice(SIZES))
+        self.sides = []
+        for i in range(4):
+            kind = (
+                "contact"
+                if i == 0
+                else str(rng.choice(["contact", "dirichlet", "neumann", "robin"]))
+            )
+            b = float(rng.choice(SIZES)) if kind in ("contact", "robin") else 0.0
+            wave = (
+                float(rng.uniform(0.5, 3)) * self.kappa,
+                float(rng.uniform(2, 4)),
+                float(rng.uniform(0, 6)),
+            )
+            self.sides.append(Side(kind, b, float(rng.uniform(-1, 1)), wave))
+        held = self.c > 0 or any(s.kind == "dirichlet" or s.b > 0 for s in self.sides)
+        if not held:
+            self.sides[2] = Side("dirichlet", 0.0, 0.0, (1.0, 1.0, 0.0))
+
+    def u(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """U."""
+        rows = zip(self.amplitudes, self.waves, self.phases, strict=True)
+        return sum(float(a) * sin(float(p) * x + float(q) * y + float(s)) for a, (p, q), s in rows)
+
+    def slope(self, x: Any, y: Any, cos: Callable[[Any], Any] = np.cos) -> tuple[Any, Any]:
+        """∇u."""
+        rows = list(zip(self.amplitudes, self.waves, self.phases, strict=True))
+        common = [float(a) * cos(float(p) * x + float(q) * y + float(s)) for a, (p, q), s in rows]
+        return tuple(
+            sum(float(wave[axis]) * each for wave, each in zip(self.waves, common, strict=True))
+            for axis in (0, 1)
+        )  # type: ignore[return-value]
+
+    def f(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """−κΔu + c u."""
+        rows = zip(self.amplitudes, self.waves, self.phases, strict=True)
+        return sum(
+            (self.kappa * float(p * p + q * q) + self.c)
+            * float(a)
+            * sin(float(p) * x + float(q) * y + float(s))
+            for a, (p, q), s in rows
+        )
+
+    def known(self, i: int, x: Any, y: Any, sin: Any = np.sin, cos: Any = np.cos) -> Any:
+        """κ∂ₙu + b (u − u_ext), which is g where there is no contact."""
+        side, (p, q) = self.sides[i], NORMALS[i]
+        a, b = self.slope(x, y, cos)
+        flux = self.kappa * (float(p) * a + float(q) * b)
+        return flux + side.b * (self.u(x, y, sin) - side.external)
+
+    def problem(self) -> Problem:
+        """All data, none derived from u."""
+
+        def on(i: int) -> Any:
+            side = self.sides[i]
+            amplitude, frequency, phase = side.wave
+
+            def wave(x: Any) -> Any:
+                return amplitude * ufl.sin(frequency * x[i % 2] + phase)
+
+            def g(x: Any) -> Any:
+                return self.known(i, x[0], x[1], ufl.sin, ufl.cos)
+
+            lossy = {"coefficient": side.b, "external": side.external}
+            if side.kind == "contact":
+                return Contact(
+                    lambda x: self.u(x[0], x[1], ufl.sin)
+                    - ufl.max_value(-wave(x) * (GAP / self.kappa), 0.0),
+                    g=lambda x: g(x) - ufl.max_value(wave(x), 0.0),
+                    **lossy,
+                )
+            if side.kind == "robin":
+                return Robin(g, **lossy)
+            if side.kind == "neumann":
+                return Neumann(g)
+            return Dirichlet(lambda x: self.u(x[0], x[1], ufl.sin))
+
+        return Problem(
+            f=lambda x: self.f(x[0], x[1], ufl.sin),
+            coefficient=self.kappa,
+            reaction=self.c,
+            conditions={name: on(i) for i, name in enumerate(SIDES)},
+        )
+
+    def energy(self) -> float:
+        """J(u), by Gauss's rules on the square and on the edges between the zeros of s."""
+        t, weights = _gauss(np.linspace(0.0, 1.0, 9))
+        x, y = np.meshgrid(t, t)
+        a, b = self.slope(x, y)
+        u = self.u(x, y)
+        inside = 0.5 * self.kappa * (a**2 + b**2) + 0.5 * self.c * u**2 - self.f(x, y) * u
+        total = float(weights @ inside @ weights)
+        for i, side in enumerate(self.sides):
+            if side.kind == "dirichlet":
+                continue
+            amplitude, frequency, phase = side.wave
+            zeros = (np.arange(-5, 12) * np.pi - phase) / frequency
+            cuts = np.linspace(0.0, 1.0, 9)
+            if side.kind == "contact":
+                cuts = np.unique([*cuts, *zeros[(zeros > 0) & (zeros < 1)]])
+            t, weights = _gauss(cuts)
+            ends = [np.zeros_like(t), np.ones_like(t)]
+            x, y = ((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]
+            u, g = self.u(x, y), self.known(i, x, y)
+            if side.kind == "contact":
+                g = g - np.maximum(amplitude * np.sin(frequency * t + phase), 0.0)
+            total += float(weights @ (0.5 * side.b * u**2 - (g + side.b * side.external) * u))
+        return total
+
+
+def _gauss(cuts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ten points between any two of the cuts."""
+    x, w = np.polynomial.legendre.leggauss(10)
+    start, length = cuts[:-1, None], np.diff(cuts)[:, None]
+    return (start + 0.5 * (x + 1.0) * length).ravel(), (0.5 * w * length).ravel()
+
+
+def distances(solution: Solution, case: Case) -> tuple[float, float]:
+    """Errors in H1 and in the energy norm; collective."""
+    mesh, V = solution.domain.mesh, solution.u.function_space
+    cells = mesh.topology.index_map(2).size_local
+    corner = mesh.geometry.x[mesh.geometry.dofmap[:cells], :2]
+    at_facets = solution.u.x.array[V.dofmap.list[:cells]]  # facet i is opposite vertex i
+    values = at_facets.sum(axis=1, keepdims=True) - 2.0 * at_facets
+    edges = corner[:, 1:] - corner[:, :1]
+    rise = values[:, 1:] - values[:, :1]
+    slope = np.linalg.solve(edges, rise[..., None])[..., 0]
+    area = 0.5 * np.abs(np.linalg.det(edges))
+    x, w = np.polynomial.legendre.leggauss(7)
+    s, t = np.meshgrid(0.5 * (x + 1.0), 0.5 * (x + 1.0))
+    first, second = s.ravel(), (t * (1.0 - s)).ravel()  # a square, collapsed to the triangle
+    weights = 0.5 * np.outer(w, w).ravel() * (1.0 - first)
+    hats = np.stack([1.0 - first - second, first, second])
+    points = np.einsum("qc,nck->nqk", hats.T, corner)
+    a, b = case.slope(points[..., 0], points[..., 1])
+    steep = (a - slope[:, :1]) ** 2 + (b - slope[:, 1:]) ** 2
+    off = (case.u(points[..., 0], points[..., 1]) - values @ hats) ** 2
+    h1 = float(area @ (steep @ weights))
+    whole = case.kappa * h1 + case.c * float(area @ (off @ weights))
+    t, w = 0.5 * (x + 1.0), 0.5 * w
+    for i, side in enumerate(case.sides):
+        if side.b == 0.0:
+            continue
+        here = np.abs(corner @ NORMALS[i] - (NORMALS[i].sum() > 0)) < 1e-9
+        for j in range(3):
+            on = np.flatnonzero(here[:, (j + 1) % 3] & here[:, (j + 2) % 3])
+            p, q = corner[on, (j + 1) % 3], corner[on, (j + 2) % 3]
+            up, uq = values[on, (j + 1) % 3], values[on, (j + 2) % 3]
+            z = p[:, None] + t[:, None] * (q - p)[:, None]
+            gap = case.u(z[..., 0], z[..., 1]) - (up[:, None] + t * (uq - up)[:, None])
+            whole += side.b * float(np.linalg.norm(q - p, axis=1) @ (gap**2 @ w))
+    h1, whole = mesh.comm.allreduce(np.array([h1, whole]))
+    return float(np.sqrt(h1)), float(np.sqrt(whole))
+
+
+def judge(solution: Solution, case: Case) -> Outcome:
+    """Compare what the certificate says with what is so; collective."""
+    certificate = solution.certificate
+    if certificate.bound_h1 is None or certificate.bound_energy_norm is None:
+        return Outcome(reason=certificate.reason or "no reason given")
+    assert certificate.energy is not None
+    (h1, whole), (low, high), J = distances(solution, case), certificate.energy, case.energy()
+    outside = max(low - J, J - high) - NEARLY * max(abs(J), abs(low), abs(high))
+    return Outcome(
+        certificate.bound_energy_norm / whole,
+        certificate.bound_h1 / h1,
+        outside / max(high - low, 1e-300),
+    )
+
+
+def solved(case: Case, rng: np.random.Generator) -> Solution:
+    """On one of several kinds of meshes; collective."""
+    polygon = Polygon(CORNERS, SIDES, names=SIDES)
+    kind, levels = str(rng.choice(["structured", "gmsh", "adaptive"])), int(rng.integers(1, 4))
+    if kind == "structured":
+        domain = families.structured(polygon, int(rng.integers(4, 12)), COMM)
+    else:
+        domain = polygon.mesh(float(rng.uniform(0.1, 0.3)), COMM)
+    if kind == "adaptive":
+        *_, solution = solve_adaptive(case.problem(), domain, levels=3)
+    else:
+        *_, solution = solve_levels(case.problem(), domain, levels)
+    return solution
+
+
+def smooth(c: float, b: float) -> Case:
+    """No contact, u smooth: a Robin condition on the right, Dirichlet conditions on two sides."""
+    case = Case(np.random.default_rng(7))
+    case.amplitudes, case.phases = np.array([1.0, 0.5, 0.3]), np.array([1.0, 0.4, 2.0])
+    case.waves = np.array([[2.0, 1.0], [-1.0, 2.0], [1.0, 1.5]])
+    case.kappa, case.c = 1.0, c
+    wave = (1.0, 1e-9, -1.0)  # s < 0: u is above the obstacle, and no force acts
+    case.sides = [
+        Side("contact", 0.0, 0.0, wave),
+        Side("robin", b, 0.3, wave),
+        Side("dirichlet", 0.0, 0.0, wave),
+        Side("dirichlet", 0.0, 0.0, wave),
+    ]
+    return case
+
+
+REFERENCE = "u in closed form, written anew; Gauss's rules on triangles and edges"
+
+
+def _drawn(seed: int, number: int) -> Row:
+    tally = Tally()
+    for k in range(number):
+        rng = np.random.default_rng((seed, k, 77))
+        case = Case(rng)
+        try:
+            outcome = judge(solved(case, rng), case)
+        except (InputError, NotConverged) as error:  # the same on all ranks
+            outcome = Outcome(reason=str(error))
+        tally.add(outcome, f"case {k} of seed {seed}")
+        if k % 10 == 9:
+            gc.collect()  # meshes hang in circles
+    return tally.row("c and b up to 1e8, one to four contact parts", REFERENCE)
+
+
+def _smooth(levels: int) -> Row:
+    tally, most = Tally(), 0.0
+    for c, b in [(c, 0.0) for c in (0.0, 1.0, 1e4, 1e8)] + [(0.0, b) for b in (1.0, 1e4, 1e8)]:
+        case = smooth(c, b)
+        domain = Polygon(CORNERS, SIDES, names=SIDES).mesh(0.25, COMM)
+        for solution in solve_levels(case.problem(), domain, levels):
+            outcome = judge(solution, case)
+            most = max(most, outcome.energy_norm)
+            tally.add(outcome, f"c = {c:g}, b = {b:g}")
+    row = tally.row(f"u smooth, c or b up to 1e8: bound at most {MOST} of the error", REFERENCE)
+    if not most <= MOST:
+        row.failures.append(f"the bound is {most:.3f} of the error")
+    return row
+
+
+def terms(seed: int, quick: bool) -> Group:
+    """Seeded cases over all terms and conditions."""
+    return Group(
+        "terms",
+        "Reaction, loss of heat, several parts",
+        "−∇·(κ∇u) + c u = f on the unit square, each edge a part of its own: Dirichlet, Neumann, "
+        "Robin, or contact with a flux or a loss of heat of its own. Passed: no bound below the "
+        f"error in either norm, J(u) inside its bracket, at most {MISSING:.0%} without bounds.",
+        [told(_drawn(seed, 6 if quick else 500)), told(_smooth(2 if quick else 4))],
+    )
