@@ -34,13 +34,14 @@ from ..multigrid.cycle import Grid
 DECADES = 2.0
 """Dofs whose diagonal entries are within so many powers of ten make a class."""
 
-LEVELS = 6
+LEVELS = 4
 """So many classes of dofs on Γ1 that are made of much or of little; the last has all the rest."""
 
-LEVEL = 3.0
-"""So many powers of ten make one."""
+LEVEL = 5.0
+"""So many powers of ten make one. Where u touches without pressing, what rows are made of is what
+the mesh does not resolve, 10⁻³ to 10⁻⁵ of what it is elsewhere: that is not worth more steps."""
 
-WINDOWS = 16
+WINDOWS = 8
 """Neighbourhoods are squares, so many of them along the longest extent of Γ1: the end of a contact
 zone, or a corner, where forces fall to 0 is no part of its own."""
 

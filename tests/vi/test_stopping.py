@@ -353,7 +353,7 @@ def test_a_piece_pressed_onto_the_obstacle(slope, element, nested):
         assert "Γ0" in solution.certificate.reason
 
 
-@pytest.mark.parametrize("scale", [1e3, 1e6, 1e10])
+@pytest.mark.parametrize("scale", [1.0, 1e6, 1e10])
 def test_a_part_that_presses_little_is_known_as_well(scale):
     """Two contact parts, 24 heights of the strip apart: they know of each other by e^{−24π}.
 
