@@ -17,12 +17,19 @@ from .expressions import Expression
 USED_ON: dict[str, int | None] = {
     "data.coefficient": None,
     "data.f": None,
+    "data.reaction": None,
     "data.dirichlet": DIRICHLET,
     "data.g": NEUMANN,
     "data.obstacle": CONTACT,
     "exact.u": None,
 }
-"""Where each expression is used: a part of the boundary, or None for the whole domain."""
+"""Where each expression is used: a part of the boundary, or None for the whole domain; those of
+[boundary.NAME] are used there."""
+
+
+def _used_on(key: str, domain: Domain) -> int | None:
+    section, name, *_ = key.split(".", 2)
+    return domain.parts[name] if section == "boundary" else USED_ON[key]
 
 
 def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
@@ -41,11 +48,13 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     digits = 11 - math.ceil(math.log10(size))
     bad: tuple[Any, ...] = (math.inf,)
     for number, (key, expression) in enumerate(expressions.items()):
-        points = _points(domain, USED_ON[key], digits)
+        points = _points(domain, _used_on(key, domain), digits)
         values = expression.numpy(points)
         wrong = ~np.isfinite(values)
         if key == "data.coefficient":
             wrong |= values <= 0
+        elif key.endswith((".reaction", ".coefficient")):
+            wrong |= values < 0
         if wrong.any():
             found = np.column_stack([points[:, :2], values])[wrong]
             first = found[np.lexsort((found[:, 1], found[:, 0]))[0]]
@@ -57,8 +66,9 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     key = list(expressions)[bad[0]]
     message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
-        raise InputError(f"{message}; the coefficient must be above 0 everywhere")
-    part, named = USED_ON[key], {value: name for name, value in domain.parts.items()}
+        what = "above 0" if key == "data.coefficient" else "0 or more"
+        raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} everywhere")
+    part, named = _used_on(key, domain), {value: name for name, value in domain.parts.items()}
     where = "in the domain" if part is None else f"on the {named[part]} part"
     raise InputError(
         f"{message}; it must be finite everywhere {where}"

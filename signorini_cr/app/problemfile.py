@@ -6,6 +6,7 @@ what is allowed, the same on all ranks; the command puts the file's name before 
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from ..adaptive import solve_adaptive
 from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, on_root
+from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
@@ -39,7 +41,7 @@ from .readers import (
     string,
     whole,
 )
-from .reference import ADAPTIVE, SECTIONS, allowed
+from .reference import ADAPTIVE, PART, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -59,6 +61,7 @@ class ProblemFile:
         title: For reports and pictures; the file's name where there is none.
         domain: A polygon, or the path of a gmsh file.
         size: Facet length wanted on the coarsest mesh of a polygon.
+        parts: The parts of the boundary that have sections.
         problem: The data as functions of x, which give UFL.
         expressions: The data that were written in the file, by key (``data.f`` …).
         mode: "uniform" or "adaptive".
@@ -70,6 +73,7 @@ class ProblemFile:
     title: str
     domain: Polygon | Path
     size: float | None
+    parts: tuple[str, ...]
     problem: Problem
     expressions: Mapping[str, Expression]
     mode: str
@@ -82,7 +86,7 @@ class ProblemFile:
         key = "domain.mesh" if isinstance(self.domain, Path) else "domain"
         try:
             if isinstance(self.domain, Path):
-                return read_gmsh(self.domain, comm)
+                return read_gmsh(self.domain, comm, self.parts)
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
         except InputError as error:
@@ -108,6 +112,9 @@ class ProblemFile:
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
         forms = Forms(self.problem, domain.mesh, parts=domain.parts)
+        there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
+        if not domain.mesh.comm.allreduce(there):
+            raise InputError("domain: no part of the boundary is contact; at least one is needed")
         check_data(forms, domain)
         return doubts(forms, domain)
 
@@ -139,6 +146,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     table = parse_toml(on_root(comm, read_text, path))
     insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
     title = get(table, "", "title", string, path.stem)
+    parts = _parts(table)
     sections = {name: _section(table, name) for name in SECTIONS}
     if "domain" not in table:
         raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
@@ -146,8 +154,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
     if "exact" in table and not table["exact"]:
         raise InputError("exact.u: this key is missing; an expression in x and y is needed")
-    domain, size = _domain(sections["domain"], path.parent)
-    expressions = _expressions(sections)
+    domain, size = _domain(sections["domain"], path.parent, tuple(parts))
+    expressions = _expressions(sections, parts)
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
     adaptive = {name: get(refine, "refine", name, *how) for name, how in ADAPTIVE.items()}
@@ -162,7 +170,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         title=title,
         domain=domain,
         size=size,
-        problem=_problem(expressions),
+        parts=tuple(parts),
+        problem=_problem(expressions, parts),
         expressions=expressions,
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
@@ -176,7 +185,26 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     )
 
 
-_SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, [define] and [refine] are optional"
+def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The sections [boundary.NAME], each checked for its type's keys."""
+    parts = table.get("boundary", {})
+    if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
+        raise InputError(f"boundary: sections [{PART}] are needed, found {shown(parts)}")
+    for name, part in parts.items():
+        section = f"boundary.{name}"
+        insist_known(part, section, allowed(PART), KEYS)
+        needed = f"one of {', '.join(TYPES)}"
+        kind = get(part, section, "type", one_of(tuple(TYPES)), needed=needed)
+        for key in part:
+            if key not in ("type", *TYPES[kind]):
+                raise InputError(
+                    f"{section}.{key}: this does not go with the type {kind}; allowed are"
+                    f" {', '.join(TYPES[kind])}"
+                )
+    return parts
+
+
+_SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, the others are optional"
 
 
 def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -188,8 +216,16 @@ def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:
     return section
 
 
-def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, float | None]:
-    """Read [domain]: the polygon and its size, or the path of the mesh."""
+def _domain(
+    table: Mapping[str, Any], folder: Path, names: tuple[str, ...]
+) -> tuple[Polygon | Path, float | None]:
+    """Read [domain]: the polygon and its size, or the path of the mesh.
+
+    Args:
+        table: The section.
+        folder: Where paths begin.
+        names: The parts of the boundary that have sections.
+    """
     if "mesh" in table:
         others = [key for key in ("vertices", "boundary", "size", "holes") if key in table]
         if others:
@@ -203,7 +239,7 @@ def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, flo
             "domain: neither vertices nor mesh is given; a polygon (vertices, boundary, size) or"
             " a mesh file is needed"
         )
-    polygon = _polygon(table, "domain")
+    polygon = _polygon(table, "domain", names)
     holes = []
     for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
         key = f"domain.holes[{i}]"
@@ -212,12 +248,18 @@ def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, flo
                 f"{key}: {{ vertices = [...], boundary = [...] }} is needed, found {shown(hole)}"
             )
         insist_known(hole, key, ("vertices", "boundary"))
-        holes.append(_polygon(hole, key))
+        holes.append(_polygon(hole, key, names))
     if holes:
         apart = "holes must lie inside the polygon and apart from each other"
         outline = (polygon.vertices, polygon.boundary)
-        polygon = named("domain.holes", Polygon, *outline, tuple(holes), rule=apart)
+        polygon = named("domain.holes", Polygon, *outline, tuple(holes), names, rule=apart)
     named("domain.boundary", polygon.check_parts)
+    labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
+    for name in names:
+        if name not in labels:
+            near = difflib.get_close_matches(name, labels, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise InputError(f"boundary.{name}: no edge is labelled {name}{hint}")
     size = get(table, "domain", "size", positive, needed="a number above 0, the length of a facet,")
     # From the longest edge on, facets grow inside only; none is longer than the diameter
     if size > polygon.diameter * (1 + 1e-9):
@@ -228,7 +270,7 @@ def _domain(table: Mapping[str, Any], folder: Path) -> tuple[Polygon | Path, flo
     return polygon, size
 
 
-def _polygon(table: Mapping[str, Any], section: str) -> Polygon:
+def _polygon(table: Mapping[str, Any], section: str, names: tuple[str, ...]) -> Polygon:
     key = f"{section}.vertices"
     vertices = get(table, section, "vertices", array, needed="a list of points [x, y]")
     for i, vertex in enumerate(vertices):
@@ -240,14 +282,17 @@ def _polygon(table: Mapping[str, Any], section: str) -> Polygon:
         raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
     boundary = get(table, section, "boundary", array, needed="a list of labels, one for each edge,")
     for i, label in enumerate(boundary):
-        one_of(tuple(PARTS))(f"{section}.boundary[{i}]", label)
+        one_of((*PARTS, *(name for name in names if name not in PARTS)))(
+            f"{section}.boundary[{i}]", label
+        )
     if len(boundary) != len(vertices):
         raise InputError(
             f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
             f" found {len(boundary)} labels"
         )
     simple = "the polygon must be simple, its edges must meet at their common vertices only"
-    return named(key, Polygon, np.array(vertices, dtype=np.float64), tuple(boundary), rule=simple)
+    outline = np.array(vertices, dtype=np.float64), tuple(boundary)
+    return named(key, Polygon, *outline, (), names, rule=simple)
 
 
 def _few_enough(levels: int, cells: int, dim: int) -> None:
@@ -259,22 +304,30 @@ def _few_enough(levels: int, cells: int, dim: int) -> None:
         )
 
 
-def _expressions(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, Expression]:
-    """Read [define], [data] and [exact]."""
+def _expressions(
+    sections: Mapping[str, Mapping[str, Any]], parts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Expression]:
+    """Read [define], [data], [boundary.NAME] and [exact]."""
     names: dict[str, Expression] = {}
     define = sections["define"]
     for name, value in define.items():
         named(f"define.{name}", check_name, name)
         later = [other for other in define if other not in names]
         names[check_name(name)] = _expression(f"define.{name}", value, names, later)
+    given = {
+        key: sections[section][name]
+        for key in USED_ON
+        for section, name in [key.split(".")]
+        if name in sections[section]
+    }
+    for part, table in parts.items():
+        given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
     result = {}
-    for key in USED_ON:
-        section, name = key.split(".")
-        if name in sections[section]:
-            expression = _expression(key, sections[section][name], names, ())
-            if expression.is_condition:
-                raise InputError(f"{key}: a number is needed, but this is a condition")
-            result[key] = expression
+    for key, value in given.items():
+        expression = _expression(key, value, names, ())
+        if expression.is_condition:
+            raise InputError(f"{key}: a number is needed, but this is a condition")
+        result[key] = expression
     return result
 
 
@@ -290,18 +343,31 @@ def _expression(
     return parse(repr(number(key, value)))
 
 
-def _problem(expressions: Mapping[str, Expression]) -> Problem:
+KINDS = {"contact": Contact, "dirichlet": Dirichlet, "neumann": Neumann, "robin": Robin}
+
+
+def _problem(
+    expressions: Mapping[str, Expression], parts: Mapping[str, Mapping[str, Any]]
+) -> Problem:
     def data(key: str, default: Any) -> Any:
         if key not in expressions:
             return default
         expression = expressions[key]
         return expression.ufl if expression.constant is None else expression.constant
 
+    conditions = {
+        name: KINDS[part["type"]](
+            **{key: data(f"boundary.{name}.{key}", None) for key in part if key != "type"}
+        )
+        for name, part in parts.items()
+    }
     return Problem(
         f=data("data.f", None),
         g=data("data.g", None),
         obstacle=data("data.obstacle", 0.0),
         dirichlet=data("data.dirichlet", None),
         coefficient=data("data.coefficient", 1.0),
+        reaction=data("data.reaction", 0.0),
+        conditions=conditions,
         exact=data("exact.u", None),
     )

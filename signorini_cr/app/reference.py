@@ -33,6 +33,15 @@ class Key(NamedTuple):
 
 
 EXPRESSION = "an expression or a number"
+PART = "boundary.NAME"
+"""The sections of the parts of the boundary."""
+TYPES = {
+    "contact": ("obstacle", "coefficient", "external", "g"),
+    "dirichlet": ("value",),
+    "neumann": ("g",),
+    "robin": ("g", "coefficient", "external"),
+}
+"""The keys that go with each type of a part."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
@@ -40,9 +49,9 @@ KEYS = (
     Key("domain", "vertices", "a list of points [x, y]", "", "The corners of a simple polygon, in "
         "either orientation. Needed, unless there is a `mesh`.",
         "vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]"),
-    Key("domain", "boundary", 'a list of "contact", "dirichlet" or "neumann"', "",
+    Key("domain", "boundary", 'a list of "contact", "dirichlet", "neumann" or your own names', "",
         "What each edge is; edge i runs from vertex i to the next. One of them is to be contact, "
-        "one dirichlet.",
+        "one dirichlet; with sections [boundary.NAME], one is to be of the type contact.",
         'boundary = ["contact", "dirichlet", "neumann", "dirichlet"]'),
     Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh, no "
         "longer than the domain.", "size = 0.25"),
@@ -51,8 +60,9 @@ KEYS = (
         'holes = [{ vertices = [[0.2, 0.4], [0.5, 0.4], [0.3, 0.7]], '
         'boundary = ["neumann", "neumann", "neumann"] }]'),
     Key("domain", "mesh", "the path of a .msh file, relative to this one", "", "A gmsh file, 2.2 "
-        "or 4.1, in the place of the polygon; physical curves named contact, dirichlet and neumann "
-        "are the parts of its boundary.", 'mesh = "signorini.msh"'),
+        "or 4.1, in the place of the polygon; physical curves named contact, dirichlet and "
+        "neumann, or as sections [boundary.NAME] are, are the parts of its boundary.",
+        'mesh = "signorini.msh"'),
     Key("data", "f", EXPRESSION, "0, or derived from `exact.u`", "The load.", 'f = "-3 + x*y"'),
     Key("data", "g", EXPRESSION, "0, or derived from `exact.u`", "The flux κ∂ₙu on neumann edges.",
         'g = "where(y > 0.5, 1, 0)"'),
@@ -63,6 +73,19 @@ KEYS = (
         "obstacle where the two parts meet.", 'dirichlet = "0.2*y"'),
     Key("data", "coefficient", EXPRESSION, "1", "κ, above 0 everywhere. It may jump.",
         'coefficient = "where(x < 0, 1, 100)"'),
+    Key("data", "reaction", EXPRESSION, "0", "c of −∇·(κ∇u) + c u = f, nowhere below 0.",
+        "reaction = 2"),
+    Key(PART, "type", '"contact", "dirichlet", "neumann" or "robin"', "", "What holds there: u ≥ "
+        "obstacle; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) = g. On contact parts "
+        "that has the pressure of the obstacle on its right, too.", 'type = "contact"'),
+    Key(PART, "obstacle", EXPRESSION, "0", "contact: α.", 'obstacle = "0.1*x"'),
+    Key(PART, "value", EXPRESSION, "0, or derived from `exact.u`", "dirichlet: u_D.", "value = 8"),
+    Key(PART, "g", EXPRESSION, "0, or derived from `exact.u` but for contact",
+        "neumann, robin, contact: the flux into the domain.", "g = 0.5"),
+    Key(PART, "coefficient", EXPRESSION, "0", "robin, contact: what is lost there by a unit of u; "
+        "nowhere below 0.", "coefficient = 20"),
+    Key(PART, "external", EXPRESSION, "0", "robin, contact: the u at which nothing is lost.",
+        "external = -10"),
     Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "
         "are then computed, and f, g and dirichlet, where left out, are derived from it.",
         'u = "x**2 - y**2"'),
@@ -83,13 +106,16 @@ ABOUT = {
     "": "At the top of the file, before all sections.",
     "domain": "A polygon, or a mesh. Needed.",
     "define": "Helper names, usable in what follows and in [data] and [exact], in this order.",
+    PART: "Optional, one section for each part that has a name of its own; dirichlet, neumann and "
+    "contact need none. With such sections there need be no dirichlet part where `reaction` or a "
+    "`coefficient` holds the solution.",
     "data": "What is left out is 0. An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",
 }
 """The sections, and what is said of each."""
 
-SECTIONS = tuple(name for name in ABOUT if name)
+SECTIONS = tuple(name.split(".")[0] for name in ABOUT if name)
 
 
 ADAPTIVE = {key.name: key.argument for key in KEYS if key.argument is not None}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from ..fem.space import facet_measures
-from ..mesh.domain import PARTS, Domain
+from ..mesh.domain import Domain
 from .problemfile import ProblemFile
 from .screen import WIDTH
 
@@ -35,18 +37,22 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         return _short(said.get(f"data.{key}", left_out))
 
     kappa = "κ" if "data.coefficient" in said else ""
-    equation = f"−∇·(κ∇u) = {data('f', 'that')}, κ = {data('coefficient')}"
+    gain = f" + ({data('reaction')}) u" if "data.reaction" in said else ""
+    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {data('coefficient')}"
     rows = {
         "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}",
-        "equation": equation if kappa else f"−Δu = {data('f', 'that')}",
+        "equation": equation if kappa else f"−Δu{gain} = {data('f', 'that')}",
     }
     conditions = {
         "dirichlet": f"u = {data('dirichlet', 'that')}",
         "neumann": f"{kappa}∂ₙu = {data('g', 'that')}",
         "contact": f"u ≥ {data('obstacle')}, {kappa}∂ₙu ≥ 0, one of them an equality",
     }
+    for name, part in case.said.items():
+        if name.startswith("boundary."):
+            conditions[name.removeprefix("boundary.")] = _condition(part, kappa, "exact.u" in said)
     for name, condition in conditions.items():
-        measures = facet_measures(mesh, domain.facets(PARTS[name]))[1]
+        measures = facet_measures(mesh, domain.facets(domain.parts[name]))[1]
         number = comm.allreduce(len(measures))
         if number > 0:
             total = comm.allreduce(float(measures.sum()))
@@ -69,6 +75,29 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         )
         for name, text in rows.items()
     )
+
+
+def _condition(part: Mapping[str, Any], kappa: str, known: bool) -> str:
+    """What holds on a part that has a section."""
+
+    def data(key: str, derived: bool = False) -> str:
+        return _short(part.get(key, "that of exact.u" if derived and known else "0"))
+
+    def factor(key: str) -> str:
+        """A number as it is, anything else in parentheses."""
+        text = data(key)
+        return text if text.replace(".", "", 1).isdigit() else f"({text})"
+
+    kind, loss = part["type"], part.get("coefficient", 0) != 0
+    flux = f"{kappa}∂ₙu"
+    if loss:
+        flux += f" + {factor('coefficient')} (u − {factor('external')})"
+    if kind == "dirichlet":
+        return f"u = {data('value', True)}"
+    if kind != "contact":
+        return f"{flux} = {data('g', True)}"
+    gain = f" − {factor('g')}" if part.get("g", 0) != 0 else ""
+    return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
 
 
 def _short(value: object) -> str:

@@ -57,6 +57,12 @@ def mesh_case(name: str) -> str:
     return f'domain.mesh = "{name}"\n[data]\nf = 1\n'
 
 
+def part_case(section: str, more: str = 'type = "contact"') -> str:
+    """CASE with its first edge labelled, and a section."""
+    text = CASE.replace('["contact"', '["deck"', 1)
+    return f"{text}\n[boundary.{section}]\n{more}\n"
+
+
 # name: (text of the file, what the message must hold)
 BAD: dict[str, tuple[str, list[str]]] = {
     "unknown section": (
@@ -101,6 +107,54 @@ BAD: dict[str, tuple[str, list[str]]] = {
     "max_dofs of a uniform sequence": (
         with_("tolerance = 0", "max_dofs = 1234567"),
         ["refine.max_dofs: 1234567 is where", 'mode = "adaptive" is needed'],
+    ),
+    "part without a type": (
+        part_case("deck", "g = 0"),
+        ["boundary.deck.type: this key is missing; one of contact, dirichlet, neumann, robin"],
+    ),
+    "part of an unknown type": (
+        part_case("deck", 'type = "contakt"'),
+        ["boundary.deck.type:", "did you mean contact?"],
+    ),
+    "key of another type": (
+        part_case("deck", 'type = "contact"\nvalue = 3'),
+        ["boundary.deck.value: this does not go with the type contact; allowed are obstacle"],
+    ),
+    "unknown key of a part": (
+        part_case("deck", 'type = "contact"\nobstakle = 3'),
+        ["boundary.deck.obstakle: there is no such key; did you mean obstacle?"],
+    ),
+    "label without a section": (
+        CASE.replace('["contact"', '["deck"', 1),
+        ["domain.boundary[0]:", '"deck" is unknown', "allowed are contact, dirichlet, neumann"],
+    ),
+    "section without an edge": (
+        part_case("desk"),
+        ["domain.boundary[0]:", '"deck" is unknown; did you mean desk?'],
+    ),
+    "section for no edge": (
+        part_case("deck") + '[boundary.roof]\ntype = "neumann"\n',
+        ["boundary.roof: no edge is labelled roof"],
+    ),
+    "boundary no section": (
+        "boundary = 3\n" + CASE,
+        ["boundary: sections [boundary.NAME] are needed, found 3"],
+    ),
+    "no contact among the parts": (
+        part_case("deck", 'type = "neumann"'),
+        ["domain: no part of the boundary is contact; at least one is needed"],
+    ),
+    "coefficient of a part below 0": (
+        part_case("deck", 'type = "contact"\ncoefficient = "x - 5"'),
+        ["boundary.deck.coefficient: the value at", "must be 0 or more everywhere"],
+    ),
+    "reaction below 0": (
+        with_("[refine]", "reaction = -1\n[refine]"),
+        ["data.reaction: the value at", "the reaction must be 0 or more everywhere"],
+    ),
+    "data of a part not finite": (
+        part_case("deck", 'type = "contact"\nobstacle = "1/y"'),
+        ["boundary.deck.obstacle: the value at", "on the deck part"],
     ),
     "fraction of a uniform sequence": (
         with_("tolerance = 0", "fraction = 0.3"),
@@ -481,6 +535,20 @@ def test_check(write) -> None:
         assert told["dirichlet"].endswith("; 8 facets, length 4")
         assert "neumann" not in told
         assert [file.name for file in out.iterdir()] == ["mesh.png"] or "not drawn" in text
+
+
+def test_the_deck(shared_tmp_path: Path) -> None:
+    """Four parts with names of their own, through the command."""
+    out = shared_tmp_path / "out"
+    status, text, err = run("solve", helpers.MESHES / "deck.toml", "--out", out, "--levels", "2")
+    assert (status, err) == (0, "")
+    if COMM.rank > 0:
+        return
+    assert "surface    u ≥ 0, κ∂ₙu + 20 (u − (-10)) ≥ 0" in text
+    level = json.loads((out / "report.json").read_text())["levels"][-1]
+    assert level["bound_h1"] is not None and level["contact"]["active"] == 80
+    # u = 0 on the deck: 20 · 10 · 4 is lost there
+    assert 0 < level["contact"]["force"] < 800
 
 
 @pytest.mark.parametrize("finished", [0, 2])

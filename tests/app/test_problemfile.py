@@ -4,6 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
+from helpers import MESHES
 from mpi4py import MPI
 
 from signorini_cr.app.problemfile import ProblemFile, load
@@ -106,6 +109,79 @@ def test_everything_is_taken_over(read) -> None:
     points = np.array([[0.25, 0.0], [0.75, 0.0]])
     assert np.allclose(case.expressions["data.dirichlet"].numpy(points), [0.5, 1.0])
     assert np.allclose(case.expressions["exact.u"].numpy([[1.0, 2.0]]), 2 * np.sin(1.0))
+
+
+PARTS = """
+[domain]
+vertices = [[0, 0], [1, 0], [1, 1], [0, 1]]
+boundary = ["floor", "air", "roof", "wall"]
+size = 0.25
+[boundary.floor]
+type = "contact"
+obstacle = "where(x < 2, 2*x + y, 9)"
+coefficient = 2
+external = 1
+g = "1.5 - 5 + 2*(2*x + y - 1) + 2"
+[boundary.air]
+type = "robin"
+coefficient = 4
+external = -1
+[boundary.roof]
+type = "dirichlet"
+[boundary.wall]
+type = "neumann"
+[data]
+coefficient = 5
+reaction = 3
+[exact]
+u = "2*x + y"
+"""
+
+
+def test_parts_with_names_of_ones_own(read) -> None:
+    """u = 2x + y, which CR has: all that is left out follows from it; on the floor λ is 0.5.
+
+    There −5 ∂u/∂y + 2 (u − 1) − g = −5 + 2 (u − 1) − (2 (u − 1) − 1.5) = −3.5 < 0 would pull: so g
+    is such that λ = −5 + 2 (u − 1) − g = 0.5.
+    """
+    text = PARTS.replace('"1.5 - 5 + 2*(2*x + y - 1) + 2"', '"-5.5 + 2*(2*x + y - 1)"')
+    case = read(text)
+    domain = case.mesh()
+    assert case.check(domain) == []
+    assert list(domain.parts) == ["contact", "dirichlet", "neumann", "floor", "air", "roof", "wall"]
+    *_, solution = solve_levels(case.problem, domain, 2)
+    assert solution.errors is not None and max(solution.errors) < 1e-7
+    assert solution.contact.force == pytest.approx(0.5, rel=1e-6)
+    assert solution.contact.active.all()
+
+
+def test_the_deck_is_in_balance() -> None:
+    """No load: the losses b ∫(u − u_ext) through all parts add up to the contact force."""
+    case = load(MESHES / "deck.toml")
+    solution = solve(case.problem, case.mesh())
+    domain = solution.domain
+    x = ufl.SpatialCoordinate(domain.mesh)
+    ds = ufl.Measure("ds", domain.mesh, subdomain_data=domain.tags)
+    losses = {"surface": (20.0, -10.0), "air": (8.0, -10.0 + 2.0 * x[0]), "duct": (25.0, 18.0)}
+    form = sum(b * (solution.u - e) * ds(domain.parts[name]) for name, (b, e) in losses.items())
+    total = domain.mesh.comm.allreduce(fem.assemble_scalar(fem.form(form)))
+    assert total == pytest.approx(solution.contact.force, rel=1e-7)
+    assert total > 400.0
+
+
+def test_no_dirichlet_part_where_something_else_holds_the_solution(read) -> None:
+    """u = 2 on the strip for c u = f with c = 3 and f = 6; refused without c."""
+    text = PARTS.split("[boundary.floor]")[0] + (
+        '[boundary.floor]\ntype = "contact"\nobstacle = -1\n'
+        + "".join(f'[boundary.{name}]\ntype = "neumann"\n' for name in ("air", "roof", "wall"))
+        + "[data]\nf = 6\n"
+    )
+    case = read(text + "reaction = 3\n")
+    solution = solve(case.problem, case.mesh())
+    assert np.allclose(solution.u.x.array, 2.0, atol=1e-8)
+    case = read(text)
+    with pytest.raises(InputError, match="has no Dirichlet facet and a net force"):
+        solve(case.problem, case.mesh())
 
 
 def test_the_fraction_decides_what_is_refined(read) -> None:

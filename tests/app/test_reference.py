@@ -15,7 +15,7 @@ from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import _parser
 from signorini_cr.app.datacheck import USED_ON
 from signorini_cr.app.problemfile import load
-from signorini_cr.app.reference import ABOUT, KEYS
+from signorini_cr.app.reference import ABOUT, KEYS, PART, TYPES
 
 BASE = {
     "domain": {
@@ -118,6 +118,10 @@ def test_examples_are_read(key, tmp_path: Path) -> None:
         sections["domain"] = {}
     if key.section == "refine":
         sections["refine"]["mode"] = 'mode = "adaptive"'
+    if key.section == PART:
+        kind = next((kind for kind, keys in TYPES.items() if key.name in keys), "")
+        sections[PART]["type"] = f'type = "{kind}"'
+        sections["domain"]["boundary"] = 'boundary = ["contact", "dirichlet", "NAME", "NAME"]'
     sections[key.section][key.name] = key.example
     lines = [*sections.pop("").values()]
     for name, rows in sections.items():
@@ -143,6 +147,10 @@ def test_every_key_of_the_ready_files_is_in_the_table() -> None:
         for section, content in table.items():
             if section == "define":
                 continue
-            keys = content if isinstance(content, dict) else [section]
-            where = section if isinstance(content, dict) else ""
-            assert {(where, key) for key in keys} <= known, path.name
+            parts = {section: content}
+            if section == "boundary":
+                parts = {f"{PART} {name}": part for name, part in content.items()}
+            for name, part in parts.items():
+                keys = part if isinstance(part, dict) else [name]
+                where = name.split()[0] if isinstance(part, dict) else ""
+                assert {(where, key) for key in keys} <= known, path.name
