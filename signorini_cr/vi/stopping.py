@@ -25,6 +25,7 @@ from collections.abc import Callable
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.ndimage import maximum_filter
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
@@ -42,8 +43,9 @@ LEVEL = 5.0
 the mesh does not resolve, 10⁻³ to 10⁻⁵ of what it is elsewhere: that is not worth more steps."""
 
 WINDOWS = 8
-"""Neighbourhoods are squares, so many of them along the longest extent of Γ1: the end of a contact
-zone, or a corner, where forces fall to 0 is no part of its own."""
+"""Squares along the longest extent of Γ1. What a dof's neighbourhood is made of is the most of its
+square and the ones around it: the end of a contact zone, or a corner, where forces fall to 0 is no
+part of its own, on whichever side of a square's edge it lies."""
 
 PART = 1e-2
 """What forces are measured against at least, in parts of what the rows of their class are made of;
@@ -128,7 +130,8 @@ class Stiffness:
         around: FloatArray = np.zeros(WINDOWS**3)
         np.maximum.at(around, self._window, made_of)
         self._comm.Allreduce(MPI.IN_PLACE, around, op=MPI.MAX)
-        top, around = float(around.max()), around[self._window]
+        top = float(around.max())
+        around = maximum_filter(around.reshape([WINDOWS] * 3), size=3).ravel()[self._window]
         decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
         level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
         self.bounded = LEVELS * self._kind + level
