@@ -36,7 +36,7 @@ EXPRESSION = "an expression or a number"
 PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
 TYPES = {
-    "contact": ("obstacle", "coefficient", "external", "g"),
+    "contact": ("obstacle", "upper", "coefficient", "external", "g"),
     "dirichlet": ("value",),
     "neumann": ("g",),
     "robin": ("g", "coefficient", "external"),
@@ -76,9 +76,13 @@ KEYS = (
     Key("data", "reaction", EXPRESSION, "0", "c of −∇·(κ∇u) + c u = f, nowhere below 0.",
         "reaction = 2"),
     Key(PART, "type", '"contact", "dirichlet", "neumann" or "robin"', "", "What holds there: u ≥ "
-        "obstacle; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) = g. On contact parts "
-        "that has the pressure of the obstacle on its right, too.", 'type = "contact"'),
-    Key(PART, "obstacle", EXPRESSION, "0", "contact: α.", 'obstacle = "0.1*x"'),
+        "obstacle, or u ≤ upper, or both; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) "
+        "= g. On contact parts that has the pressure of the obstacle on its right, too.",
+        'type = "contact"'),
+    Key(PART, "obstacle", EXPRESSION, "0; nothing where there is an `upper`", "contact: α, which u "
+        "is not to be below.", 'obstacle = "0.1*x"'),
+    Key(PART, "upper", EXPRESSION, "nothing", "contact: β, which u is not to be above, instead of "
+        "an obstacle or together with it.", "upper = 10"),
     Key(PART, "value", EXPRESSION, "0, or derived from `exact.u`", "dirichlet: u_D.", "value = 8"),
     Key(PART, "g", EXPRESSION, "0, or derived from `exact.u` but for contact",
         "neumann, robin, contact: the flux into the domain.", "g = 0.5"),

@@ -253,9 +253,10 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     w = vertex_rows(u, cells)
     load, edge = data.load, Known.of(data.edges, cells, w)
     of_u = load if reaction == 0.0 else load.less(reaction, w)
-    gap = u[alpha.side.dofs] - alpha.means
-    flux = equilibrate(cells, kappa.mean, w, of_u, edge, alpha.side, gap)
-    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, alpha.side)
+    contact, signs = alpha.side, alpha.signs
+    gap = signs * u[contact.dofs] - alpha.means
+    flux = equilibrate(cells, kappa.mean, w, of_u, edge, contact, signs, gap)
+    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, contact, signs)
     size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, load, cells, kappa.low, size, reaction)
     _insist(certain.reason)
@@ -387,7 +388,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             bumps=v.bumps,
             thirds=v.thirds,
             cusps=v.cusps,
-            force=float(flux.contact.sum()),
+            force=float(v.boundary.alpha.signs @ flux.contact),
             reach=float(bound - near / 2 + loose + lift / 2),
         ),
     )

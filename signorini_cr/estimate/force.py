@@ -88,7 +88,10 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
         made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)
     )
     reach = made.reach * np.sqrt(energy)
-    return max(float(middle - reach), 0.0), float(middle + reach)
+    conditions = diffusion(level.data).forms.bounded
+    signs = {sign for condition in conditions for sign, _ in condition.bounds}
+    lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
+    return max(float(middle - reach), lowest), min(float(middle + reach), highest)
 
 
 def _weight(solution: Certified) -> fem.Function:

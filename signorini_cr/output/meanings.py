@@ -112,9 +112,10 @@ FACET = {
     "x": "Of its midpoint.",
     "y": "Of its midpoint.",
     "length": "Of the facet.",
-    "obstacle": "The bound of u_h there, the mean of α.",
+    "obstacle": "The lower bound of u_h there, the mean of α.",
+    "upper": "The upper bound of u_h there, the mean of β; only if there are some.",
     "u": "u_h at the midpoint.",
-    "pressure": "λ_h, constant on the facet; 0 where there is no contact.",
+    "pressure": "λ_h, constant on the facet; below 0 on the upper bound, 0 without contact.",
     "active": "1 in contact, 0 elsewhere.",
 }
 """The columns of contact.csv."""
