@@ -43,6 +43,9 @@ TYPES = {
 }
 """The keys that go with each type of a part."""
 
+QUANTITIES = {"force": "contact", "flux": "dirichlet"}
+"""Kinds of quantities, and the type of the part that each is of."""
+
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
         'title = "S1"'),
@@ -116,6 +119,9 @@ ABOUT = {
     "data": "What is left out is 0. An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",
+    "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
+    "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
+    "through a dirichlet part. The part must not touch other dirichlet or contact parts.",
 }
 """The sections, and what is said of each."""
 
@@ -146,6 +152,10 @@ def page() -> str:
         if section == "define":
             example = ["[define]", 'r = "sqrt(x**2 + y**2)"', 'w = "r**1.5*cos(1.5*atan2(y, x))"']
             lines += ["```toml", *example, "```", ""]
+            continue
+        if section == "quantities":
+            example = ['push = { force = "contact" }', 'inflow = { flux = "dirichlet" }']
+            lines += ["```toml", "[quantities]", *example, "```", ""]
             continue
         lines += ["| key | value | if left out | |", "|---|---|---|---|"]
         keys = [key for key in KEYS if key.section == section]

@@ -598,7 +598,7 @@ def _lift(
         return affine(cells, side, trace, v[side.ends], ends, scale)
     third = cells.ways_between(*side.ends) * thirds[side.dofs]
     companion = Cubic(v[side.ends], bumps[side.dofs], third)
-    base = companion
+    base = None
     if obstacle and len(data.condition.bounds) == 1:
         base = Cubic(ends, middle - ends.mean(axis=0), third)
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

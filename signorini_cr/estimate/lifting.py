@@ -110,7 +110,7 @@ def lift(
     cells: Cells,
     side: Side,
     trace: Trace,
-    base: Cubic,
+    base: Cubic | None,
     v: Cubic,
     scale: float,
     goal: float,
@@ -122,8 +122,8 @@ def lift(
         cells: The mesh, of triangles.
         side: The facets.
         trace: The data.
-        base: What δ is measured from: for an obstacle α_I, or v.
-        v: The companion, for an obstacle; where the obstacle is below it δ is 0.
+        base: α_I, for an obstacle; None to measure δ from v.
+        v: The companion; on facets where the obstacle is below it δ is 0.
         scale: Size of the values, by which rounding is told.
         goal: What ‖∇ℓ‖ need not be known better than.
         obstacle: Whether δ is the positive part of the difference.
@@ -145,7 +145,7 @@ def lift(
         return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
 
     def steepness(pieces: Pieces) -> FloatArray:
-        bound = _bounds(trace, pieces, base, cells, length, scale)
+        bound = _bounds(trace, pieces, base or v, cells, length, scale)
         return np.stack([parts(pieces, *bound[:2]).sum(axis=0), *bound])
 
     weights = np.zeros((4, n))
@@ -156,12 +156,12 @@ def lift(
             pieces = pieces.halves()
         room = 8 * cells.comm.allreduce(n) + 1000
         pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
-        jumps = _jump_at_ends(trace, whole, base, cells, JUMP * scale, obstacle)
+        jumps = _jump_at_ends(trace, whole, base or v, cells, JUMP * scale, obstacle)
         clear = np.zeros(n, dtype=bool)
         if obstacle:
             below = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0] <= 0
             clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
-            if base is v:
+            if base is None:
                 size, steep = (np.where(below, 0.0, values) for values in (size, steep))
     except Unknown as error:
         return Lift.none(np.zeros(n), NO_RANGE.format(name, error))
