@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .adaptive import solve_adaptive
     from .errors import InputError, NotConverged
     from .estimate.certificate import Certificate
+    from .evolution import Solver, solve_in_time
     from .fem.conditions import Contact, Dirichlet, Neumann, Robin
     from .fem.problem import Problem
     from .levels import solve, solve_levels
@@ -45,6 +46,8 @@ _ROOMS = {
     "solve": "levels",
     "solve_levels": "levels",
     "solve_adaptive": "adaptive",
+    "solve_in_time": "evolution",
+    "Solver": "evolution",
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
     "Dirichlet": "fem.conditions",
@@ -74,6 +77,8 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "solve",
     "solve_levels",
     "solve_adaptive",
+    "solve_in_time",
+    "Solver",
     "Solution",
     "Certificate",
     "InputError",

@@ -21,7 +21,7 @@ from ..arrays import FloatArray
 from ..data.diffusion import diffusion
 from ..data.loads import Certain, Known, Load, Segments, mean_to_norm
 from ..data.moments import Coefficient, OnParts
-from ..fem.cells import Cells, blocks, measures, pick, sum_rows
+from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from .beyond import Beyond
 from .companion import Companion, Masses, companion, on_facet
@@ -266,8 +266,9 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     flux = equilibrate(cells, kappa.mean, w, of_u, edge, contact, signs, gap)
     flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, contact, signs)
     size = _size(cells, kappa, w, flux)
-    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size, reaction)
+    certain = Certain.of(data.compiled.f, data.of_f, cells, kappa.low, size, reaction)
     _insist(certain.reason)
+    certain = replace(certain, load=data.with_source(certain.load))
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
     # y is to have the means that f and g have now
@@ -511,15 +512,6 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     loose = np.sqrt(square) + np.sqrt(on_edge)
     missed_in_all = unbalanced(level, cells, missed, kappa.low, size, known.reaction)
     return loose + missed_in_all, float(change)
-
-
-def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
-    """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
-    out = np.empty(cells.facets.shape)
-    for part in blocks(cells.number):
-        values = u[cells.facets[:, part]]
-        np.subtract(sum_rows(values), cells.tdim * values, out=out[:, part])
-    return out
 
 
 def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, float, float]:

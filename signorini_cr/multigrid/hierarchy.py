@@ -51,11 +51,13 @@ class NestedMesh:
         physics: What is solved, shared by all meshes.
         domain: Mesh and boundary parts.
         parents: The cells of the mesh below that hold this one's, None on the coarsest.
+        given: The physics on it, if somebody has that.
     """
 
     physics: Physics
     domain: Domain
     parents: Parents | None = None
+    given: OnMesh | None = None
 
     def __post_init__(self) -> None:
         """Free what meshes before have left, and hold this one while there are objects on it."""
@@ -65,7 +67,7 @@ class NestedMesh:
     @cached_property
     def data(self) -> OnMesh:
         """The physics on this mesh."""
-        return self.physics.on(self.domain)
+        return self.physics.on(self.domain) if self.given is None else self.given
 
     @property
     def V(self) -> fem.FunctionSpace:

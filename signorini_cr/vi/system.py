@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 import numpy as np
 from dolfinx import fem
@@ -52,6 +51,7 @@ class System:
     """The variational inequality (1.8) as matrix, vector and bounds.
 
     Attributes:
+        operator: A as the solver uses it.
         A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
         b: Vector of χ less the Dirichlet values' share, the values themselves in their rows.
         chi: Vector of χ alone, ghosts up to date.
@@ -70,11 +70,12 @@ class System:
             unless it is so large that differences drown in it.
     """
 
-    def __init__(self, data: OnMesh):
+    def __init__(self, data: OnMesh, like: System | None = None):
         """Assemble it; collective.
 
         Args:
             data: The physics on the mesh.
+            like: A system on the same mesh and parts whose matrix is the same, and is taken.
 
         Raises:
             InputError: Data are not finite, or κ is not above 0.
@@ -94,18 +95,11 @@ class System:
         self.bounded = np.flatnonzero(bounded[: layout.size[0]]).astype(np.int32)
         self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
         bc, a = self._bc(self.u_D), data.a
-        with defaults(MATRICES, prefix=""):
-            if layout.cr:
-                self.A = assemble_matrix(empty_matrix(layout), a, [bc])
-            else:
-                self.A = assemble_matrix(a, [bc])
-        self.A.assemble()
-        diagonal = self.A.getDiagonal()
-        positive = bool((diagonal.array_r > 0.0).all())
-        release(diagonal)
-        complaint = "data: the coefficient must be finite and above 0 everywhere"
-        raise_together(comm, None if positive else complaint)
-        self.A.setOption(PETSc.Mat.Option.SPD, True)
+        if like is None:
+            self.A = _assembled(a, bc, layout)
+            self.operator = ConstrainedMatrix(self.A, self.bounded)
+        else:
+            self.A, self.operator = like.A, like.operator
         self.chi = fem.Function(V)
         self.chi.x.array[:] = data.chi()
         self.b = fem.Function(V)
@@ -138,11 +132,6 @@ class System:
         if not np.isfinite(scale):
             raise InputError("data: so large that their squares overflow; choose other units")
         return scale
-
-    @cached_property
-    def operator(self) -> ConstrainedMatrix:
-        """A as the solver uses it."""
-        return ConstrainedMatrix(self.A, self.bounded)
 
     @property
     def owned_dirichlet(self) -> Int32Array:
@@ -223,6 +212,24 @@ class System:
             vector.destroy()
         r.x.scatter_forward()
         return norm
+
+
+def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
+    """The matrix of a_h, with the identity's rows and columns on Γ0; collective."""
+    with defaults(MATRICES, prefix=""):
+        A = (
+            assemble_matrix(empty_matrix(layout), a, [bc])
+            if layout.cr
+            else assemble_matrix(a, [bc])
+        )
+    A.assemble()
+    diagonal = A.getDiagonal()
+    positive = bool((diagonal.array_r > 0.0).all())
+    release(diagonal)
+    complaint = "data: the coefficient must be finite and above 0 everywhere"
+    raise_together(A.comm.tompi4py(), None if positive else complaint)
+    A.setOption(PETSc.Mat.Option.SPD, True)
+    return A
 
 
 def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:
