@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .errors import InputError, NotConverged
     from .estimate.certificate import Certificate
     from .fem.conditions import Contact, Dirichlet, Neumann, Robin
-    from .fem.problem import Problem
+    from .fem.problem import Material, Problem
     from .levels import solve, solve_levels
     from .mesh.domain import Domain, Polygon, read_gmsh
     from .solution import Solution
@@ -47,6 +47,7 @@ _ROOMS = {
     "solve_adaptive": "adaptive",
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
+    "Material": "fem.problem",
     "Dirichlet": "fem.conditions",
     "Neumann": "fem.conditions",
     "Robin": "fem.conditions",
@@ -67,6 +68,7 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Polygon",
     "read_gmsh",
     "Problem",
+    "Material",
     "Dirichlet",
     "Neumann",
     "Robin",

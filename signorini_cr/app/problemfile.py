@@ -111,7 +111,7 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
-        forms = Forms(self.problem, domain.mesh, parts=domain.parts)
+        forms = Forms(self.problem, domain.mesh, parts=domain.parts, materials=domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")

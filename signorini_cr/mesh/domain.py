@@ -15,7 +15,7 @@ from pathlib import Path
 
 import basix.ufl
 import numpy as np
-from dolfinx import la
+from dolfinx import fem, la
 from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 from dolfinx.mesh import (
@@ -32,6 +32,7 @@ from ..arrays import FloatArray, Int32Array
 from ..compat import coordinate_map
 from ..errors import InputError, on_root, raise_together
 from . import gmshmesh
+from .materials import Materials
 from .partition import by_position
 from .polygon import check_labels, check_loops, coordinates
 
@@ -50,6 +51,8 @@ class Domain:
         mesh: Affine simplices; no ghost cells when we make it.
         tags: Facet tags; each exterior facet has the value of one part.
         parts: The parts' names, and their values in the tags.
+        materials: What the cells consist of.
+        coarser: What it was refined from, and the cell there that holds each cell, local indices.
         seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
@@ -57,6 +60,8 @@ class Domain:
     tags: MeshTags
     seconds: float = 0.0
     parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
+    materials: Materials = field(default_factory=Materials)
+    coarser: tuple[Domain, Int32Array] | None = None
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
@@ -86,12 +91,46 @@ class Domain:
             for part in self.parts.values()
         }
 
+    @cached_property
+    def _own(self) -> dict[fem.Function, fem.Function]:
+        """What `own` has made."""
+        return {}
+
+    def own(self, function: fem.Function) -> fem.Function:
+        """Carry a function that is constant on each cell of a coarser mesh to this one.
+
+        Args:
+            function: Of degree 0, on this mesh or on one that it was refined from.
+
+        Raises:
+            InputError: It is of another degree, or on another mesh.
+        """
+        V = function.function_space
+        if V.mesh is self.mesh:
+            return function
+        if self.coarser is None or not is_by_cells(function):
+            raise InputError(
+                "data given as a dolfinx Function live on one mesh only, unless they are of degree"
+                " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
+            )
+        if function not in self._own:
+            coarse, parents = self.coarser
+            above = coarse.own(function)
+            fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
+            at = (space.dofmap.list[:, 0] for space in (fine.function_space, above.function_space))
+            here, there = at
+            fine.x.array[here[: len(parents)]] = above.x.array[there[parents]]
+            self._own[function] = fine
+        return self._own[function]
+
     @classmethod
     def from_tags(
         cls,
         mesh: Mesh,
         facet_tags: MeshTags,
         *,
+        cell_tags: MeshTags | None = None,
+        materials: Mapping[str, int | Sequence[int]] | None = None,
         contact: int | Sequence[int] | None = None,
         dirichlet: int | Sequence[int] | None = None,
         neumann: int | Sequence[int] | None = None,
@@ -109,6 +148,9 @@ class Domain:
         Args:
             mesh: Triangles or tetrahedra, straight-sided, any ghost mode.
             facet_tags: Values on facets.
+            cell_tags: Values on cells, for the materials.
+            materials: The value or values there that stand for each material, by names of your
+                own; `Problem.materials` has their data. Cells without any have those of `Problem`.
             contact: The value or values that stand for Γ1; 1 if there are no further parts.
             dirichlet: The value or values that stand for Γ0; 2 if there are no further parts.
             neumann: The value or values that stand for Γg; named so that they can be checked.
@@ -172,7 +214,17 @@ class Domain:
                 f"exterior facets are tagged {_list(left)}, which stands for nothing:"
                 f" {', '.join(words[:-1])} and {words[-1]}"
             )
-        return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]), parts=parts)
+        made = Materials.from_tags(mesh, cell_tags, materials or {})
+        tags = meshtags(mesh, fdim, exterior, values[exterior])
+        return cls(mesh, tags, parts=parts, materials=made)
+
+
+def is_by_cells(function: object) -> bool:
+    """Whether it is a scalar function that is constant on each cell."""
+    if not isinstance(function, fem.Function) or function.ufl_shape:
+        return False
+    element = function.function_space.ufl_element()
+    return bool(element.embedded_superdegree == 0)
 
 
 def numbered(names: Iterable[str]) -> dict[str, int]:
