@@ -33,6 +33,7 @@ from ..compat import coordinate_map
 from ..errors import InputError, on_root, raise_together
 from . import gmshmesh
 from .materials import Materials
+from .materials import numbered as numbered_materials
 from .partition import by_position
 from .polygon import check_labels, check_loops, coordinates
 
@@ -277,6 +278,9 @@ class Polygon:
         holes: Polygons inside this one, apart from each other.
         names: Further parts that there may be, whose conditions are in `Problem.conditions`. With
             some, there need be no edge that is contact, and none that is dirichlet.
+        materials: What lies in a polygon, shape (n, 2), consists of a material, whose data are in
+            `Problem.materials`. These polygons may share edges and reach beyond the domain, but not
+            overlap; lines of the mesh follow their edges.
 
     Raises:
         InputError: An outline crosses itself or another one, or a label is not known.
@@ -286,6 +290,7 @@ class Polygon:
     boundary: tuple[str, ...]
     holes: tuple[Polygon, ...] = ()
     names: tuple[str, ...] = ()
+    materials: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take lists as well as arrays and check everything that can be checked at once."""
@@ -295,6 +300,13 @@ class Polygon:
         object.__setattr__(self, "names", tuple(self.names))
         check_labels(self.boundary, len(self.vertices), (*PARTS, *self.names))
         check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
+        polygons = {name: coordinates(polygon) for name, polygon in self.materials.items()}
+        object.__setattr__(self, "materials", polygons)
+        for name, polygon in polygons.items():
+            try:
+                check_loops([polygon])
+            except InputError as error:
+                raise InputError(f"the material {name}: {error}") from None
         if any(hole.holes for hole in self.holes):
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
@@ -338,7 +350,9 @@ class Polygon:
         loops = [self.vertices, *(hole.vertices for hole in self.holes)]
         names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
         labels = np.array([self.parts[name] for name in names], dtype=np.int32)
-        return _distribute(comm, self.parts, gmshmesh.triangulate, loops, labels, float(size))
+        numbers = numbered_materials(list(self.materials))
+        what = loops, labels, float(size), self.materials, numbers
+        return _distribute(comm, self.parts, numbers, gmshmesh.triangulate, *what)
 
     @property
     def parts(self) -> dict[str, int]:
@@ -348,7 +362,10 @@ class Polygon:
 
 
 def read_gmsh(
-    path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, names: Sequence[str] = ()
+    path: str | Path,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    names: Sequence[str] = (),
+    materials: Sequence[str] = (),
 ) -> Domain:
     """Read a gmsh file (2.2 or 4.1, ASCII or binary) with named physical curves; collective.
 
@@ -361,21 +378,24 @@ def read_gmsh(
         comm: The ranks that share the mesh.
         names: Further curves to look for, whose conditions are in `Problem.conditions`. With some,
             there need be no curve named contact, and none named dirichlet.
+        materials: Physical surfaces to look for, whose data are in `Problem.materials`.
 
     Raises:
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
-    parts = numbered(names)
-    return _distribute(comm, parts, gmshmesh.read, Path(path), parts, not names)
+    parts, numbers = numbered(names), numbered_materials(materials)
+    what = Path(path), parts, not names, numbers
+    return _distribute(comm, parts, numbers, gmshmesh.read, *what)
 
 
 def _distribute(
     comm: MPI.Comm,
     parts: Mapping[str, int],
+    numbers: Mapping[str, int],
     make: Callable[..., gmshmesh.Triangulation],
     *args: object,
 ) -> Domain:
-    """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
+    """Make arrays on rank 0, share them out as a mesh without ghost cells, labels and materials."""
     began = time.perf_counter()
     raw: gmshmesh.Triangulation | None = None
 
@@ -404,4 +424,11 @@ def _distribute(
     values = np.full(_count(mesh, 1), REST, dtype=np.int32)
     values[found.indices] = found.values
     tags = meshtags(mesh, 1, exterior, values[exterior])
-    return Domain(mesh, tags, time.perf_counter() - began, parts)
+    materials = Materials()
+    if numbers:
+        corners, of_cells = distribute_entity_data(mesh, 2, raw.triangles, raw.materials)
+        materials = Materials(numbers, np.zeros(_count(mesh, 2), dtype=np.int32))
+        mesh.topology.create_connectivity(2, 2)
+        cells = meshtags_from_entities(mesh, 2, adjacencylist(corners), of_cells)
+        materials.of_cells[cells.indices] = cells.values
+    return Domain(mesh, tags, time.perf_counter() - began, parts, materials)
