@@ -10,6 +10,7 @@ import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -210,15 +211,18 @@ def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
 
 
 def read(
-    path: Path, parts: dict[str, int], usual: bool, materials: Mapping[str, int]
+    path: Path,
+    parts: dict[str, int],
+    usual: bool = True,
+    materials: Mapping[str, int] = MappingProxyType({}),
 ) -> Triangulation:
     """Read a planar triangle mesh with named physical curves, and perhaps surfaces.
 
     Args:
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
-        materials: Numbers of the physical surfaces that are asked for, by name.
         usual: Whether there must be a contact and a dirichlet curve.
+        materials: Numbers of the physical surfaces that are asked for, by name.
     """
     file = mshfile.load(path)
     _check_cells(file, path)
