@@ -6,6 +6,7 @@ from dolfinx.mesh import compute_midpoints
 from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Polygon, read_gmsh
+from signorini_cr.compat import cell_nodes
 from signorini_cr.errors import on_root
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.refinement import refine, refine_marked
@@ -21,7 +22,7 @@ def areas(domain: Domain) -> dict[str, float]:
     """Of each material; collective."""
     mesh = domain.mesh
     cells = np.arange(mesh.topology.index_map(2).size_local)
-    x = mesh.geometry.x[mesh.geometry.dofmap[cells], :2]
+    x = mesh.geometry.x[cell_nodes(mesh)[cells], :2]
     a, b = (x[:, i] - x[:, 0] for i in (1, 2))
     size = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     return {
