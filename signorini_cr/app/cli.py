@@ -230,7 +230,8 @@ def _solve_levels(
                 finest = solution
                 continue
             _ = solution.errors, solution.certificate  # the report reads what is there
-            record = output.level_record(solution, records[-1] if records else None)
+            before = records[-1] if records else None
+            record = output.level_record(solution, before, case.quantities)
             report = output.make_report(case.title, element, comm, [*records, record], False)
             with _named("--out"):
                 restart = Restart.of(solution, restart, case.mode == "adaptive")
@@ -245,10 +246,8 @@ def _solve_levels(
         failure = error
     failure = failure or _above_tolerance(case, records)
     if finest is not None:
-        screen.progress("bounds of the contact force")
-        force = output.force_record(finest)
         screen.progress("writing")
-        report = output.make_report(case.title, element, comm, records, failure is None, force)
+        report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
             if args.html:
@@ -257,7 +256,7 @@ def _solve_levels(
         screen.text(legend(records[0]))
         screen.line("")
         screen.text(_facts(records[-1]))
-        screen.text(certified(records[-1], force))
+        screen.text(certified(records[-1]))
         screen.text(times(records))
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:

@@ -43,7 +43,7 @@ from .readers import (
     string,
     whole,
 )
-from .reference import ADAPTIVE, MATERIAL, PART, SECTIONS, TYPES, allowed
+from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -71,6 +71,8 @@ class ProblemFile:
         mode: "uniform" or "adaptive".
         levels: Number of meshes, the coarsest included.
         adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
+        quantities: The kind of each quantity that is asked for, "force" or "flux", and its part of
+            the boundary, by name.
         said: All that levels depend on, by key, as it was written.
     """
 
@@ -84,6 +86,7 @@ class ProblemFile:
     mode: str
     levels: int
     adaptive: Mapping[str, Any]
+    quantities: Mapping[str, tuple[str, str]]
     said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
@@ -182,11 +185,12 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         adaptive=adaptive,
+        quantities=_quantities(sections["quantities"], parts),
         said={
             f"{name}.{key}": value
             for name, section in sections.items()
             for key, value in section.items()
-            if f"{name}.{key}" not in ENDS
+            if f"{name}.{key}" not in ENDS and name != "quantities"
         },
     )
 
@@ -217,6 +221,26 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         raise InputError(f"material: sections [{MATERIAL}] are needed, found {shown(found)}")
     for name, material in found.items():
         insist_known(material, f"material.{name}", allowed(MATERIAL), KEYS)
+    return found
+
+
+def _quantities(
+    table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, tuple[str, str]]:
+    """[quantities]: each a kind and a part of the boundary of the type that goes with it."""
+    types = {name: name for name in PARTS} | {name: part["type"] for name, part in parts.items()}
+    found = {}
+    for name, value in table.items():
+        key = f"quantities.{name}"
+        if not isinstance(value, dict) or len(value) != 1:
+            raise InputError(
+                f'{key}: {{ force = "PART" }} or {{ flux = "PART" }} is needed, found'
+                f" {shown(value)}"
+            )
+        insist_known(value, key, tuple(QUANTITIES))
+        ((kind, part),) = value.items()
+        own = [each for each, what in types.items() if what == QUANTITIES[kind]]
+        found[name] = kind, one_of(own)(f"{key}.{kind}", part)
     return found
 
 

@@ -38,12 +38,15 @@ PART = "boundary.NAME"
 MATERIAL = "material.NAME"
 """The sections of the materials."""
 TYPES = {
-    "contact": ("obstacle", "coefficient", "external", "g"),
+    "contact": ("obstacle", "upper", "coefficient", "external", "g"),
     "dirichlet": ("value",),
     "neumann": ("g",),
     "robin": ("g", "coefficient", "external"),
 }
 """The keys that go with each type of a part."""
+
+QUANTITIES = {"force": "contact", "flux": "dirichlet"}
+"""Kinds of quantities, and the type of the part that each is of."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
@@ -78,9 +81,13 @@ KEYS = (
     Key("data", "reaction", EXPRESSION, "0", "c of −∇·(κ∇u) + c u = f, nowhere below 0.",
         "reaction = 2"),
     Key(PART, "type", '"contact", "dirichlet", "neumann" or "robin"', "", "What holds there: u ≥ "
-        "obstacle; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) = g. On contact parts "
-        "that has the pressure of the obstacle on its right, too.", 'type = "contact"'),
-    Key(PART, "obstacle", EXPRESSION, "0", "contact: α.", 'obstacle = "0.1*x"'),
+        "obstacle, or u ≤ upper, or both; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) "
+        "= g. On contact parts that has the pressure of the obstacle on its right, too.",
+        'type = "contact"'),
+    Key(PART, "obstacle", EXPRESSION, "0; nothing where there is an `upper`", "contact: α, which u "
+        "is not to be below.", 'obstacle = "0.1*x"'),
+    Key(PART, "upper", EXPRESSION, "nothing", "contact: β, which u is not to be above, instead of "
+        "an obstacle or together with it.", "upper = 10"),
     Key(PART, "value", EXPRESSION, "0, or derived from `exact.u`", "dirichlet: u_D.", "value = 8"),
     Key(PART, "g", EXPRESSION, "0, or derived from `exact.u` but for contact",
         "neumann, robin, contact: the flux into the domain.", "g = 0.5"),
@@ -126,6 +133,9 @@ ABOUT = {
     "data": "What is left out is 0. An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",
+    "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
+    "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
+    "through a dirichlet part. The part must not touch other dirichlet or contact parts.",
 }
 """The sections, and what is said of each."""
 
@@ -156,6 +166,10 @@ def page() -> str:
         if section == "define":
             example = ["[define]", 'r = "sqrt(x**2 + y**2)"', 'w = "r**1.5*cos(1.5*atan2(y, x))"']
             lines += ["```toml", *example, "```", ""]
+            continue
+        if section == "quantities":
+            example = ['push = { force = "contact" }', 'inflow = { flux = "dirichlet" }']
+            lines += ["```toml", "[quantities]", *example, "```", ""]
             continue
         lines += ["| key | value | if left out | |", "|---|---|---|---|"]
         keys = [key for key in KEYS if key.section == section]

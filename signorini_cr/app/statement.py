@@ -108,7 +108,14 @@ def _condition(part: Mapping[str, Any], kappa: str, known: bool) -> str:
     if kind != "contact":
         return f"{flux} = {data('g', True)}"
     gain = f" − {factor('g')}" if part.get("g", 0) != 0 else ""
-    return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
+    if "upper" not in part:
+        return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
+    if "obstacle" not in part:
+        return f"u ≤ {data('upper')}, {flux}{gain} ≤ 0, one of them an equality"
+    return (
+        f"{data('obstacle')} ≤ u ≤ {data('upper')}, {flux}{gain} ≥ 0 on the lower bound, ≤ 0 on "
+        "the upper, 0 between them"
+    )
 
 
 def _short(value: object) -> str:

@@ -61,8 +61,12 @@ class DiffusionOnMesh:
 
     @cached_property
     def alpha(self) -> tuple[OnFacets, ...]:
-        """What u must not be below on Γ1, one for each condition."""
-        return self._sampled(self.forms.bounded, lambda condition: condition.lower)
+        """What s u must not be below on Γ1, one for each condition's each bound."""
+        return tuple(
+            OnFacets.of(condition, self.compiled.trace(datum), self.domain, sign)
+            for condition in self.forms.bounded
+            for sign, datum in condition.bounds
+        )
 
     # what the system asks for
 
@@ -77,8 +81,8 @@ class DiffusionOnMesh:
         return tuple(on_facets.imposed for on_facets in self.u_D)
 
     @property
-    def lower(self) -> tuple[Imposed, ...]:
-        """α on Γ1."""
+    def bounds(self) -> tuple[Imposed, ...]:
+        """α and −β on Γ1."""
         return tuple(on_facets.imposed for on_facets in self.alpha)
 
     def chi(self) -> FloatArray:

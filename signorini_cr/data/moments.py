@@ -326,6 +326,7 @@ class OnFacets:
         ends: Values at the vertices, in the order of the cell's closure, shape (d, n).
         middle: At the midpoints, shape (n,).
         inside: At the trace's quadrature points, shape (q, n).
+        sign: Of a bound: s, where s u must not be below the datum.
     """
 
     condition: Condition
@@ -335,13 +336,14 @@ class OnFacets:
     ends: FloatArray
     middle: FloatArray
     inside: FloatArray
+    sign: int = 1
 
     @classmethod
-    def of(cls, condition: Condition, trace: Trace, domain: Domain) -> OnFacets:
+    def of(cls, condition: Condition, trace: Trace, domain: Domain, sign: int = 1) -> OnFacets:
         """Evaluate a datum on a mesh; collective."""
         facets = domain.all_facets[condition.number]
         entities = facet_entities(domain.mesh, facets)
-        return cls(condition, trace, facets, entities, *trace.at(domain, entities))
+        return cls(condition, trace, facets, entities, *trace.at(domain, entities), sign)
 
     @property
     def means(self) -> FloatArray:
@@ -353,14 +355,15 @@ class OnFacets:
         """The same for the one unknown of each facet."""
         only = np.zeros(1, dtype=np.int32)
         means, ends = self.means[:, None], self.ends.T[:, :, None]
-        return Imposed(self.condition.label.removeprefix("data."), self.facets, only, means, ends)
+        key = self.condition.label.removeprefix("data.")
+        return Imposed(key, self.facets, only, means, ends, self.sign)
 
     def seen_from(self, cells: Cells) -> OnFacets:
         """Keep the facets of owned cells, those of the part's `Side`."""
         own = self.entities[:, 0] < cells.number
         where = self.facets[own], self.entities[own]
         values = self.ends[:, own], self.middle[own], self.inside[:, own]
-        return OnFacets(self.condition, self.trace, *where, *values)
+        return OnFacets(self.condition, self.trace, *where, *values, self.sign)
 
     def side(self, cells: Cells) -> Side:
         """The facets of owned cells, seen from these."""
@@ -400,6 +403,12 @@ class OnParts:
     def means(self) -> FloatArray:
         """Means over the facets, shape (n,)."""
         return np.concatenate([np.empty(0), *(each.means for each in self.parts)])
+
+    @property
+    def signs(self) -> FloatArray:
+        """The bounds' signs, shape (n,)."""
+        count = [len(each.middle) for each in self.parts]
+        return np.repeat([float(each.sign) for each in self.parts], count)
 
     @property
     def traces(self) -> list[Trace]:

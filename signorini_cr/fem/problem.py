@@ -292,7 +292,7 @@ class Forms:
     @property
     def bounded(self) -> tuple[Condition, ...]:
         """The conditions that bound u: their parts make Γ1."""
-        return tuple(c for c in self.conditions if c.lower is not None)
+        return tuple(c for c in self.conditions if c.bounds)
 
     @property
     def natural(self) -> tuple[Condition, ...]:
@@ -448,7 +448,7 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
     usual: dict[str, tuple[Condition, str]] = {
         "dirichlet": (Dirichlet(problem.dirichlet), "data.dirichlet"),
         "neumann": (Neumann(problem.g), "data.g"),
-        "contact": (Contact(problem.obstacle), "data.obstacle"),
+        "contact": (Contact(given.expression(problem.obstacle)), "data.obstacle"),
     }
     for name, condition in problem.conditions.items():
         if name not in parts:

@@ -192,7 +192,7 @@ def conforming(mesh: NestedMesh) -> tuple[ConstrainedMatrix, Layout, Int32Array]
     matrix = assemble_matrix(empty_matrix(p1), form)
     matrix.assemble()
     matrix.scale(scale)
-    dirichlet, bounded = p1.owned_at(data.fixed), p1.owned_at(data.lower)
+    dirichlet, bounded = p1.owned_at(data.fixed), p1.owned_at(data.bounds)
     matrix.zeroRowsColumns(numbers_of(matrix, dirichlet), 1.0)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
     return ConstrainedMatrix(matrix, bounded), p1, dirichlet

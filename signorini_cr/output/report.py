@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import dolfinx
@@ -25,7 +26,7 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
-from ..estimate.force import NO_BOUNDS, force_bounds
+from ..estimate.force import NO_BOUNDS, flux, force_bounds
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .tables import contact_csv, levels_csv, markdown_table
@@ -63,12 +64,15 @@ Record = dict[str, Any]
 def level_record(
     solution: Solution,
     previous: Mapping[str, Any] | None = None,
+    quantities: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Record:
     """The numbers of one level, as they stand in report.json.
 
     Args:
         solution: What was found on this mesh.
         previous: The record of the level before, for the rates.
+        quantities: The kind, "force" or "flux", and the part of the boundary of what is wanted in
+            an interval, by name. Each takes about as long as a linear solve.
 
     Returns:
         Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
@@ -101,12 +105,17 @@ def level_record(
                 "length": contact.length,
                 "force": contact.force,
                 "transitions": contact.transitions[:, :gdim],
+                "force_bounds": _bounded(solution, None),
+            },
+            "quantities": {
+                name: _bounded(solution, [part]) for name, (_, part) in quantities.items()
             },
             "error_h1": h1,
             "error_l2": l2,
             "rate_h1": _rate("error_h1", h1, solution, previous),
             "rate_l2": _rate("error_l2", l2, solution, previous),
             "bound_h1": bound,
+            "bound_energy_norm": certificate.bound_energy_norm,
             "effectivity": bound / h1 if bound is not None and h1 else None,
             "bound_reason": certificate.reason,
             "bound_parts": {name: certificate.parts.get(name) for name in SHARES},
@@ -118,16 +127,17 @@ def level_record(
     )
 
 
-def force_record(solution: Solution) -> Record:
-    """Bounds of the contact force of u itself, None with a reason where there are none; collective.
-
-    It takes about as long as the solve, and that is why no record of a level has it.
-    """
+def _bounded(solution: Solution, parts: Sequence[str] | None) -> Record:
+    """What flows through parts, None for all of Γ1, or nothing, and why; collective."""
     try:
+        if parts is not None:
+            return {**flux(solution, *parts)._asdict(), "reason": None}
         lower, upper = force_bounds(solution)
+        return {"lower": lower, "upper": upper, "reason": None}
     except InputError as error:
-        return {"lower": None, "upper": None, "reason": str(error).removeprefix(f"{NO_BOUNDS}: ")}
-    return {"lower": lower, "upper": upper, "reason": None}
+        value = {} if parts is None else {"value": None}
+        reason = str(error).removeprefix(f"{NO_BOUNDS}: ")
+        return {**value, "lower": None, "upper": None, "reason": reason}
 
 
 def make_report(
@@ -136,7 +146,6 @@ def make_report(
     comm: MPI.Comm,
     records: Sequence[Record],
     complete: bool = True,
-    force: Record | None = None,
 ) -> Record:
     """The whole of report.json from the records of its levels.
 
@@ -146,7 +155,6 @@ def make_report(
         comm: The ranks that solved it.
         records: From `level_record`, coarsest level first.
         complete: Whether these are all the levels that were asked for.
-        force: From `force_record`, of the finest level, at the end of the run.
     """
     versions = {
         "signorini_cr": __version__,
@@ -160,7 +168,7 @@ def make_report(
         "ranks": comm.size,
         "versions": versions,
         "complete": complete,
-        "force_bounds": force or {"lower": None, "upper": None, "reason": "the run has not ended"},
+        "force_bounds": records[-1]["contact"]["force_bounds"],
         "levels": list(records),
     }
 
