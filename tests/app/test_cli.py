@@ -601,6 +601,16 @@ def test_the_deck(shared_tmp_path: Path) -> None:
     assert 0 < level["contact"]["force"] < 800
 
 
+def test_data_need_to_make_sense_only_where_they_are_used(write) -> None:
+    """1/y does not on Γ1, where the cells' material has a load of its own."""
+    text = with_('f = "1 + r"', 'f = "1/y"')
+    assert "data.f: the value at" in refused("check", write(text), "--out", "out")
+    path = write(f"{text}\n[material.soil]\n{SOIL}\nf = 1\n")
+    status, printed, err = run("check", path, "--out", "out")
+    assert (status, err) == (0, "")
+    assert COMM.rank > 0 or "soil       f = 1; " in printed
+
+
 def test_a_deck_of_three_materials(shared_tmp_path: Path) -> None:
     """Those of two polygons and, elsewhere, of [data], through the command."""
     out = shared_tmp_path / "out"

@@ -23,7 +23,7 @@ SOIL, ROCK = 5, 9
 
 
 def layers(n=4, comm=MPI.COMM_WORLD, **more):
-    """The unit square, of rock above y = ½."""
+    """The unit square, of rock above y = ½; n is even."""
     mesh = create_rectangle(comm, [[0.0, 0.0], [1.0, 1.0]], [n, n])
     mesh.topology.create_connectivity(1, 2)
     facets = exterior_facet_indices(mesh.topology)
@@ -66,6 +66,33 @@ def test_rates_and_bounds_across_an_interface(contrast):
         assert certificate.bound_h1 >= error
         # of the energy's norm, which the certificate is about
         assert certificate.bound_energy_norm <= 1.3 * energy_error(solution, contrast)
+
+
+@pytest.mark.parametrize("touching", [True, False])
+def test_bounds_hold_for_random_layers(touching):
+    """Loads and κ that jump by up to 10⁸, in contact all along Γ1 or nowhere there."""
+    domain = layers(6, materials={"soil": SOIL, "rock": ROCK})
+    random = np.random.default_rng(1 + touching)
+    names = ("soil", "rock", "mean", "wave", "steep")
+    at = {name: fem.Constant(domain.mesh, 1.0) for name in names}
+
+    def u(x):
+        kappa = ufl.conditional(ufl.gt(x[1], 0.5), at["rock"], at["soil"])
+        angle = (at["steep"] if touching else ufl.pi) * (x[1] - 0.5)
+        return -(at["mean"] + at["wave"] * ufl.cos(ufl.pi * x[0])) * ufl.sin(angle) / kappa
+
+    for _ in range(3):
+        at["soil"].value, at["rock"].value = 10.0 ** random.uniform(-4.0, 4.0, 2)
+        at["mean"].value, at["wave"].value = random.uniform(0.5, 1.0), random.uniform(-0.5, 0.5)
+        at["steep"].value = random.uniform(0.1, 3.0)
+        own = {name: Material(coefficient=float(at[name].value)) for name in ("soil", "rock")}
+        problem = Problem(exact=u, obstacle=u if touching else -1.0, materials=own)
+        for solution in solve_levels(problem, domain, 2):
+            assert touching or solution.contact.force == 0.0
+            certificate = solution.certificate
+            assert certificate.bound_h1 >= solution.errors[0]
+            low, high = certificate.energy
+            assert low <= high
 
 
 def energy_error(solution, contrast):
