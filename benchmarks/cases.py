@@ -18,6 +18,7 @@ from petsc4py import PETSc  # noqa: E402
 from signorini_cr import (  # noqa: E402
     Contact,
     Dirichlet,
+    Material,
     Neumann,
     Polygon,
     Problem,
@@ -58,6 +59,26 @@ PUSHED = Problem(
 EDGES = ("floor", "right", "top", "left")
 
 
+BURIED = Polygon(
+    [[-1, 0], [1, 0], [1, 1], [-1, 1]],
+    ["contact", "neumann", "dirichlet", "neumann"],
+    materials={
+        "layer": [[-2, 0.3], [2, 0.5], [2, 0.7], [-2, 0.5]],
+        "block": [[-0.7, 0], [-0.2, 0], [-0.3, 0.25], [-0.6, 0.2]],
+        "pipe": [[0.5, 0.2], [0.6, 0.1], [0.7, 0.2], [0.6, 0.3]],
+    },
+)
+LAYERED = Problem(
+    f=lambda x: 40 * ufl.sin(np.pi * x[0]) + 2,
+    obstacle=-0.1,
+    materials={
+        "layer": Material(coefficient=0.01),
+        "block": Material(coefficient=100.0),
+        "pipe": Material(coefficient=0.01, f=-5.0),
+    },
+)
+
+
 def _with_terms() -> dict[str, Problem]:
     """Problems on (−1, 1) × (0, 1) with more than the model problem has."""
     top, waves = Dirichlet(0.0), lambda x: 40 * ufl.sin(np.pi * x[0]) + 2
@@ -92,6 +113,7 @@ def cases() -> dict[str, tuple[Problem, Coarsest]]:
     rectangle = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], EDGES, names=EDGES)
     for name, problem in _with_terms().items():
         result[name] = problem, lambda: families.structured(rectangle, COARSEST, comm)
+    result["materials"] = (LAYERED, lambda: BURIED.mesh(SIZE, comm))
     result["polygon"] = (PUSHED, lambda: CROOKED.mesh(SIZE, comm))
     return result
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .estimate.certificate import Certificate
     from .evolution import Solver, solve_in_time
     from .fem.conditions import Contact, Dirichlet, Neumann, Robin
-    from .fem.problem import Problem
+    from .fem.problem import Material, Problem
     from .levels import solve, solve_levels
     from .mesh.domain import Domain, Polygon, read_gmsh
     from .solution import Solution
@@ -50,6 +50,7 @@ _ROOMS = {
     "Solver": "evolution",
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
+    "Material": "fem.problem",
     "Dirichlet": "fem.conditions",
     "Neumann": "fem.conditions",
     "Robin": "fem.conditions",
@@ -70,6 +71,7 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Polygon",
     "read_gmsh",
     "Problem",
+    "Material",
     "Dirichlet",
     "Neumann",
     "Robin",

@@ -71,7 +71,7 @@ def solve_levels(
     """Solve on a mesh and its uniform refinements, each starting from the one below.
 
     Args:
-        problem: The data; they must not hold a Function, which lives on one mesh only.
+        problem: The data; a Function in them must be of degree 0, on the coarsest mesh.
         domain: The coarsest mesh and its boundary parts.
         levels: Number of meshes, the coarsest included.
         element: "CR" or "P1".
@@ -131,7 +131,7 @@ def solve_sequence(
         The solutions, coarsest first.
     """
     yield from solve_physics(
-        Diffusion(problem, domain.mesh, element, domain.parts),
+        Diffusion(problem, domain.mesh, element, domain.parts, domain.materials),
         domain,
         step,
         monitor,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,15 @@ import numpy as np
 from mpi4py import MPI
 
 from ..adaptive import solve_adaptive
+from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, on_root
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
-from ..fem.problem import Forms, Problem
+from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
+from ..mesh.polygon import check_loops, coordinates
 from ..solution import Solution
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
@@ -41,7 +43,7 @@ from .readers import (
     string,
     whole,
 )
-from .reference import ADAPTIVE, PART, QUANTITIES, SECTIONS, TYPES, allowed
+from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -49,6 +51,7 @@ ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
+SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
 MOST_CELLS = 1e9
 """More than anyone means for the last mesh of a uniform sequence."""
 
@@ -62,6 +65,7 @@ class ProblemFile:
         domain: A polygon, or the path of a gmsh file.
         size: Facet length wanted on the coarsest mesh of a polygon.
         parts: The parts of the boundary that have sections.
+        materials: The materials.
         problem: The data as functions of x, which give UFL.
         expressions: The data that were written in the file, by key (``data.f`` …).
         mode: "uniform" or "adaptive".
@@ -76,6 +80,7 @@ class ProblemFile:
     domain: Polygon | Path
     size: float | None
     parts: tuple[str, ...]
+    materials: tuple[str, ...]
     problem: Problem
     expressions: Mapping[str, Expression]
     mode: str
@@ -89,7 +94,7 @@ class ProblemFile:
         key = "domain.mesh" if isinstance(self.domain, Path) else "domain"
         try:
             if isinstance(self.domain, Path):
-                return read_gmsh(self.domain, comm, self.parts)
+                return read_gmsh(self.domain, comm, self.parts, self.materials)
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
         except InputError as error:
@@ -114,7 +119,7 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
-        forms = Forms(self.problem, domain.mesh, parts=domain.parts)
+        forms = Forms(self.problem, domain.mesh, parts=domain.parts, materials=domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
@@ -149,7 +154,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     table = parse_toml(on_root(comm, read_text, path))
     insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
     title = get(table, "", "title", string, path.stem)
-    parts = _parts(table)
+    parts, materials = _parts(table), _materials(table)
     sections = {name: _section(table, name) for name in SECTIONS}
     if "domain" not in table:
         raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
@@ -157,8 +162,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
     if "exact" in table and not table["exact"]:
         raise InputError("exact.u: this key is missing; an expression in x and y is needed")
-    domain, size = _domain(sections["domain"], path.parent, tuple(parts))
-    expressions = _expressions(sections, parts)
+    domain, size = _domain(sections["domain"], path.parent, tuple(parts), materials)
+    expressions = _expressions(sections, parts, materials)
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
     adaptive = {name: get(refine, "refine", name, *how) for name, how in ADAPTIVE.items()}
@@ -174,7 +179,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         domain=domain,
         size=size,
         parts=tuple(parts),
-        problem=_problem(expressions, parts),
+        materials=tuple(materials),
+        problem=_problem(expressions, parts, materials),
         expressions=expressions,
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
@@ -206,6 +212,16 @@ def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
                     f" {', '.join(TYPES[kind])}"
                 )
     return parts
+
+
+def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The sections [material.NAME], each checked for its keys."""
+    found = table.get("material", {})
+    if not isinstance(found, dict) or not all(isinstance(each, dict) for each in found.values()):
+        raise InputError(f"material: sections [{MATERIAL}] are needed, found {shown(found)}")
+    for name, material in found.items():
+        insist_known(material, f"material.{name}", allowed(MATERIAL), KEYS)
+    return found
 
 
 def _quantities(
@@ -241,7 +257,10 @@ def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def _domain(
-    table: Mapping[str, Any], folder: Path, names: tuple[str, ...]
+    table: Mapping[str, Any],
+    folder: Path,
+    names: tuple[str, ...],
+    materials: Mapping[str, Mapping[str, Any]],
 ) -> tuple[Polygon | Path, float | None]:
     """Read [domain]: the polygon and its size, or the path of the mesh.
 
@@ -249,6 +268,7 @@ def _domain(
         table: The section.
         folder: Where paths begin.
         names: The parts of the boundary that have sections.
+        materials: The sections of the materials.
     """
     if "mesh" in table:
         others = [key for key in ("vertices", "boundary", "size", "holes") if key in table]
@@ -257,6 +277,12 @@ def _domain(
                 f"domain: both mesh and {others[0]} are given; either a mesh file or a polygon"
                 " (vertices, boundary, size) is allowed"
             )
+        for name, material in materials.items():
+            if "polygon" in material:
+                raise InputError(
+                    f"material.{name}.polygon: with a mesh file a physical surface named {name} is"
+                    " needed instead"
+                )
         return folder / get(table, "domain", "mesh", string), None
     if "vertices" not in table:
         raise InputError(
@@ -264,7 +290,12 @@ def _domain(
             " a mesh file is needed"
         )
     polygon = _polygon(table, "domain", names)
-    holes = []
+    holes, polygons = [], {}
+    for name, material in materials.items():
+        key, needed = f"material.{name}", "a list of points [x, y]"
+        points = _points(f"{key}.polygon", get(material, key, "polygon", array, needed=needed))
+        named(f"{key}.polygon", check_loops, [coordinates(points)], rule=SIMPLE)
+        polygons[name] = points
     for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
         key = f"domain.holes[{i}]"
         if not isinstance(hole, dict):
@@ -273,10 +304,11 @@ def _domain(
             )
         insist_known(hole, key, ("vertices", "boundary"))
         holes.append(_polygon(hole, key, names))
-    if holes:
+    if holes or polygons:
         apart = "holes must lie inside the polygon and apart from each other"
         outline = (polygon.vertices, polygon.boundary)
         polygon = named("domain.holes", Polygon, *outline, tuple(holes), names, rule=apart)
+        polygon = replace(polygon, materials=polygons)
     named("domain.boundary", polygon.check_parts)
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
     for name in names:
@@ -297,13 +329,7 @@ def _domain(
 def _polygon(table: Mapping[str, Any], section: str, names: tuple[str, ...]) -> Polygon:
     key = f"{section}.vertices"
     vertices = get(table, section, "vertices", array, needed="a list of points [x, y]")
-    for i, vertex in enumerate(vertices):
-        if not isinstance(vertex, list) or len(vertex) != 2:
-            raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
-        for j, coordinate in enumerate(vertex):
-            number(f"{key}[{i}][{j}]", coordinate)
-    if len(vertices) < 3:
-        raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
+    points = _points(key, vertices)
     boundary = get(table, section, "boundary", array, needed="a list of labels, one for each edge,")
     for i, label in enumerate(boundary):
         one_of((*PARTS, *(name for name in names if name not in PARTS)))(
@@ -314,9 +340,19 @@ def _polygon(table: Mapping[str, Any], section: str, names: tuple[str, ...]) -> 
             f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
             f" found {len(boundary)} labels"
         )
-    simple = "the polygon must be simple, its edges must meet at their common vertices only"
-    outline = np.array(vertices, dtype=np.float64), tuple(boundary)
-    return named(key, Polygon, *outline, (), names, rule=simple)
+    return named(key, Polygon, points, tuple(boundary), (), names, rule=SIMPLE)
+
+
+def _points(key: str, vertices: list[Any]) -> FloatArray:
+    """The vertices of a polygon, shape (n, 2)."""
+    for i, vertex in enumerate(vertices):
+        if not isinstance(vertex, list) or len(vertex) != 2:
+            raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
+        for j, coordinate in enumerate(vertex):
+            number(f"{key}[{i}][{j}]", coordinate)
+    if len(vertices) < 3:
+        raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
+    return np.array(vertices, dtype=np.float64)
 
 
 def _few_enough(levels: int, cells: int, dim: int) -> None:
@@ -329,9 +365,11 @@ def _few_enough(levels: int, cells: int, dim: int) -> None:
 
 
 def _expressions(
-    sections: Mapping[str, Mapping[str, Any]], parts: Mapping[str, Mapping[str, Any]]
+    sections: Mapping[str, Mapping[str, Any]],
+    parts: Mapping[str, Mapping[str, Any]],
+    materials: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Expression]:
-    """Read [define], [data], [boundary.NAME] and [exact]."""
+    """Read [define], [data], [boundary.NAME], [material.NAME] and [exact]."""
     names: dict[str, Expression] = {}
     define = sections["define"]
     for name, value in define.items():
@@ -346,6 +384,8 @@ def _expressions(
     }
     for part, table in parts.items():
         given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
+    for material, table in materials.items():
+        given |= {f"material.{material}.{key}": v for key, v in table.items() if key != "polygon"}
     result = {}
     for key, value in given.items():
         expression = _expression(key, value, names, ())
@@ -371,7 +411,9 @@ KINDS = {"contact": Contact, "dirichlet": Dirichlet, "neumann": Neumann, "robin"
 
 
 def _problem(
-    expressions: Mapping[str, Expression], parts: Mapping[str, Mapping[str, Any]]
+    expressions: Mapping[str, Expression],
+    parts: Mapping[str, Mapping[str, Any]],
+    materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
     def data(key: str, default: Any) -> Any:
         if key not in expressions:
@@ -393,5 +435,15 @@ def _problem(
         coefficient=data("data.coefficient", 1.0),
         reaction=data("data.reaction", 0.0),
         conditions=conditions,
+        materials={
+            name: Material(
+                **{
+                    key: data(f"material.{name}.{key}", None)
+                    for key in material
+                    if key != "polygon"
+                }
+            )
+            for name, material in materials.items()
+        },
         exact=data("exact.u", None),
     )

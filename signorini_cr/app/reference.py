@@ -35,6 +35,8 @@ class Key(NamedTuple):
 EXPRESSION = "an expression or a number"
 PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
+MATERIAL = "material.NAME"
+"""The sections of the materials."""
 TYPES = {
     "contact": ("obstacle", "upper", "coefficient", "external", "g"),
     "dirichlet": ("value",),
@@ -93,6 +95,15 @@ KEYS = (
         "nowhere below 0.", "coefficient = 20"),
     Key(PART, "external", EXPRESSION, "0", "robin, contact: the u at which nothing is lost.",
         "external = -10"),
+    Key(MATERIAL, "polygon", "a list of points [x, y]", "", "Where the domain consists of it: "
+        "what of it lies in this polygon. Its edges become lines of the mesh. Polygons may "
+        "share edges, and reach beyond the domain, but not overlap. Needed, unless there is a "
+        "`domain.mesh`, which has physical surfaces of such names.",
+        "polygon = [[0, 0], [1, 0], [1, 1], [0, 1]]"),
+    Key(MATERIAL, "coefficient", EXPRESSION, "that of [data]", "κ there.", "coefficient = 50"),
+    Key(MATERIAL, "f", EXPRESSION, "that of [data]", "The load there.", "f = -2"),
+    Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there; a c that is not the same "
+        "everywhere has no certificate.", "reaction = 2"),
     Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "
         "are then computed, and f, g and dirichlet, where left out, are derived from it.",
         'u = "x**2 - y**2"'),
@@ -116,6 +127,9 @@ ABOUT = {
     PART: "Optional, one section for each part that has a name of its own; dirichlet, neumann and "
     "contact need none. With such sections there need be no dirichlet part where `reaction` or a "
     "`coefficient` holds the solution.",
+    MATERIAL: "Optional, one section for each material that has a name. Its cells, on the coarsest "
+    "mesh and when they are refined, have its data in the place of those in [data], which are for "
+    "cells without material, and for what is left out here.",
     "data": "What is left out is 0. An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",

@@ -14,6 +14,7 @@ from .problemfile import ProblemFile
 from .screen import WIDTH
 
 INDENT = 11
+_SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c"}
 LONGEST = 50
 """Characters of an expression; what is longer is cut."""
 
@@ -36,13 +37,23 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         left_out = f"{derived} of exact.u".strip() if derived and "exact.u" in said else "0"
         return _short(said.get(f"data.{key}", left_out))
 
-    kappa = "κ" if "data.coefficient" in said else ""
+    materials = {name: case.said[f"material.{name}"] for name in case.materials}
+    own_kappa = any("coefficient" in material for material in materials.values())
+    kappa = "κ" if "data.coefficient" in said or own_kappa else ""
     gain = f" + ({data('reaction')}) u" if "data.reaction" in said else ""
-    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {data('coefficient')}"
+    if not gain and any("reaction" in material for material in materials.values()):
+        gain = " + c u"
+    usual = _short(said.get("data.coefficient", 1))
+    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {usual}"
     rows = {
         "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}",
         "equation": equation if kappa else f"−Δu{gain} = {data('f', 'that')}",
     }
+    for name, material in materials.items():
+        tags = domain.materials
+        number = np.count_nonzero(tags.where(name)[: mesh.topology.index_map(tdim).size_local])
+        own = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
+        rows[name] = f"{', '.join(own) or 'no data of its own'}; {comm.allreduce(number)} cells"
     conditions = {
         "dirichlet": f"u = {data('dirichlet', 'that')}",
         "neumann": f"{kappa}∂ₙu = {data('g', 'that')}",

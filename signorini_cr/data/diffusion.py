@@ -39,7 +39,7 @@ class DiffusionOnMesh:
     def __init__(self, compiled: Compiled, domain: Domain):
         """Make the space; collective."""
         self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
-        self.forms.insist_on_mesh(domain.mesh)
+        self.forms.insist_on_data(domain)
         self.V = function_space(domain.mesh, self.forms.element)
 
     @cached_property

@@ -76,9 +76,8 @@ class Volume:
         """Values at the quadrature points of owned cells, shape (cells, q)."""
         assert self._values is not None
         which = np.arange(cells.number, dtype=np.int32)
-        return self._values.eval(cells.domain.mesh, which).reshape(
-            cells.number, len(self.rule.weights)
-        )
+        values = compat.bound(self._values, cells.domain.own)
+        return values.eval(cells.domain.mesh, which).reshape(cells.number, len(self.rule.weights))
 
     @cached_property
     def deviation(self) -> Deviation:
@@ -216,7 +215,7 @@ class Coefficient:
             hats = self.rule.hats
             x = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
             cells = None if boxes.cells is None else np.tile(boxes.cells, hats.shape[1])
-            there = values(self.deviation.expression, Boxes(x, x, cells=cells, mesh=boxes.mesh))
+            there = values(self.deviation.expression, Boxes(x, x, cells=cells, domain=boxes.domain))
             excess = np.fmin(excess, self._by_points(there.reshape(hats.shape[1], len(r)), r))
             return np.where(np.isnan(excess), np.inf, excess)
 
@@ -297,11 +296,11 @@ class Trace:
         """How far it is from polynomials."""
         return Deviation(self._expression)
 
-    def at(self, mesh: Mesh, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def at(self, domain: Domain, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values at the vertices, the midpoint and the quadrature points of facets.
 
         Args:
-            mesh: Where.
+            domain: Where.
             entities: Pairs (cell, facet's number in the cell), shape (n, 2).
 
         Returns:
@@ -311,7 +310,7 @@ class Trace:
         if self.constant is not None:
             count = len(self.weights)
             return tuple(np.full(s, self.constant) for s in ((k, n), n, (count, n)))  # type: ignore
-        values = np.ascontiguousarray(self._values.at(mesh, entities)[:, :, 0].T)
+        values = np.ascontiguousarray(self._values.at(domain.mesh, entities, domain.own)[:, :, 0].T)
         return values[:k], values[k], values[k + 1 :]
 
 
@@ -344,7 +343,7 @@ class OnFacets:
         """Evaluate a datum on a mesh; collective."""
         facets = domain.all_facets[condition.number]
         entities = facet_entities(domain.mesh, facets)
-        return cls(condition, trace, facets, entities, *trace.at(domain.mesh, entities), sign)
+        return cls(condition, trace, facets, entities, *trace.at(domain, entities), sign)
 
     @property
     def means(self) -> FloatArray:

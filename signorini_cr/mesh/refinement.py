@@ -1,6 +1,6 @@
 """Nested meshes: every triangle into four, or marked triangles only.
 
-Both keep the children of a cell on its rank and carry the boundary parts along.
+Both keep the children of a cell on its rank and carry boundary parts and materials along.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import cpp, la
-from dolfinx.mesh import CellType, Mesh, RefinementOption, meshtags
+from dolfinx.mesh import CellType, Mesh, MeshTags, RefinementOption, meshtags
 from dolfinx.mesh import refine as split
 
 from .. import compat
@@ -67,7 +67,7 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
         topology.create_connectivity(1, 2)
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
-    return Domain(fine, _child_tags(domain, fine, facets), parts=domain.parts), parent
+    return _child(domain, fine, _child_tags(domain, fine, facets), parent), parent
 
 
 def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, Int32Array]:
@@ -134,7 +134,13 @@ def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]
     facet = _table(fine.topology.connectivity(2, 1))[cell, j][value > 0]
     order = np.argsort(facet)
     tags = meshtags(fine, 1, facet[order], value[value > 0][order])
-    return Domain(fine, tags, parts=domain.parts), parent
+    return _child(domain, fine, tags, parent), parent
+
+
+def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
+    """The fine domain: its cells consist of what their parents do."""
+    materials = domain.materials.of_children(parent)
+    return Domain(fine, tags, parts=domain.parts, materials=materials, coarser=(domain, parent))
 
 
 def _count(index_map: Any) -> int:

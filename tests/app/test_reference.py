@@ -15,7 +15,7 @@ from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import _parser
 from signorini_cr.app.datacheck import USED_ON
 from signorini_cr.app.problemfile import load
-from signorini_cr.app.reference import ABOUT, KEYS, PART, TYPES
+from signorini_cr.app.reference import ABOUT, KEYS, MATERIAL, PART, TYPES
 
 BASE = {
     "domain": {
@@ -124,6 +124,8 @@ def test_examples_are_read(key, tmp_path: Path) -> None:
         kind = next((kind for kind, keys in TYPES.items() if key.name in keys), "")
         sections[PART]["type"] = f'type = "{kind}"'
         sections["domain"]["boundary"] = 'boundary = ["contact", "dirichlet", "NAME", "NAME"]'
+    if key.section == MATERIAL:
+        sections[MATERIAL]["polygon"] = "polygon = [[0, 0], [1, 0], [0, 1]]"
     sections[key.section][key.name] = key.example
     lines = [*sections.pop("").values()]
     for name, rows in sections.items():
@@ -150,8 +152,9 @@ def test_every_key_of_the_ready_files_is_in_the_table() -> None:
             if section in ("define", "quantities"):  # names of one's own
                 continue
             parts = {section: content}
-            if section == "boundary":
-                parts = {f"{PART} {name}": part for name, part in content.items()}
+            if section in ("boundary", "material"):
+                whole = {"boundary": PART, "material": MATERIAL}[section]
+                parts = {f"{whole} {name}": part for name, part in content.items()}
             for name, part in parts.items():
                 keys = part if isinstance(part, dict) else [name]
                 where = name.split()[0] if isinstance(part, dict) else ""
