@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from types import TracebackType
-from typing import Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 import ufl
@@ -35,6 +35,12 @@ from .solution import Solution
 from .vi.level import Level
 
 SCHEMES = ("euler", "bdf2")
+
+
+class Clock(Protocol):
+    """What has a time that can be set, as dolfinx's Constant."""
+
+    value: Any
 
 
 class Solver:
@@ -62,7 +68,7 @@ class Solver:
             raise InputError(f"levels is {levels}; it must be 1 or more")
         if levels > 1:
             check_refinable(domain.mesh)
-        physics = Diffusion(problem, domain.mesh, "CR", domain.parts)
+        physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
         physics.check(domain)
         hierarchy = Hierarchy(physics, domain)
         if like is None:
@@ -147,7 +153,7 @@ def solve_in_time(
     initial: Data = 0.0,
     capacity: float = 1.0,
     levels: int = 1,
-    time: fem.Constant | None = None,
+    time: Clock | None = None,
 ) -> Iterator[tuple[float, Solution]]:
     """Solve capacity ∂u/∂t − ∇·(κ∇u) + c u = f with contact, step by step; collective.
 

@@ -29,7 +29,7 @@ USED_ON: dict[str, int | None] = {
 
 def _used_on(key: str, domain: Domain) -> int | None:
     section, name, *_ = key.split(".", 2)
-    if section == "material":
+    if section in ("material", "time"):
         return None
     return domain.parts[name] if section == "boundary" else USED_ON[key]
 

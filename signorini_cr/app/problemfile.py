@@ -21,6 +21,7 @@ from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, on_root
+from ..evolution import solve_in_time
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
@@ -29,6 +30,7 @@ from ..mesh.polygon import check_loops, coordinates
 from ..solution import Solution
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
+from .formula import Clock, Node
 from .readers import (
     array,
     get,
@@ -43,7 +45,7 @@ from .readers import (
     string,
     whole,
 )
-from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
+from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SCHEMES, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -54,6 +56,27 @@ ENOUGH = 1000
 SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
 MOST_CELLS = 1e9
 """More than anyone means for the last mesh of a uniform sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Time:
+    """What [time] says.
+
+    Attributes:
+        end: The last time.
+        steps: How many steps there are.
+        scheme: "euler" or "bdf2".
+        initial: u at the time 0.
+        capacity: What multiplies ∂u/∂t.
+        clock: The time that expressions hold.
+    """
+
+    end: float
+    steps: int
+    scheme: str
+    initial: Any
+    capacity: float
+    clock: Clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +96,7 @@ class ProblemFile:
         adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
         quantities: The kind of each quantity that is asked for, "force" or "flux", and its part of
             the boundary, by name.
+        time: What [time] says; None for a problem without time.
         said: All that levels depend on, by key, as it was written.
     """
 
@@ -87,6 +111,7 @@ class ProblemFile:
     levels: int
     adaptive: Mapping[str, Any]
     quantities: Mapping[str, tuple[str, str]]
+    time: Time | None
     said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
@@ -126,6 +151,27 @@ class ProblemFile:
         check_data(forms, domain)
         return doubts(forms, domain)
 
+    def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:
+        """Solve step by step what has a [time]; collective.
+
+        Args:
+            domain: From :meth:`mesh`.
+            levels: Number of meshes; solved is on the last.
+        """
+        time = self.time
+        assert time is not None
+        return solve_in_time(
+            self.problem,
+            domain,
+            end=time.end,
+            steps=time.steps,
+            scheme=time.scheme,
+            initial=time.initial,
+            capacity=time.capacity,
+            levels=levels,
+            time=time.clock,
+        )
+
     def solutions(self, domain: Domain, **arguments: Any) -> Iterator[Solution]:
         """Solve on the meshes that the file asks for; collective.
 
@@ -163,7 +209,8 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     if "exact" in table and not table["exact"]:
         raise InputError("exact.u: this key is missing; an expression in x and y is needed")
     domain, size = _domain(sections["domain"], path.parent, tuple(parts), materials)
-    expressions = _expressions(sections, parts, materials)
+    clock = Clock() if "time" in table else None
+    expressions = _expressions(sections, parts, materials, clock)
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
     adaptive = {name: get(refine, "refine", name, *how) for name, how in ADAPTIVE.items()}
@@ -185,6 +232,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         adaptive=adaptive,
+        time=None if clock is None else _time(sections, expressions, mode, clock),
         quantities=_quantities(sections["quantities"], parts),
         said={
             f"{name}.{key}": value
@@ -368,10 +416,15 @@ def _expressions(
     sections: Mapping[str, Mapping[str, Any]],
     parts: Mapping[str, Mapping[str, Any]],
     materials: Mapping[str, Mapping[str, Any]],
+    clock: Clock | None,
 ) -> dict[str, Expression]:
-    """Read [define], [data], [boundary.NAME], [material.NAME] and [exact]."""
+    """Read [define], [data], [boundary.NAME], [material.NAME], [exact] and `initial` of [time]."""
     names: dict[str, Expression] = {}
     define = sections["define"]
+    if clock is not None:
+        if "t" in define:
+            raise InputError("define.t: t is the time, as there is a section [time]")
+        names["t"] = Expression("t", Node("clock", (clock,)))
     for name, value in define.items():
         named(f"define.{name}", check_name, name)
         later = [other for other in define if other not in names]
@@ -386,6 +439,8 @@ def _expressions(
         given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
     for material, table in materials.items():
         given |= {f"material.{material}.{key}": v for key, v in table.items() if key != "polygon"}
+    if "initial" in sections["time"]:
+        given["time.initial"] = sections["time"]["initial"]
     result = {}
     for key, value in given.items():
         expression = _expression(key, value, names, ())
@@ -393,6 +448,46 @@ def _expressions(
             raise InputError(f"{key}: a number is needed, but this is a condition")
         result[key] = expression
     return result
+
+
+def _time(
+    sections: Mapping[str, Mapping[str, Any]],
+    expressions: Mapping[str, Expression],
+    mode: str,
+    clock: Clock,
+) -> Time:
+    """[time], and what goes with it."""
+    table = sections["time"]
+    if mode != "uniform":
+        raise InputError('refine.mode: a problem in time needs "uniform": its meshes do not change')
+    if "exact.u" in expressions:
+        raise InputError("exact.u: a problem in time has none")
+    for key, expression in expressions.items():
+        fixed = key.endswith((".coefficient", ".reaction")) or key == "time.initial"
+        if fixed and expression.depends_on_time:
+            raise InputError(f"{key}: this must not depend on t")
+    initial = expressions.get("time.initial")
+    return Time(
+        end=get(table, "time", "end", positive, needed="a number above 0, the last time,"),
+        steps=get(table, "time", "steps", whole, needed="a whole number, of steps,"),
+        scheme=get(table, "time", "scheme", one_of(SCHEMES), "euler"),
+        initial=0.0 if initial is None else _data(initial),
+        capacity=get(table, "time", "capacity", _capacity, 1.0),
+        clock=clock,
+    )
+
+
+def _capacity(key: str, value: Any) -> float:
+    """A number above 0, which may be written as an expression."""
+    found = _expression(key, value, {}, ()).constant
+    if not isinstance(found, float) or found <= 0.0:
+        raise InputError(f"{key}: a number above 0 is needed, found {shown(value)}")
+    return found
+
+
+def _data(expression: Expression) -> Any:
+    """An expression as `Problem` takes it."""
+    return expression.ufl if expression.constant is None else expression.constant
 
 
 def _expression(
@@ -418,8 +513,7 @@ def _problem(
     def data(key: str, default: Any) -> Any:
         if key not in expressions:
             return default
-        expression = expressions[key]
-        return expression.ufl if expression.constant is None else expression.constant
+        return _data(expressions[key])
 
     conditions = {
         name: KINDS[part["type"]](

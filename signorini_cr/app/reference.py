@@ -45,6 +45,9 @@ TYPES = {
 }
 """The keys that go with each type of a part."""
 
+SCHEMES = ("euler", "bdf2")
+"""Ways to go from one time to the next."""
+
 QUANTITIES = {"force": "contact", "flux": "dirichlet"}
 """Kinds of quantities, and the type of the part that each is of."""
 
@@ -118,6 +121,14 @@ KEYS = (
     Key("refine", "fraction", "a number above 0, at most 1", "0.5", "Adaptive: the part of the "
         "squared bound that the cells to be refined hold. Less takes more meshes, and fewer cells "
         "for the same bound.", "fraction = 0.3", (part, 0.5)),
+    Key("time", "end", "a number above 0", "", "The last time; the first is 0. Needed.",
+        "end = 36000"),
+    Key("time", "steps", "a whole number above 0", "", "Steps of equal length. Needed.",
+        "steps = 60"),
+    Key("time", "scheme", '"euler" or "bdf2"', '"euler"', "Implicit Euler, of first order; or the "
+        "backward difference of second order.", 'scheme = "bdf2"'),
+    Key("time", "initial", EXPRESSION, "0", "u at the time 0.", 'initial = "8 - 2*y"'),
+    Key("time", "capacity", "a number above 0", "1", "What multiplies ∂u/∂t.", "capacity = 2e6"),
 )  # fmt: skip
 
 ABOUT = {
@@ -133,6 +144,9 @@ ABOUT = {
     "data": "What is left out is 0. An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",
+    "time": "Optional: capacity ∂u/∂t − ∇·(κ∇u) + c u = f, step by step. `t` may then stand in "
+    "every expression but those of κ, c and the coefficients of parts. The bound of a step is that "
+    "of its own problem, in which the steps before are data.",
     "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
     "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
     "through a dirichlet part. The part must not touch other dirichlet or contact parts.",

@@ -69,6 +69,10 @@ def statement(case: ProblemFile, domain: Domain) -> str:
             total = comm.allreduce(float(measures.sum()))
             what = "length" if gdim == 2 else "area"
             rows[name] = f"{condition}; {number} facets, {what} {total:.6g}"
+    if case.time is not None:
+        words = f"t from 0 to {case.time.end:g} in {case.time.steps} steps of {case.time.scheme}"
+        start = f"u = {_short(said.get('time.initial', 0))} at t = 0"
+        rows["time"] = f"{words}; {case.time.capacity:g} ∂u/∂t on the left; {start}"
     if "exact.u" in said:
         rows["exact.u"] = _short(said["exact.u"])
     helpers = [key.removeprefix("define.") for key in said if key.startswith("define.")]

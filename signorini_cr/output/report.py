@@ -51,6 +51,8 @@ FILES = (
     "contact.png",
     "convergence.png",
     "report.html",
+    "times.csv",
+    "series.pvd",
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 
@@ -226,6 +228,7 @@ def write_output(
     solution: Solution,
     pictures: bool = True,
     resumable: bool = False,
+    steps: bool = False,
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
 
@@ -238,6 +241,7 @@ def write_output(
         pictures: Whether to draw. There are none of three-dimensional domains, and none where
             Matplotlib is not installed.
         resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
+        steps: Whether what `series.write_step` has left is of this one.
 
     Returns:
         The names of the files written.
@@ -258,7 +262,8 @@ def write_output(
             writers["convergence.png"] = lambda path: plots.drawn(
                 comm, lambda: plots.plot_convergence(records, path, title)
             )
-    removed = set(FILES) - ({checkpoint.NAME} if resumable else set())
+    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if steps else set()
+    removed = set(FILES) - kept
     write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)
 
