@@ -191,8 +191,8 @@ def solve_in_time(
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")
     c = number(as_expression(problem.reaction, ufl.SpatialCoordinate(domain.mesh)))
-    if c is None:
-        raise InputError("problems in time need a reaction that is a number")
+    if c is None or any(each.reaction is not None for each in problem.materials.values()):
+        raise InputError("problems in time need a reaction that is a number, the same everywhere")
     rate, own = capacity * steps / end, 1.0
     solver: Solver | None = None
     last: Solution | None = None

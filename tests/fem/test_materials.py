@@ -15,6 +15,7 @@ from signorini_cr import (
     norms,
     solve,
     solve_adaptive,
+    solve_in_time,
     solve_levels,
 )
 
@@ -170,6 +171,30 @@ def test_expressions_of_materials():
     bounds = np.array([solution.certificate.bound_h1 for solution in solutions])
     assert np.all(bounds >= h1)
     assert bounds[-1] <= 1.5 * h1[-1]
+
+
+def test_materials_in_time():
+    """Step by step the same as with functions of x that jump at the lines."""
+    domain = layers()
+
+    def jump(low, high):
+        return lambda x: ufl.conditional(ufl.gt(x[1], 0.5), high, low)
+
+    common = {"obstacle": -0.02, "reaction": 1.0}
+    rock = {"rock": Material(coefficient=50.0, f=-3.0)}
+    given = (
+        Problem(f=-1.0, materials=rock, **common),
+        Problem(f=jump(-1.0, -3.0), coefficient=jump(1.0, 50.0), **common),
+    )
+    both = [solve_in_time(each, domain, end=0.1, steps=3, levels=2) for each in given]
+    for (time, one), (_, other) in zip(*both, strict=True):
+        assert time > 0.0
+        assert one.energy == pytest.approx(other.energy, rel=1e-8)
+        bounds = [solution.certificate.bound_h1 for solution in (one, other)]
+        assert bounds[0] == pytest.approx(bounds[1], rel=1e-4)
+    of_rock = Problem(materials={"rock": Material(reaction=2.0)}, **common)
+    with pytest.raises(InputError, match="the same everywhere"):
+        next(solve_in_time(of_rock, domain, end=0.1, steps=3))
 
 
 def test_a_reaction_of_materials_has_no_certificate():
