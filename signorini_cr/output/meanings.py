@@ -126,12 +126,28 @@ FACET = {
 }
 """The columns of contact.csv."""
 
+STEP = {
+    "step": "From 1.",
+    "time": "t at its end.",
+    "newton_iterations": LEVEL["newton_iterations"],
+    "linear_iterations": LEVEL["linear_iterations"],
+    "active": LEVEL["contact.active"],
+    "length": LEVEL["contact.length"],
+    "force": LEVEL["contact.force"],
+    "energy": "J(u_h) of the step's own problem, in which the steps before are data.",
+    "bound_h1": "Of that problem: ‖∇_h(u − u_h)‖ is not above it.",
+    "bound_energy_norm": "The same of the energy norm.",
+    "seconds": "Wall time, bounds included.",
+}
+"""The columns of times.csv."""
+
 SECTIONS = {
     "Columns of the printed table and of levels.md": {
         name: meaning for name, (_, meaning) in PRINTED.items()
     },
     "Keys of report.json": REPORT,
     "Keys of a level in report.json; columns of levels.csv, with _ in the place of the dot": LEVEL,
+    "Columns of times.csv, a line a step, and keys of times in report.json, for [time]": STEP,
     "Columns of contact.csv, a line a facet in order along the boundary": FACET,
 }
 """Everything, under the heads that help and reference give it."""

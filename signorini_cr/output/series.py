@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 TABLE, SERIES, FIELDS = "times.csv", "series.pvd", "step_*.vtu"
 WIDTHS = {
-    "step": 5, "time": 11, "newton": 6, "cg": 4, "active": 7, "contact": 9, "force": 12,
+    "step": 5, "time": 10, "newton": 6, "cg": 4, "active": 6, "contact": 8, "force": 12,
     "energy": 12, "bound": 9,
 }  # fmt: skip
 """The columns of the printed table."""

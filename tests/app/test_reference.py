@@ -120,6 +120,8 @@ def test_examples_are_read(key, tmp_path: Path) -> None:
         sections["domain"] = {}
     if key.section == "refine":
         sections["refine"]["mode"] = 'mode = "adaptive"'
+    if key.section == "time":
+        sections["time"] = {"end": "end = 1", "steps": "steps = 2"}
     if key.section == PART:
         kind = next((kind for kind, keys in TYPES.items() if key.name in keys), "")
         sections[PART]["type"] = f'type = "{kind}"'
