@@ -10,12 +10,14 @@ from signorini_cr import (
     Contact,
     Dirichlet,
     InputError,
+    Material,
     Neumann,
     Polygon,
     Problem,
     Robin,
     families,
     solve,
+    solve_adaptive,
     solve_levels,
 )
 
@@ -218,3 +220,36 @@ def test_exact_solutions_that_pull_at_the_upper_bound():
     problem = Problem(exact=lambda x: -x[1], conditions={"floor": Contact(upper=0.0), **rest})
     (said,) = doubts(Forms(problem, where.mesh, parts=where.parts), where)
     assert "the pressure on the obstacle is -1, below 0" in said
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_ranks_make_no_difference(adaptive):
+    """Reaction, losses of heat, bounds on both sides, a material: by one rank and by all."""
+    inner = np.array([[-0.5, 0.3], [0.5, 0.3], [0.5, 0.6], [-0.5, 0.6]])
+    whole = Polygon(RECTANGLE, EDGES, names=EDGES, materials={"steel": inner})
+    problem = Problem(
+        f=between,
+        reaction=1.5,
+        materials={"steel": Material(coefficient=300.0)},
+        conditions={
+            "floor": Contact(-0.1, upper=0.15, coefficient=2.0, external=-0.3),
+            "right": Contact(upper=0.2, g=0.1),
+            "top": Robin(coefficient=4.0, external=0.1),
+            "left": Dirichlet(lambda x: 0.05 * x[1]),
+        },
+    )
+    found = []
+    for comm in (MPI.COMM_SELF, WORLD):
+        meshes = whole.mesh(0.4, comm)
+        solutions = (
+            solve_adaptive(problem, meshes, levels=4)
+            if adaptive
+            else solve_levels(problem, meshes, 3)
+        )
+        for solution in solutions:
+            contact, certificate = solution.contact, solution.certificate
+        found.append([solution.dofs, solution.energy, contact.force, contact.length])
+        found[-1] += [contact.number_active, certificate.bound_h1, *certificate.energy]
+        found[-1] += np.sort(contact.transitions[:, :2].ravel()).tolist()
+    assert found[1] == pytest.approx(found[0], rel=1e-7, abs=1e-9)
