@@ -9,12 +9,24 @@ import petsc4py
 
 petsc4py.init(["benchmark", "-options_left", "no"])  # the command line is not PETSc's
 
+import numpy as np  # noqa: E402
 import ufl  # noqa: E402
 from harness import command_line, keep_memory, tabulate  # noqa: E402
 from mpi4py import MPI  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
 
-from signorini_cr import Polygon, Problem, exact, solve_levels  # noqa: E402
+from signorini_cr import (  # noqa: E402
+    Contact,
+    Dirichlet,
+    Material,
+    Neumann,
+    Polygon,
+    Problem,
+    Robin,
+    exact,
+    families,
+    solve_levels,
+)
 from signorini_cr.fem.space import ghosted_vector  # noqa: E402
 from signorini_cr.mesh.domain import Domain  # noqa: E402
 from signorini_cr.solution import Solution  # noqa: E402
@@ -44,6 +56,49 @@ PUSHED = Problem(
 )
 
 
+EDGES = ("floor", "right", "top", "left")
+
+
+BURIED = Polygon(
+    [[-1, 0], [1, 0], [1, 1], [-1, 1]],
+    ["contact", "neumann", "dirichlet", "neumann"],
+    materials={
+        "layer": [[-2, 0.3], [2, 0.5], [2, 0.7], [-2, 0.5]],
+        "block": [[-0.7, 0], [-0.2, 0], [-0.3, 0.25], [-0.6, 0.2]],
+        "pipe": [[0.5, 0.2], [0.6, 0.1], [0.7, 0.2], [0.6, 0.3]],
+    },
+)
+LAYERED = Problem(
+    f=lambda x: 40 * ufl.sin(np.pi * x[0]) + 2,
+    obstacle=-0.1,
+    materials={
+        "layer": Material(coefficient=0.01),
+        "block": Material(coefficient=100.0),
+        "pipe": Material(coefficient=0.01, f=-5.0),
+    },
+)
+
+
+def _with_terms() -> dict[str, Problem]:
+    """Problems on (−1, 1) × (0, 1) with more than the model problem has."""
+    top, waves = Dirichlet(0.0), lambda x: 40 * ufl.sin(np.pi * x[0]) + 2
+    walls = {"right": Neumann(), "left": Neumann(), "top": top}
+    lossy = Robin(coefficient=10.0, external=-1.0)
+    return {
+        "reaction": Problem(waves, reaction=100.0, conditions=walls | {"floor": Contact(-0.1)}),
+        "Robin": Problem(
+            waves,
+            conditions={
+                "floor": Contact(-0.1, coefficient=20.0, external=-1.0),
+                "right": lossy,
+                "top": lossy,
+                "left": lossy,
+            },
+        ),
+        "both sides": Problem(waves, conditions=walls | {"floor": Contact(-0.1, upper=0.15)}),
+    }
+
+
 def cases() -> dict[str, tuple[Problem, Coarsest]]:
     """Problems and what makes their coarsest meshes, by name."""
     result: dict[str, tuple[Problem, Coarsest]] = {}
@@ -55,6 +110,10 @@ def cases() -> dict[str, tuple[Problem, Coarsest]]:
                     COARSEST, comm, shift=shift
                 ),
             )
+    rectangle = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], EDGES, names=EDGES)
+    for name, problem in _with_terms().items():
+        result[name] = problem, lambda: families.structured(rectangle, COARSEST, comm)
+    result["materials"] = (LAYERED, lambda: BURIED.mesh(SIZE, comm))
     result["polygon"] = (PUSHED, lambda: CROOKED.mesh(SIZE, comm))
     return result
 

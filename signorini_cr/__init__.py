@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from .adaptive import solve_adaptive
     from .errors import InputError, NotConverged
     from .estimate.certificate import Certificate
+    from .evolution import Solver, solve_in_time
     from .fem.conditions import Contact, Dirichlet, Neumann, Robin
-    from .fem.problem import Problem
+    from .fem.problem import Material, Problem
     from .levels import solve, solve_levels
     from .mesh.domain import Domain, Polygon, read_gmsh
     from .solution import Solution
@@ -45,8 +46,11 @@ _ROOMS = {
     "solve": "levels",
     "solve_levels": "levels",
     "solve_adaptive": "adaptive",
+    "solve_in_time": "evolution",
+    "Solver": "evolution",
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
+    "Material": "fem.problem",
     "Dirichlet": "fem.conditions",
     "Neumann": "fem.conditions",
     "Robin": "fem.conditions",
@@ -67,6 +71,7 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Polygon",
     "read_gmsh",
     "Problem",
+    "Material",
     "Dirichlet",
     "Neumann",
     "Robin",
@@ -74,6 +79,8 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "solve",
     "solve_levels",
     "solve_adaptive",
+    "solve_in_time",
+    "Solver",
     "Solution",
     "Certificate",
     "InputError",

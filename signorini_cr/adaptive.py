@@ -42,7 +42,7 @@ def solve_adaptive(
     """Solve on meshes that are refined where the error is; each starts from the one below.
 
     Args:
-        problem: The data; they must not hold a Function, which lives on one mesh only.
+        problem: The data; a Function in them must be of degree 0, on the coarsest mesh.
         domain: The coarsest mesh and its boundary parts.
         tolerance: The end: a certified bound of the broken error (1.6) not above it.
         levels: The end: so many meshes, the coarsest included; None for any number.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import basix
+import cffi
 import numpy as np
 import ufl
 from dolfinx import cpp, fem
@@ -167,6 +170,31 @@ def compile_expression(expression: Any, points: FloatArray, mesh: Mesh) -> fem.E
     return compiled(mesh.comm, fem.Expression, expression + nothing, points, mesh.comm)
 
 
+def bound(expression: fem.Expression, own: Callable[[Any], Any]) -> fem.Expression:
+    """A compiled expression with other functions in it, of the same element.
+
+    Args:
+        expression: From `compile_expression`.
+        own: The function to take in the place of one in the expression.
+    """
+    data = expression.ufl_expression
+    functions = ufl.algorithms.extract_coefficients(data)
+    if all(own(function) is function for function in functions):
+        return expression
+    code = expression.ufcx_expression
+    where = code.original_coefficient_positions
+    values = [own(functions[where[i]])._cpp_object for i in range(code.num_coefficients)]
+    constants = [c._cpp_object for c in ufl.algorithms.analysis.extract_constants(data)]
+    ffi = cffi.FFI()
+    address = int(ffi.cast("uintptr_t", ffi.addressof(code)))
+    made = copy(expression)
+    try:
+        made._cpp_object = cpp.fem.create_expression_float64(address, values, constants, None)
+    except TypeError:  # since 0.10 there are maps between meshes, too
+        made._cpp_object = cpp.fem.create_expression_float64(address, values, constants, [], None)
+    return made
+
+
 class FacetExpression:
     """A UFL expression at points of the reference facet.
 
@@ -188,23 +216,26 @@ class FacetExpression:
         self._hats = np.column_stack([1.0 - points.sum(axis=1), points])
         self._corners = np.array(basix.topology(mesh.basix_cell())[-2])
 
-    def at(self, mesh: Mesh, entities: Int32Array) -> FloatArray:
+    def at(
+        self, mesh: Mesh, entities: Int32Array, own: Callable[[Any], Any] = lambda given: given
+    ) -> FloatArray:
         """Evaluate on boundary facets of a mesh of the same kind.
 
         Args:
             mesh: Where.
             entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+            own: The mesh's function in the place of one in the expression.
 
         Returns:
             Shape (n, q, components).
         """
         if not len(entities):
             return np.zeros((0, len(self._hats), self._values.value_size))
-        shape = (len(entities), *self._shape)
+        shape, expression = (len(entities), *self._shape), bound(self._values, own)
         try:
-            values = self._values.eval(mesh, entities).reshape(shape)
+            values = expression.eval(mesh, entities).reshape(shape)
         except (AssertionError, TypeError):  # 0.9 wants them flattened, and turns nothing
-            return self._values.eval(mesh, entities.ravel()).reshape(shape)
+            return expression.eval(mesh, entities.ravel()).reshape(shape)
         cells, local = entities.T
         nodes = np.take_along_axis(cell_nodes(mesh)[cells], self._corners[local], axis=1)
         wanted = self._hats @ mesh.geometry.x[nodes, : mesh.geometry.dim]

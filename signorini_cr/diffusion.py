@@ -23,8 +23,8 @@ class Diffusion(Forms):
 
     @property
     def galerkin(self) -> bool:
-        """Whether quadrature sees the same on all meshes: κ is a number, and nothing is added."""
-        return self.uniform and self.of_one is None
+        """Whether quadrature sees the same on all meshes: κ jumps between cells, if at all."""
+        return self.steady and self.of_one is None
 
     def check(self, domain: Domain) -> None:
         """Refuse data for which there is no solution; collective."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from dolfinx import fem
@@ -16,6 +17,7 @@ from .limits import Limits
 from .mesh.balance import Refined
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
+from .multigrid.cycle import Multigrid
 from .multigrid.hierarchy import Hierarchy
 from .restart import Restart
 from .solution import Solution
@@ -23,6 +25,7 @@ from .vi.contact import contact_facts
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
 from .vi.solver import solve_vi
+from .vi.system import System
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
 """Called with level, step, residual norm, active dofs and linear iterations so far, which are the
@@ -68,7 +71,7 @@ def solve_levels(
     """Solve on a mesh and its uniform refinements, each starting from the one below.
 
     Args:
-        problem: The data; they must not hold a Function, which lives on one mesh only.
+        problem: The data; a Function in them must be of degree 0, on the coarsest mesh.
         domain: The coarsest mesh and its boundary parts.
         levels: Number of meshes, the coarsest included.
         element: "CR" or "P1".
@@ -128,7 +131,7 @@ def solve_sequence(
         The solutions, coarsest first.
     """
     yield from solve_physics(
-        Diffusion(problem, domain.mesh, element, domain.parts),
+        Diffusion(problem, domain.mesh, element, domain.parts, domain.materials),
         domain,
         step,
         monitor,
@@ -148,16 +151,20 @@ def solve_physics(
     """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`."""
     physics.check(domain)
     hierarchy, seconds = Hierarchy(physics, domain), {"mesh": domain.seconds}
-    level, start, before = Level(hierarchy.meshes), _Start(), None
+    level, start, before = Level(hierarchy.meshes), Start(), None
+
+    def lend(system: System) -> AbstractContextManager[Multigrid]:
+        return hierarchy.multigrid(system.operator, system.owned_dirichlet)
+
     if restart is not None:
         for refined in restart.meshes(domain):
             level.tidy()
             hierarchy.add(*refined)
             level = Level(hierarchy.meshes, held=level.loose is None)
-        start = _Start(known=restart.function(level.V, 0))
+        start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:
-        solution = _solve(level, hierarchy, start, monitor, seconds)
+        solution = solve_level(level, lend, start, monitor, seconds)
         yield solution
         began = time.perf_counter()
         following = step(solution)
@@ -166,14 +173,14 @@ def solve_physics(
         level.tidy()
         hierarchy.add(*following)
         level = Level(hierarchy.meshes, held=level.loose is None)
-        start = _Start()
+        start = Start()
         if nested:
-            start, before = _Start(solution, before), solution.u
+            start, before = Start(solution, before), solution.u
         seconds = {"mesh": time.perf_counter() - began}
     hierarchy.free()
 
 
-class _Start(NamedTuple):
+class Start(NamedTuple):
     """What a solve starts from: zero, unless there is something here.
 
     Attributes:
@@ -187,10 +194,10 @@ class _Start(NamedTuple):
     known: fem.Function | None = None
 
 
-def _solve(
+def solve_level(
     level: Level,
-    hierarchy: Hierarchy,
-    start: _Start,
+    lend: Callable[[System], AbstractContextManager[Multigrid]],
+    start: Start,
     monitor: LevelMonitor | None,
     seconds: dict[str, float],
 ) -> Solution:
@@ -198,7 +205,7 @@ def _solve(
 
     Args:
         level: That mesh.
-        hierarchy: All meshes.
+        lend: Lends the cycle for a system.
         start: What to start from.
         monitor: Called after each step of the solver.
         seconds: Wall time of the phases so far; others are added.
@@ -218,7 +225,7 @@ def _solve(
     told = None if monitor is None else lambda *facts: monitor(level.number, *facts)
     try:
         with (
-            hierarchy.multigrid(system.operator, system.owned_dirichlet) as cycle,
+            lend(system) as cycle,
             system.vectors(u, residual) as vectors,
         ):
             iterations = solve_vi(

@@ -137,8 +137,9 @@ class Solution:
             By name: `u`, from `u_dg`; `indicator`, constant on each cell, the square root of its
             share in `Certificate.indicators`; `companion`, continuous and of degree 1 to 3, from
             `Certificate.companion`; on a mesh of Γ1's facets, and constant on each, `pressure`
-            λ_h, `contact`, 1 where there is contact and 0 elsewhere, and `obstacle`, the bound
-            of u_h there. What a certificate without a bound lacks is left out.
+            λ_h, `contact`, 1 where there is contact and 0 elsewhere, and `obstacle` and
+            `upper`, the bounds of u_h there, NaN for none. What a certificate without a bound
+            lacks is left out.
         """
         mesh, contact, certificate = self.domain.mesh, self.contact, self.certificate
         found = {"u": self.u_dg()}
@@ -151,6 +152,6 @@ class Solution:
         columns = {
             "pressure": contact.pressure,
             "contact": contact.active,
-            "obstacle": contact.obstacle,
+            **contact.bounds,
         }
         return found | fields.on_facets(mesh, contact.facets, columns)

@@ -217,6 +217,9 @@ def _solve_levels(
     case, domain = _read(args, screen, comm)
     problem = statement(case, domain)
     screen.line(f"{problem}\n")
+    if case.time is not None:
+        _solve_steps(args, screen, comm, folder, case, domain)
+        return
     element = args.element.upper()
     said = _said(args, case, comm)
     restart = _resumed(folder, said, records, comm) if args.resume else None
@@ -230,7 +233,8 @@ def _solve_levels(
                 finest = solution
                 continue
             _ = solution.errors, solution.certificate  # the report reads what is there
-            record = output.level_record(solution, records[-1] if records else None)
+            before = records[-1] if records else None
+            record = output.level_record(solution, before, case.quantities)
             report = output.make_report(case.title, element, comm, [*records, record], False)
             with _named("--out"):
                 restart = Restart.of(solution, restart, case.mode == "adaptive")
@@ -245,10 +249,8 @@ def _solve_levels(
         failure = error
     failure = failure or _above_tolerance(case, records)
     if finest is not None:
-        screen.progress("bounds of the contact force")
-        force = output.force_record(finest)
         screen.progress("writing")
-        report = output.make_report(case.title, element, comm, records, failure is None, force)
+        report = output.make_report(case.title, element, comm, records, failure is None)
         with _named("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
             if args.html:
@@ -257,11 +259,66 @@ def _solve_levels(
         screen.text(legend(records[0]))
         screen.line("")
         screen.text(_facts(records[-1]))
-        screen.text(certified(records[-1], force))
+        screen.text(certified(records[-1]))
         screen.text(times(records))
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
         raise NotConverged(_stopped(failure, records, folder))
+
+
+def _solve_steps(
+    args: argparse.Namespace,
+    screen: Screen,
+    comm: Any,
+    folder: Path,
+    case: ProblemFile,
+    domain: Domain,
+) -> None:
+    """Solve a problem in time; each step is safe in the folder before the next begins."""
+    from ..errors import InputError, NotConverged
+    from ..output import report as output
+    from ..output import series
+    from ..output.tables import certified
+
+    for name, given in {
+        "--resume": args.resume,
+        "--max-time": args.max_time,
+        "--html": args.html,
+    }.items():
+        if given:
+            raise InputError(f"{name}: problems in time have no such option")
+    if args.element.upper() != "CR":
+        raise InputError("--element: problems in time are solved with cr")
+    records: list[dict[str, Any]] = []
+    failure: NotConverged | None = None
+    solution: Solution | None = None
+    screen.progress("step 1")
+    try:
+        for time, solution in case.steps(domain, case.levels):
+            record = series.step_record(len(records) + 1, time, solution)
+            records.append(record)
+            with _named("--out"):
+                series.write_step(folder, records, solution)
+            if len(records) == 1:
+                screen.line(series.header())
+            screen.line(series.row(record))
+    except NotConverged as error:
+        failure = NotConverged(f"time step {len(records) + 1}: {error}")
+    if solution is not None:
+        screen.progress("writing")
+        last = output.level_record(solution, None, case.quantities)
+        report = output.make_report(case.title, "CR", comm, [last], failure is None)
+        report["times"] = records
+        with _named("--out"):
+            names = output.write_output(folder, report, solution, steps=True)
+        screen.line("")
+        screen.text(_facts(last))
+        screen.text(f"the last step's own problem, {certified(last)}")
+        screen.text(
+            f"written to {folder}: {', '.join(names)}, times.csv, series.pvd and its fields"
+        )
+    if failure is not None:
+        raise failure
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:

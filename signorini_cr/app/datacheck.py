@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import InputError
 from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from .expressions import Expression
@@ -24,12 +24,31 @@ USED_ON: dict[str, int | None] = {
     "exact.u": None,
 }
 """Where each expression is used: a part of the boundary, or None for the whole domain; those of
-[boundary.NAME] are used there."""
+[boundary.NAME] and [material.NAME] are used there."""
 
 
 def _used_on(key: str, domain: Domain) -> int | None:
     section, name, *_ = key.split(".", 2)
+    if section in ("material", "time"):
+        return None
     return domain.parts[name] if section == "boundary" else USED_ON[key]
+
+
+def _used_in(key: str, expressions: Collection[str], domain: Domain) -> BoolArray:
+    """The local cells in which a datum that is used on no part of the boundary is used."""
+    section, name, *_ = key.split(".", 2)
+    tdim, materials = domain.mesh.topology.dim, domain.materials
+    used = np.ones(domain.mesh.topology.index_map(tdim).size_local, dtype=bool)
+    if section == "material":
+        return materials.where(name)[: len(used)]
+    for material in materials.numbers:
+        if section == "data" and f"material.{material}.{name}" in expressions:
+            used &= ~materials.where(material)[: len(used)]
+    return used
+
+
+def _is_kappa(key: str) -> bool:
+    return key.endswith(".coefficient") and not key.startswith("boundary.")
 
 
 def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
@@ -48,10 +67,12 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     digits = 11 - math.ceil(math.log10(size))
     bad: tuple[Any, ...] = (math.inf,)
     for number, (key, expression) in enumerate(expressions.items()):
-        points = _points(domain, _used_on(key, domain), digits)
+        part = _used_on(key, domain)
+        which = _used_in(key, expressions, domain) if part is None else domain.facets(part)
+        points = _points(domain, domain.mesh.topology.dim - (part is not None), which, digits)
         values = expression.numpy(points)
         wrong = ~np.isfinite(values)
-        if key == "data.coefficient":
+        if _is_kappa(key):
             wrong |= values <= 0
         elif key.endswith((".reaction", ".coefficient")):
             wrong |= values < 0
@@ -66,8 +87,9 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     key = list(expressions)[bad[0]]
     message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
-        what = "above 0" if key == "data.coefficient" else "0 or more"
-        raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} everywhere")
+        what = "above 0" if _is_kappa(key) else "0 or more"
+        there = "there" if key.startswith("material.") else "everywhere"
+        raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} {there}")
     part, named = _used_on(key, domain), {value: name for name, value in domain.parts.items()}
     where = "in the domain" if part is None else f"on the {named[part]} part"
     raise InputError(
@@ -76,30 +98,19 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     )
 
 
-def _points(domain: Domain, part: int | None, digits: int) -> FloatArray:
-    """Vertices and midpoints of the cells, or of the facets of one part, shape (n, 3).
+def _points(domain: Domain, dim: int, which: BoolArray | Int32Array, digits: int) -> FloatArray:
+    """Vertices and midpoints of some cells or facets, shape (n, 3).
 
     Rounded to so many digits after the point, because a mesh generator gets so many right: at
     1e-13 instead of 0, 1/x is finite and sqrt(-x) is not.
     """
     mesh = domain.mesh
-    tdim = mesh.topology.dim
-    if part is None:
-        cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
-        points = np.vstack([mesh.geometry.x, compute_midpoints(mesh, tdim, cells)])
-    else:
-        facets = domain.facets(part)
-        vertices = mesh.geometry.x[_vertices(domain, facets)]
-        points = np.vstack([vertices, compute_midpoints(mesh, tdim - 1, facets)])
+    entities = (np.flatnonzero(which) if which.dtype == bool else which).astype(np.int32)
+    if not len(entities):
+        return np.empty((0, 3))
+    nodes = np.unique(entities_to_geometry(mesh, dim, entities))
+    points = np.vstack([mesh.geometry.x[nodes], compute_midpoints(mesh, dim, entities)])
     return np.round(points, digits) + 0.0
-
-
-def _vertices(domain: Domain, facets: Int32Array) -> Int32Array:
-    """Geometry nodes of the facets' vertices, each once."""
-    mesh = domain.mesh
-    if len(facets) == 0:
-        return np.empty(0, dtype=np.int32)
-    return np.unique(entities_to_geometry(mesh, mesh.topology.dim - 1, facets))
 
 
 def _point(x: Collection[float]) -> str:

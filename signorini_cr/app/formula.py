@@ -31,6 +31,37 @@ class Node:
     condition: bool = False
 
 
+class Clock:
+    """The time t, one number for all the expressions of a file."""
+
+    def __init__(self) -> None:
+        """Begin at 0."""
+        self._value = 0.0
+        self._constants: dict[Any, Any] = {}
+
+    @property
+    def value(self) -> float:
+        """The time, which can be set; forms that hold `on` follow."""
+        return self._value
+
+    @value.setter
+    def value(self, value: float) -> None:
+        self._value = value
+        for constant in self._constants.values():
+            constant.value = value
+
+    def on(self, x: Any) -> Any:
+        """A number where x is an array of points, a Constant where it is a coordinate in UFL."""
+        if isinstance(x, np.ndarray):
+            return self._value
+        from dolfinx import fem  # problem files are read without it
+
+        domain = ufl.domain.extract_unique_domain(x)
+        if domain not in self._constants:
+            self._constants[domain] = fem.Constant(domain, self._value)
+        return self._constants[domain]
+
+
 def _power(base: Any, exponent: Any) -> Any:
     """``base**exponent`` in UFL, with small whole exponents as integers."""
     if isinstance(exponent, float) and exponent.is_integer() and abs(exponent) <= 64:
@@ -116,6 +147,11 @@ class Expression:
         """The value where it is the same at every point, else None."""
         return self.root.args[0] if self.root.op == "const" else None
 
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether the time is in it."""
+        return any(node.op == "clock" for node in self._order)
+
     @cached_property
     def _order(self) -> tuple[Node, ...]:
         """All operations, each after those it needs."""
@@ -151,6 +187,8 @@ class Expression:
         for node in self._order:
             if node.op == "const":
                 values[id(node)] = node.args[0]
+            elif node.op == "clock":
+                values[id(node)] = node.args[0].on(x)
             elif node.op == "variable":
                 values[id(node)] = x[node.args[0]]
             else:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,20 @@ import numpy as np
 from mpi4py import MPI
 
 from ..adaptive import solve_adaptive
+from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, on_root
+from ..evolution import solve_in_time
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
-from ..fem.problem import Forms, Problem
+from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
+from ..mesh.polygon import check_loops, coordinates
 from ..solution import Solution
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
+from .formula import Clock, Node
 from .readers import (
     array,
     get,
@@ -41,7 +45,7 @@ from .readers import (
     string,
     whole,
 )
-from .reference import ADAPTIVE, PART, SECTIONS, TYPES, allowed
+from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SCHEMES, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -49,8 +53,30 @@ ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
+SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
 MOST_CELLS = 1e9
 """More than anyone means for the last mesh of a uniform sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Time:
+    """What [time] says.
+
+    Attributes:
+        end: The last time.
+        steps: How many steps there are.
+        scheme: "euler" or "bdf2".
+        initial: u at the time 0.
+        capacity: What multiplies ∂u/∂t.
+        clock: The time that expressions hold.
+    """
+
+    end: float
+    steps: int
+    scheme: str
+    initial: Any
+    capacity: float
+    clock: Clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +88,15 @@ class ProblemFile:
         domain: A polygon, or the path of a gmsh file.
         size: Facet length wanted on the coarsest mesh of a polygon.
         parts: The parts of the boundary that have sections.
+        materials: The materials.
         problem: The data as functions of x, which give UFL.
         expressions: The data that were written in the file, by key (``data.f`` …).
         mode: "uniform" or "adaptive".
         levels: Number of meshes, the coarsest included.
         adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
+        quantities: The kind of each quantity that is asked for, "force" or "flux", and its part of
+            the boundary, by name.
+        time: What [time] says; None for a problem without time.
         said: All that levels depend on, by key, as it was written.
     """
 
@@ -74,11 +104,14 @@ class ProblemFile:
     domain: Polygon | Path
     size: float | None
     parts: tuple[str, ...]
+    materials: tuple[str, ...]
     problem: Problem
     expressions: Mapping[str, Expression]
     mode: str
     levels: int
     adaptive: Mapping[str, Any]
+    quantities: Mapping[str, tuple[str, str]]
+    time: Time | None
     said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
@@ -86,7 +119,7 @@ class ProblemFile:
         key = "domain.mesh" if isinstance(self.domain, Path) else "domain"
         try:
             if isinstance(self.domain, Path):
-                return read_gmsh(self.domain, comm, self.parts)
+                return read_gmsh(self.domain, comm, self.parts, self.materials)
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
         except InputError as error:
@@ -111,12 +144,33 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
-        forms = Forms(self.problem, domain.mesh, parts=domain.parts)
+        forms = Forms(self.problem, domain.mesh, parts=domain.parts, materials=domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
         check_data(forms, domain)
         return doubts(forms, domain)
+
+    def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:
+        """Solve step by step what has a [time]; collective.
+
+        Args:
+            domain: From :meth:`mesh`.
+            levels: Number of meshes; solved is on the last.
+        """
+        time = self.time
+        assert time is not None
+        return solve_in_time(
+            self.problem,
+            domain,
+            end=time.end,
+            steps=time.steps,
+            scheme=time.scheme,
+            initial=time.initial,
+            capacity=time.capacity,
+            levels=levels,
+            time=time.clock,
+        )
 
     def solutions(self, domain: Domain, **arguments: Any) -> Iterator[Solution]:
         """Solve on the meshes that the file asks for; collective.
@@ -146,7 +200,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     table = parse_toml(on_root(comm, read_text, path))
     insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
     title = get(table, "", "title", string, path.stem)
-    parts = _parts(table)
+    parts, materials = _parts(table), _materials(table)
     sections = {name: _section(table, name) for name in SECTIONS}
     if "domain" not in table:
         raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
@@ -154,8 +208,9 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
     if "exact" in table and not table["exact"]:
         raise InputError("exact.u: this key is missing; an expression in x and y is needed")
-    domain, size = _domain(sections["domain"], path.parent, tuple(parts))
-    expressions = _expressions(sections, parts)
+    domain, size = _domain(sections["domain"], path.parent, tuple(parts), materials)
+    clock = Clock() if "time" in table else None
+    expressions = _expressions(sections, parts, materials, clock)
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
     adaptive = {name: get(refine, "refine", name, *how) for name, how in ADAPTIVE.items()}
@@ -171,16 +226,19 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         domain=domain,
         size=size,
         parts=tuple(parts),
-        problem=_problem(expressions, parts),
+        materials=tuple(materials),
+        problem=_problem(expressions, parts, materials),
         expressions=expressions,
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         adaptive=adaptive,
+        time=None if clock is None else _time(sections, expressions, mode, clock),
+        quantities=_quantities(sections["quantities"], parts),
         said={
             f"{name}.{key}": value
             for name, section in sections.items()
             for key, value in section.items()
-            if f"{name}.{key}" not in ENDS
+            if f"{name}.{key}" not in ENDS and name != "quantities"
         },
     )
 
@@ -204,6 +262,36 @@ def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return parts
 
 
+def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The sections [material.NAME], each checked for its keys."""
+    found = table.get("material", {})
+    if not isinstance(found, dict) or not all(isinstance(each, dict) for each in found.values()):
+        raise InputError(f"material: sections [{MATERIAL}] are needed, found {shown(found)}")
+    for name, material in found.items():
+        insist_known(material, f"material.{name}", allowed(MATERIAL), KEYS)
+    return found
+
+
+def _quantities(
+    table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, tuple[str, str]]:
+    """[quantities]: each a kind and a part of the boundary of the type that goes with it."""
+    types = {name: name for name in PARTS} | {name: part["type"] for name, part in parts.items()}
+    found = {}
+    for name, value in table.items():
+        key = f"quantities.{name}"
+        if not isinstance(value, dict) or len(value) != 1:
+            raise InputError(
+                f'{key}: {{ force = "PART" }} or {{ flux = "PART" }} is needed, found'
+                f" {shown(value)}"
+            )
+        insist_known(value, key, tuple(QUANTITIES))
+        ((kind, part),) = value.items()
+        own = [each for each, what in types.items() if what == QUANTITIES[kind]]
+        found[name] = kind, one_of(own)(f"{key}.{kind}", part)
+    return found
+
+
 _SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, the others are optional"
 
 
@@ -217,7 +305,10 @@ def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def _domain(
-    table: Mapping[str, Any], folder: Path, names: tuple[str, ...]
+    table: Mapping[str, Any],
+    folder: Path,
+    names: tuple[str, ...],
+    materials: Mapping[str, Mapping[str, Any]],
 ) -> tuple[Polygon | Path, float | None]:
     """Read [domain]: the polygon and its size, or the path of the mesh.
 
@@ -225,6 +316,7 @@ def _domain(
         table: The section.
         folder: Where paths begin.
         names: The parts of the boundary that have sections.
+        materials: The sections of the materials.
     """
     if "mesh" in table:
         others = [key for key in ("vertices", "boundary", "size", "holes") if key in table]
@@ -233,6 +325,12 @@ def _domain(
                 f"domain: both mesh and {others[0]} are given; either a mesh file or a polygon"
                 " (vertices, boundary, size) is allowed"
             )
+        for name, material in materials.items():
+            if "polygon" in material:
+                raise InputError(
+                    f"material.{name}.polygon: with a mesh file a physical surface named {name} is"
+                    " needed instead"
+                )
         return folder / get(table, "domain", "mesh", string), None
     if "vertices" not in table:
         raise InputError(
@@ -240,7 +338,12 @@ def _domain(
             " a mesh file is needed"
         )
     polygon = _polygon(table, "domain", names)
-    holes = []
+    holes, polygons = [], {}
+    for name, material in materials.items():
+        key, needed = f"material.{name}", "a list of points [x, y]"
+        points = _points(f"{key}.polygon", get(material, key, "polygon", array, needed=needed))
+        named(f"{key}.polygon", check_loops, [coordinates(points)], rule=SIMPLE)
+        polygons[name] = points
     for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
         key = f"domain.holes[{i}]"
         if not isinstance(hole, dict):
@@ -249,10 +352,11 @@ def _domain(
             )
         insist_known(hole, key, ("vertices", "boundary"))
         holes.append(_polygon(hole, key, names))
-    if holes:
+    if holes or polygons:
         apart = "holes must lie inside the polygon and apart from each other"
         outline = (polygon.vertices, polygon.boundary)
         polygon = named("domain.holes", Polygon, *outline, tuple(holes), names, rule=apart)
+        polygon = replace(polygon, materials=polygons)
     named("domain.boundary", polygon.check_parts)
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
     for name in names:
@@ -273,13 +377,7 @@ def _domain(
 def _polygon(table: Mapping[str, Any], section: str, names: tuple[str, ...]) -> Polygon:
     key = f"{section}.vertices"
     vertices = get(table, section, "vertices", array, needed="a list of points [x, y]")
-    for i, vertex in enumerate(vertices):
-        if not isinstance(vertex, list) or len(vertex) != 2:
-            raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
-        for j, coordinate in enumerate(vertex):
-            number(f"{key}[{i}][{j}]", coordinate)
-    if len(vertices) < 3:
-        raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
+    points = _points(key, vertices)
     boundary = get(table, section, "boundary", array, needed="a list of labels, one for each edge,")
     for i, label in enumerate(boundary):
         one_of((*PARTS, *(name for name in names if name not in PARTS)))(
@@ -290,9 +388,19 @@ def _polygon(table: Mapping[str, Any], section: str, names: tuple[str, ...]) -> 
             f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
             f" found {len(boundary)} labels"
         )
-    simple = "the polygon must be simple, its edges must meet at their common vertices only"
-    outline = np.array(vertices, dtype=np.float64), tuple(boundary)
-    return named(key, Polygon, *outline, (), names, rule=simple)
+    return named(key, Polygon, points, tuple(boundary), (), names, rule=SIMPLE)
+
+
+def _points(key: str, vertices: list[Any]) -> FloatArray:
+    """The vertices of a polygon, shape (n, 2)."""
+    for i, vertex in enumerate(vertices):
+        if not isinstance(vertex, list) or len(vertex) != 2:
+            raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
+        for j, coordinate in enumerate(vertex):
+            number(f"{key}[{i}][{j}]", coordinate)
+    if len(vertices) < 3:
+        raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
+    return np.array(vertices, dtype=np.float64)
 
 
 def _few_enough(levels: int, cells: int, dim: int) -> None:
@@ -305,11 +413,18 @@ def _few_enough(levels: int, cells: int, dim: int) -> None:
 
 
 def _expressions(
-    sections: Mapping[str, Mapping[str, Any]], parts: Mapping[str, Mapping[str, Any]]
+    sections: Mapping[str, Mapping[str, Any]],
+    parts: Mapping[str, Mapping[str, Any]],
+    materials: Mapping[str, Mapping[str, Any]],
+    clock: Clock | None,
 ) -> dict[str, Expression]:
-    """Read [define], [data], [boundary.NAME] and [exact]."""
+    """Read [define], [data], [boundary.NAME], [material.NAME], [exact] and `initial` of [time]."""
     names: dict[str, Expression] = {}
     define = sections["define"]
+    if clock is not None:
+        if "t" in define:
+            raise InputError("define.t: t is the time, as there is a section [time]")
+        names["t"] = Expression("t", Node("clock", (clock,)))
     for name, value in define.items():
         named(f"define.{name}", check_name, name)
         later = [other for other in define if other not in names]
@@ -322,6 +437,10 @@ def _expressions(
     }
     for part, table in parts.items():
         given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
+    for material, table in materials.items():
+        given |= {f"material.{material}.{key}": v for key, v in table.items() if key != "polygon"}
+    if "initial" in sections["time"]:
+        given["time.initial"] = sections["time"]["initial"]
     result = {}
     for key, value in given.items():
         expression = _expression(key, value, names, ())
@@ -329,6 +448,46 @@ def _expressions(
             raise InputError(f"{key}: a number is needed, but this is a condition")
         result[key] = expression
     return result
+
+
+def _time(
+    sections: Mapping[str, Mapping[str, Any]],
+    expressions: Mapping[str, Expression],
+    mode: str,
+    clock: Clock,
+) -> Time:
+    """[time], and what goes with it."""
+    table = sections["time"]
+    if mode != "uniform":
+        raise InputError('refine.mode: a problem in time needs "uniform": its meshes do not change')
+    if "exact.u" in expressions:
+        raise InputError("exact.u: a problem in time has none")
+    for key, expression in expressions.items():
+        fixed = key.endswith((".coefficient", ".reaction")) or key == "time.initial"
+        if fixed and expression.depends_on_time:
+            raise InputError(f"{key}: this must not depend on t")
+    initial = expressions.get("time.initial")
+    return Time(
+        end=get(table, "time", "end", positive, needed="a number above 0, the last time,"),
+        steps=get(table, "time", "steps", whole, needed="a whole number, of steps,"),
+        scheme=get(table, "time", "scheme", one_of(SCHEMES), "euler"),
+        initial=0.0 if initial is None else _data(initial),
+        capacity=get(table, "time", "capacity", _capacity, 1.0),
+        clock=clock,
+    )
+
+
+def _capacity(key: str, value: Any) -> float:
+    """A number above 0, which may be written as an expression."""
+    found = _expression(key, value, {}, ()).constant
+    if not isinstance(found, float) or found <= 0.0:
+        raise InputError(f"{key}: a number above 0 is needed, found {shown(value)}")
+    return found
+
+
+def _data(expression: Expression) -> Any:
+    """An expression as `Problem` takes it."""
+    return expression.ufl if expression.constant is None else expression.constant
 
 
 def _expression(
@@ -347,13 +506,14 @@ KINDS = {"contact": Contact, "dirichlet": Dirichlet, "neumann": Neumann, "robin"
 
 
 def _problem(
-    expressions: Mapping[str, Expression], parts: Mapping[str, Mapping[str, Any]]
+    expressions: Mapping[str, Expression],
+    parts: Mapping[str, Mapping[str, Any]],
+    materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
     def data(key: str, default: Any) -> Any:
         if key not in expressions:
             return default
-        expression = expressions[key]
-        return expression.ufl if expression.constant is None else expression.constant
+        return _data(expressions[key])
 
     conditions = {
         name: KINDS[part["type"]](
@@ -369,5 +529,15 @@ def _problem(
         coefficient=data("data.coefficient", 1.0),
         reaction=data("data.reaction", 0.0),
         conditions=conditions,
+        materials={
+            name: Material(
+                **{
+                    key: data(f"material.{name}.{key}", None)
+                    for key in material
+                    if key != "polygon"
+                }
+            )
+            for name, material in materials.items()
+        },
         exact=data("exact.u", None),
     )

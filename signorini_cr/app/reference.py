@@ -35,13 +35,21 @@ class Key(NamedTuple):
 EXPRESSION = "an expression or a number"
 PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
+MATERIAL = "material.NAME"
+"""The sections of the materials."""
 TYPES = {
-    "contact": ("obstacle", "coefficient", "external", "g"),
+    "contact": ("obstacle", "upper", "coefficient", "external", "g"),
     "dirichlet": ("value",),
     "neumann": ("g",),
     "robin": ("g", "coefficient", "external"),
 }
 """The keys that go with each type of a part."""
+
+SCHEMES = ("euler", "bdf2")
+"""Ways to go from one time to the next."""
+
+QUANTITIES = {"force": "contact", "flux": "dirichlet"}
+"""Kinds of quantities, and the type of the part that each is of."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
@@ -76,9 +84,13 @@ KEYS = (
     Key("data", "reaction", EXPRESSION, "0", "c of −∇·(κ∇u) + c u = f, nowhere below 0.",
         "reaction = 2"),
     Key(PART, "type", '"contact", "dirichlet", "neumann" or "robin"', "", "What holds there: u ≥ "
-        "obstacle; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) = g. On contact parts "
-        "that has the pressure of the obstacle on its right, too.", 'type = "contact"'),
-    Key(PART, "obstacle", EXPRESSION, "0", "contact: α.", 'obstacle = "0.1*x"'),
+        "obstacle, or u ≤ upper, or both; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) "
+        "= g. On contact parts that has the pressure of the obstacle on its right, too.",
+        'type = "contact"'),
+    Key(PART, "obstacle", EXPRESSION, "0; nothing where there is an `upper`", "contact: α, which u "
+        "is not to be below.", 'obstacle = "0.1*x"'),
+    Key(PART, "upper", EXPRESSION, "nothing", "contact: β, which u is not to be above, instead of "
+        "an obstacle or together with it.", "upper = 10"),
     Key(PART, "value", EXPRESSION, "0, or derived from `exact.u`", "dirichlet: u_D.", "value = 8"),
     Key(PART, "g", EXPRESSION, "0, or derived from `exact.u` but for contact",
         "neumann, robin, contact: the flux into the domain.", "g = 0.5"),
@@ -86,6 +98,15 @@ KEYS = (
         "nowhere below 0.", "coefficient = 20"),
     Key(PART, "external", EXPRESSION, "0", "robin, contact: the u at which nothing is lost.",
         "external = -10"),
+    Key(MATERIAL, "polygon", "a list of points [x, y]", "", "Where the domain consists of it: "
+        "what of it lies in this polygon. Its edges become lines of the mesh. Polygons may "
+        "share edges, and reach beyond the domain, but not overlap. Needed, unless there is a "
+        "`domain.mesh`, which has physical surfaces of such names.",
+        "polygon = [[0, 0], [1, 0], [1, 1], [0, 1]]"),
+    Key(MATERIAL, "coefficient", EXPRESSION, "that of [data]", "κ there.", "coefficient = 50"),
+    Key(MATERIAL, "f", EXPRESSION, "that of [data]", "The load there.", "f = -2"),
+    Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there; a c that is not the same "
+        "everywhere has no certificate.", "reaction = 2"),
     Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "
         "are then computed, and f, g and dirichlet, where left out, are derived from it.",
         'u = "x**2 - y**2"'),
@@ -100,6 +121,14 @@ KEYS = (
     Key("refine", "fraction", "a number above 0, at most 1", "0.5", "Adaptive: the part of the "
         "squared bound that the cells to be refined hold. Less takes more meshes, and fewer cells "
         "for the same bound.", "fraction = 0.3", (part, 0.5)),
+    Key("time", "end", "a number above 0", "", "The last time; the first is 0. Needed.",
+        "end = 36000"),
+    Key("time", "steps", "a whole number above 0", "", "Steps of equal length. Needed.",
+        "steps = 60"),
+    Key("time", "scheme", '"euler" or "bdf2"', '"euler"', "Implicit Euler, of first order; or the "
+        "backward difference of second order.", 'scheme = "bdf2"'),
+    Key("time", "initial", EXPRESSION, "0", "u at the time 0.", 'initial = "8 - 2*y"'),
+    Key("time", "capacity", "a number above 0", "1", "What multiplies ∂u/∂t.", "capacity = 2e6"),
 )  # fmt: skip
 
 ABOUT = {
@@ -109,9 +138,18 @@ ABOUT = {
     PART: "Optional, one section for each part that has a name of its own; dirichlet, neumann and "
     "contact need none. With such sections there need be no dirichlet part where `reaction` or a "
     "`coefficient` holds the solution.",
+    MATERIAL: "Optional, one section for each material that has a name. Its cells, on the coarsest "
+    "mesh and when they are refined, have its data in the place of those in [data], which are for "
+    "cells without material, and for what is left out here.",
     "data": "What is left out is 0. An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",
+    "time": "Optional: capacity ∂u/∂t − ∇·(κ∇u) + c u = f, step by step. `t` may then stand in "
+    "every expression but those of κ, c and the coefficients of parts. The bound of a step is that "
+    "of its own problem, in which the steps before are data.",
+    "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
+    "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
+    "through a dirichlet part. The part must not touch other dirichlet or contact parts.",
 }
 """The sections, and what is said of each."""
 
@@ -142,6 +180,10 @@ def page() -> str:
         if section == "define":
             example = ["[define]", 'r = "sqrt(x**2 + y**2)"', 'w = "r**1.5*cos(1.5*atan2(y, x))"']
             lines += ["```toml", *example, "```", ""]
+            continue
+        if section == "quantities":
+            example = ['push = { force = "contact" }', 'inflow = { flux = "dirichlet" }']
+            lines += ["```toml", "[quantities]", *example, "```", ""]
             continue
         lines += ["| key | value | if left out | |", "|---|---|---|---|"]
         keys = [key for key in KEYS if key.section == section]

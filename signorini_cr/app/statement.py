@@ -14,6 +14,7 @@ from .problemfile import ProblemFile
 from .screen import WIDTH
 
 INDENT = 11
+_SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c"}
 LONGEST = 50
 """Characters of an expression; what is longer is cut."""
 
@@ -36,13 +37,23 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         left_out = f"{derived} of exact.u".strip() if derived and "exact.u" in said else "0"
         return _short(said.get(f"data.{key}", left_out))
 
-    kappa = "κ" if "data.coefficient" in said else ""
+    materials = {name: case.said[f"material.{name}"] for name in case.materials}
+    own_kappa = any("coefficient" in material for material in materials.values())
+    kappa = "κ" if "data.coefficient" in said or own_kappa else ""
     gain = f" + ({data('reaction')}) u" if "data.reaction" in said else ""
-    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {data('coefficient')}"
+    if not gain and any("reaction" in material for material in materials.values()):
+        gain = " + c u"
+    usual = _short(said.get("data.coefficient", 1))
+    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {usual}"
     rows = {
         "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}",
         "equation": equation if kappa else f"−Δu{gain} = {data('f', 'that')}",
     }
+    for name, material in materials.items():
+        tags = domain.materials
+        number = np.count_nonzero(tags.where(name)[: mesh.topology.index_map(tdim).size_local])
+        own = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
+        rows[name] = f"{', '.join(own) or 'no data of its own'}; {comm.allreduce(number)} cells"
     conditions = {
         "dirichlet": f"u = {data('dirichlet', 'that')}",
         "neumann": f"{kappa}∂ₙu = {data('g', 'that')}",
@@ -58,6 +69,10 @@ def statement(case: ProblemFile, domain: Domain) -> str:
             total = comm.allreduce(float(measures.sum()))
             what = "length" if gdim == 2 else "area"
             rows[name] = f"{condition}; {number} facets, {what} {total:.6g}"
+    if case.time is not None:
+        words = f"t from 0 to {case.time.end:g} in {case.time.steps} steps of {case.time.scheme}"
+        start = f"u = {_short(said.get('time.initial', 0))} at t = 0"
+        rows["time"] = f"{words}; {case.time.capacity:g} ∂u/∂t on the left; {start}"
     if "exact.u" in said:
         rows["exact.u"] = _short(said["exact.u"])
     helpers = [key.removeprefix("define.") for key in said if key.startswith("define.")]
@@ -97,7 +112,14 @@ def _condition(part: Mapping[str, Any], kappa: str, known: bool) -> str:
     if kind != "contact":
         return f"{flux} = {data('g', True)}"
     gain = f" − {factor('g')}" if part.get("g", 0) != 0 else ""
-    return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
+    if "upper" not in part:
+        return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
+    if "obstacle" not in part:
+        return f"u ≤ {data('upper')}, {flux}{gain} ≤ 0, one of them an equality"
+    return (
+        f"{data('obstacle')} ≤ u ≤ {data('upper')}, {flux}{gain} ≥ 0 on the lower bound, ≤ 0 on "
+        "the upper, 0 between them"
+    )
 
 
 def _short(value: object) -> str:

@@ -20,6 +20,7 @@ from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError
 from ..fem.cells import Cells, Side, corner_points
+from ..fem.conditions import negative
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities
 from ..mesh.domain import Domain
@@ -83,9 +84,20 @@ def check_data(forms: Forms, domain: Domain) -> None:
     if len(fixed) > 1:
         _raise_first(comm, _between(fixed, None, forms.fixed[-1].source))
     for contact in forms.bounded:
-        alpha, bounded = _Values(contact.lower, domain), _Facets.of(domain, contact.number)
-        for u_D, facets in fixed:
-            _raise_first(comm, _crossing(u_D, facets, alpha, bounded, contact.label))
+        bounded = _Facets.of(domain, contact.number)
+        for sign, bound in contact.bounds:
+            limit = _Values(bound, domain)
+            for u_D, facets in fixed:
+                complaints = _crossing(u_D, facets, limit, bounded, contact.label, sign)
+                _raise_first(comm, complaints)
+            for other in forms.bounded:
+                for _, rival in (b for b in other.bounds if b[0] != sign and other is not contact):
+                    edge = _Values(negative(rival) if sign > 0 else rival, domain)
+                    there = edge, _Facets.of(domain, other.number), limit, bounded
+                    _raise_first(comm, _crossing(*there, contact.label, sign, "contact"))
+        if len(contact.bounds) == 2:
+            (_, lower), (_, upper) = contact.bounds
+            _raise_first(comm, _crossed(lower, upper, domain, bounded, contact.label))
 
 
 REACTION = "the reaction"
@@ -384,18 +396,28 @@ def _jump_message(key: str, mesh: Mesh, x: FloatArray, a: float, b: float) -> Co
 
 
 def _crossing(
-    u_D: _Values, fixed: _Facets, alpha: _Values, contact: _Facets, label: str
+    u_D: _Values,
+    fixed: _Facets,
+    alpha: _Values,
+    contact: _Facets,
+    label: str,
+    sign: int,
+    other: str = "dirichlet",
 ) -> list[Complaint]:
-    """Where Γ0 meets Γ1 with α above u_D, so that K is empty; collective."""
+    """Where Γ0 meets Γ1 with α above u_D, or −β above −u_D, so that K is empty; collective.
+
+    In the place of u_D there may be the opposite bound of another part of Γ1.
+    """
     mesh = u_D.mesh
     comm = mesh.comm
     error = u_D.precision.vertices
+    value_of = f"the {other} value" if other == "dirichlet" else "the other part's bound"
     found = u_D.at(fixed.x, fixed.cells, error)
     above = alpha.at(contact.x, contact.cells, error)
     if comm.allreduce(found is None or above is None, op=MPI.LOR):
         return []
     assert found is not None and above is not None
-    mine = [array.ravel() for array in (fixed.nodes, *found)]
+    mine = [array.ravel() for array in (fixed.nodes, sign * found[0], found[1])]
     node, value, slack = (np.concatenate(each) for each in zip(*comm.allgather(mine)))
     node, one = np.unique(node, return_index=True)
     row = np.minimum(np.searchsorted(node, contact.nodes), max(len(node) - 1, 0))
@@ -408,12 +430,34 @@ def _crossing(
     return [
         (
             where := place(contact.x[meets][i], mesh),
-            f"{label}: at {shown(where)}, where contact and dirichlet meet, the obstacle is"
-            f" {top[i]:.10g} but the dirichlet value is only {below[i]:.10g}; the obstacle must not"
-            " be above it",
+            f"{label}: at {shown(where)}, where contact and {other} meet, the obstacle is"
+            f" {sign * top[i]:.10g} but {value_of} is {'only ' if sign > 0 else ''}"
+            f"{sign * below[i]:.10g}; the obstacle must not be {'above' if sign > 0 else 'below'}"
+            " it",
         )
         for i in wrong
     ]
+
+
+def _crossed(
+    lower: ufl.core.expr.Expr,
+    upper: ufl.core.expr.Expr,
+    domain: Domain,
+    contact: _Facets,
+    label: str,
+) -> list[Complaint]:
+    """Where α is above β, at vertices and midpoints; β comes with the other sign."""
+    room = _Values(upper + lower, domain)
+    complaints = []
+    for x in (contact.x.mean(axis=1), *np.moveaxis(contact.x, 1, 0)):
+        found = room.at(x, contact.cells, room.precision.vertices)
+        if found is None:
+            return []
+        for i in np.flatnonzero(found[0] > found[1]):
+            where = place(x[i], domain.mesh)
+            said = f"{label}: at {shown(where)} it is {found[0][i]:.10g} above the upper bound"
+            complaints.append((where, said))
+    return complaints
 
 
 def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:

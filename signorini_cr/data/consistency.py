@@ -62,7 +62,8 @@ class _Solution:
         """The first condition that u violates: on Γ1, in Ω, on other parts; collective."""
         said = None
         for contact in self.forms.bounded:
-            said = said or self._on_contact(contact)
+            for sign, bound in contact.bounds:
+                said = said or self._on_contact(contact, sign, bound)
         problem = self.forms.problem
         if problem.f is not None and not said:
             tdim = self.mesh.topology.dim
@@ -79,32 +80,35 @@ class _Solution:
             if condition.fixed is not None:
                 given = self._values(condition.fixed, x, cells)
                 said = self._same(condition.label, x, given, self._values(self.u, x, cells))
-            elif condition.lower is None and condition.flux is not None:
+            elif not condition.bounds and condition.flux is not None:
                 given = self._values(condition.flux, x, cells)
                 said = self._same(condition.label, x, given, self._flux(condition, x, cells, n))
         return said
 
-    def _on_contact(self, contact: Condition) -> str | None:
+    def _on_contact(self, contact: Condition, sign: int, bound: Any) -> str | None:
+        """What is wrong with one bound: sign u must not be below it."""
         x, cells, n = self._facets(contact.number)
-        u, alpha = self._values(self.u, x, cells), self._values(contact.lower, x, cells)
+        u, alpha = self._values(self.u, x, cells), self._values(bound, x, cells)
         pressure = self._flux(contact, x, cells, n)
         if contact.flux is not None:
             pressure = _difference(pressure, self._values(contact.flux, x, cells))
+        u, pressure = ((sign * each[0], each[1]) for each in (u, pressure))
         gap = _difference(u, alpha)
         height, force = self._size(u, alpha), self._size(pressure)
         said = self._first(
             gap[0] < -ENOUGH * height - gap[1],
             x,
-            "u is {:.6g}, below the obstacle, {:.6g}",
-            u,
-            alpha,
+            f"u is {{:.6g}}, {'below' if sign > 0 else 'above'} the obstacle, {{:.6g}}",
+            (sign * u[0], u[1]),
+            (sign * alpha[0], alpha[1]),
         )
         low = ENOUGH * force + pressure[1]
-        said = said or self._first(
-            pressure[0] < -low, x, "the pressure on the obstacle is {:.6g}, below 0", pressure
-        )
+        pulls = (pressure[0] < -low) & (len(contact.bounds) == 1)
+        words = "the pressure on the obstacle is {:.6g}, below 0"
+        said = said or self._first(pulls, x, words, pressure)
         apart = (gap[0] > ENOUGH * height + gap[1]) & (pressure[0] > low)
-        words = "the pressure on the obstacle is {:.6g} though u is above it by {:.6g}"
+        words = "the pressure on the obstacle is {:.6g} though u is "
+        words += ("above" if sign > 0 else "below") + " it by {:.6g}"
         return said or self._first(apart, x, words, pressure, gap)
 
     def _same(self, key: str, x: FloatArray, given: Found, wanted: Found) -> str | None:

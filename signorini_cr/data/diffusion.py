@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -11,7 +12,7 @@ from dolfinx import fem
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array
-from ..fem.cells import Cells
+from ..fem.cells import Cells, vertex_rows
 from ..fem.conditions import Condition
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
@@ -29,12 +30,16 @@ class DiffusionOnMesh:
         forms: Their forms.
         domain: Mesh and boundary parts.
         V: The discrete space.
+        source: A function of CR by dof that f has beside what the problem says, ghosts included;
+            None for nothing.
     """
+
+    source: FloatArray | None = None
 
     def __init__(self, compiled: Compiled, domain: Domain):
         """Make the space; collective."""
         self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
-        self.forms.insist_on_mesh(domain.mesh)
+        self.forms.insist_on_data(domain)
         self.V = function_space(domain.mesh, self.forms.element)
 
     @cached_property
@@ -43,10 +48,33 @@ class DiffusionOnMesh:
         fixed = [condition.number for condition in self.forms.fixed]
         return Cells(self.domain, self.V, fixed, self.forms.sinks)
 
+    def renewed(self, source: FloatArray | None = None) -> DiffusionOnMesh:
+        """The same with data as they are now, which are sampled anew; a_h must be what it was.
+
+        Args:
+            source: As above.
+        """
+        other = copy(self)
+        for name in ("of_f", "load", "edges", "u_D", "alpha"):
+            other.__dict__.pop(name, None)
+        other.source = source
+        return other
+
     @cached_property
-    def load(self) -> Load:
+    def of_f(self) -> Load:
         """Moments of f."""
         return Load.of(self.compiled.f, self.cells)
+
+    @cached_property
+    def load(self) -> Load:
+        """Moments of f and what it has beside."""
+        return self.with_source(self.of_f)
+
+    def with_source(self, load: Load) -> Load:
+        """Moments of f, as given, and what it has beside."""
+        if self.source is None:
+            return load
+        return load.less(-1.0, vertex_rows(self.source, self.cells))
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:
@@ -61,8 +89,12 @@ class DiffusionOnMesh:
 
     @cached_property
     def alpha(self) -> tuple[OnFacets, ...]:
-        """What u must not be below on Γ1, one for each condition."""
-        return self._sampled(self.forms.bounded, lambda condition: condition.lower)
+        """What s u must not be below on Γ1, one for each condition's each bound."""
+        return tuple(
+            OnFacets.of(condition, self.compiled.trace(datum), self.domain, sign)
+            for condition in self.forms.bounded
+            for sign, datum in condition.bounds
+        )
 
     # what the system asks for
 
@@ -77,13 +109,13 @@ class DiffusionOnMesh:
         return tuple(on_facets.imposed for on_facets in self.u_D)
 
     @property
-    def lower(self) -> tuple[Imposed, ...]:
-        """α on Γ1."""
+    def bounds(self) -> tuple[Imposed, ...]:
+        """α and −β on Γ1."""
         return tuple(on_facets.imposed for on_facets in self.alpha)
 
     def chi(self) -> FloatArray:
         """χ (1.10) by dof, this rank's cells' share."""
-        if self.forms.element == "CR" and self.forms.loaded:
+        if self.forms.element == "CR" and (self.forms.loaded or self.source is not None):
             return chi(self.load, self.edges, self.cells)
         return self._assembled(self.forms.chi)
 
@@ -124,7 +156,7 @@ class DiffusionOnMesh:
 
     def tidy(self) -> None:
         """Drop what only solution and certificate needed; it is made again if asked for."""
-        for name in ("cells", "load", "edges"):
+        for name in ("cells", "of_f", "load", "edges"):
             self.__dict__.pop(name, None)
 
     def _sampled(

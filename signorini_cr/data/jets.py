@@ -24,6 +24,7 @@ from ufl.algorithms.expand_indices import expand_indices
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
+from ..mesh.domain import Domain
 from .balls import EPS, LOOSE, NONE, ORDER, Balls, Factor, Rows, indices, middle, union
 from .pointwise import FUNCTIONS
 
@@ -50,7 +51,7 @@ class Boxes:
             `STRIP` wide.
         cells: A cell that holds each box, shape (n,), for data that are given by cells.
         normal: Outward normals, shape (gdim, n).
-        mesh: The mesh of the cells.
+        domain: Of the cells.
         slanted: Boxes that are much larger than their simplices, shape (k,).
         edges: Two edges of each of these, from one vertex, shape (variables, gdim, k).
     """
@@ -61,7 +62,7 @@ class Boxes:
     corners: FloatArray | None = None
     cells: IndexArray | None = None
     normal: FloatArray | None = None
-    mesh: Any = None
+    domain: Domain | None = None
     slanted: IndexArray | None = None
     edges: FloatArray | None = None
 
@@ -71,7 +72,7 @@ class Boxes:
         assert self.slanted is not None
         low, high = self.low[:, self.slanted], self.high[:, self.slanted]
         cells = None if self.cells is None else self.cells[self.slanted]
-        return Boxes(low, high, self.edges, cells=cells, mesh=self.mesh)
+        return Boxes(low, high, self.edges, cells=cells, domain=self.domain)
 
     def whole(self, which: IndexArray) -> Boxes:
         """Some of them, of which all points are meant."""
@@ -80,7 +81,7 @@ class Boxes:
             return None if array is None else array[..., which]
 
         along, cells, normal = some(self.along), some(self.cells), some(self.normal)
-        return Boxes(some(self.low), some(self.high), along, None, cells, normal, self.mesh)
+        return Boxes(some(self.low), some(self.high), along, None, cells, normal, self.domain)
 
     @property
     def variables(self) -> int:
@@ -285,22 +286,21 @@ class Enclosure:
 
     def _function(self, function: fem.Function) -> Jet:
         """Functions that are affine on each cell, or constant."""
-        box, V = self.boxes, function.function_space
-        element = V.ufl_element()
-        within = (
-            box.cells is not None
-            and V.mesh is box.mesh
-            and element.reference_value_shape == ()
+        box, domain, element = self.boxes, self.boxes.domain, function.function_space.ufl_element()
+        known = (
+            element.reference_value_shape == ()
             and element.family_name in ("P", "Lagrange", "Discontinuous Lagrange")
             and element.degree <= 1
         )
-        if not within:
+        if box.cells is None or domain is None or not known:
             raise Unknown(function.name)
-        values = function.x.array[V.dofmap.list[box.cells]]
+        function = domain.own(function)
+        values = function.x.array[function.function_space.dofmap.list[box.cells]]
         ends = values.min(axis=1), values.max(axis=1)
         if values.shape[1] == 1:
             return Jet(*ends)
-        X = box.mesh.geometry.x[compat.cell_nodes(box.mesh)[box.cells]][:, :, : len(box.low)]
+        mesh = domain.mesh
+        X = mesh.geometry.x[compat.cell_nodes(mesh)[box.cells]][:, :, : len(box.low)]
         rise = (values[:, 1:] - values[:, :1])[:, :, None]
         slope = np.linalg.solve(X[:, 1:] - X[:, :1], rise)[:, :, 0].T
         reach = [

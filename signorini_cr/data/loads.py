@@ -236,7 +236,7 @@ class Edge:
         self.shares = self.measure * (g.hats.T * g.weights @ inside)
         condition = sampled.condition
         self.loss = 0.0 if condition.loss is None else number(condition.loss) or 0.0
-        self.bounded = condition.lower is not None
+        self.bounded = bool(condition.bounds)
 
     def to_cells(self) -> FloatArray:
         """∫_F g ψ_i for the Crouzeix-Raviart functions of the facet's cell, shape (d + 1, n).

@@ -76,9 +76,8 @@ class Volume:
         """Values at the quadrature points of owned cells, shape (cells, q)."""
         assert self._values is not None
         which = np.arange(cells.number, dtype=np.int32)
-        return self._values.eval(cells.domain.mesh, which).reshape(
-            cells.number, len(self.rule.weights)
-        )
+        values = compat.bound(self._values, cells.domain.own)
+        return values.eval(cells.domain.mesh, which).reshape(cells.number, len(self.rule.weights))
 
     @cached_property
     def deviation(self) -> Deviation:
@@ -216,7 +215,7 @@ class Coefficient:
             hats = self.rule.hats
             x = np.einsum("cgn,cq->gqn", boxes.corners, hats).reshape(len(boxes.low), -1)
             cells = None if boxes.cells is None else np.tile(boxes.cells, hats.shape[1])
-            there = values(self.deviation.expression, Boxes(x, x, cells=cells, mesh=boxes.mesh))
+            there = values(self.deviation.expression, Boxes(x, x, cells=cells, domain=boxes.domain))
             excess = np.fmin(excess, self._by_points(there.reshape(hats.shape[1], len(r)), r))
             return np.where(np.isnan(excess), np.inf, excess)
 
@@ -297,11 +296,11 @@ class Trace:
         """How far it is from polynomials."""
         return Deviation(self._expression)
 
-    def at(self, mesh: Mesh, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def at(self, domain: Domain, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values at the vertices, the midpoint and the quadrature points of facets.
 
         Args:
-            mesh: Where.
+            domain: Where.
             entities: Pairs (cell, facet's number in the cell), shape (n, 2).
 
         Returns:
@@ -311,7 +310,7 @@ class Trace:
         if self.constant is not None:
             count = len(self.weights)
             return tuple(np.full(s, self.constant) for s in ((k, n), n, (count, n)))  # type: ignore
-        values = np.ascontiguousarray(self._values.at(mesh, entities)[:, :, 0].T)
+        values = np.ascontiguousarray(self._values.at(domain.mesh, entities, domain.own)[:, :, 0].T)
         return values[:k], values[k], values[k + 1 :]
 
 
@@ -327,6 +326,7 @@ class OnFacets:
         ends: Values at the vertices, in the order of the cell's closure, shape (d, n).
         middle: At the midpoints, shape (n,).
         inside: At the trace's quadrature points, shape (q, n).
+        sign: Of a bound: s, where s u must not be below the datum.
     """
 
     condition: Condition
@@ -336,13 +336,14 @@ class OnFacets:
     ends: FloatArray
     middle: FloatArray
     inside: FloatArray
+    sign: int = 1
 
     @classmethod
-    def of(cls, condition: Condition, trace: Trace, domain: Domain) -> OnFacets:
+    def of(cls, condition: Condition, trace: Trace, domain: Domain, sign: int = 1) -> OnFacets:
         """Evaluate a datum on a mesh; collective."""
         facets = domain.all_facets[condition.number]
         entities = facet_entities(domain.mesh, facets)
-        return cls(condition, trace, facets, entities, *trace.at(domain.mesh, entities))
+        return cls(condition, trace, facets, entities, *trace.at(domain, entities), sign)
 
     @property
     def means(self) -> FloatArray:
@@ -354,14 +355,15 @@ class OnFacets:
         """The same for the one unknown of each facet."""
         only = np.zeros(1, dtype=np.int32)
         means, ends = self.means[:, None], self.ends.T[:, :, None]
-        return Imposed(self.condition.label.removeprefix("data."), self.facets, only, means, ends)
+        key = self.condition.label.removeprefix("data.")
+        return Imposed(key, self.facets, only, means, ends, self.sign)
 
     def seen_from(self, cells: Cells) -> OnFacets:
         """Keep the facets of owned cells, those of the part's `Side`."""
         own = self.entities[:, 0] < cells.number
         where = self.facets[own], self.entities[own]
         values = self.ends[:, own], self.middle[own], self.inside[:, own]
-        return OnFacets(self.condition, self.trace, *where, *values)
+        return OnFacets(self.condition, self.trace, *where, *values, self.sign)
 
     def side(self, cells: Cells) -> Side:
         """The facets of owned cells, seen from these."""
@@ -401,6 +403,12 @@ class OnParts:
     def means(self) -> FloatArray:
         """Means over the facets, shape (n,)."""
         return np.concatenate([np.empty(0), *(each.means for each in self.parts)])
+
+    @property
+    def signs(self) -> FloatArray:
+        """The bounds' signs, shape (n,)."""
+        count = [len(each.middle) for each in self.parts]
+        return np.repeat([float(each.sign) for each in self.parts], count)
 
     @property
     def traces(self) -> list[Trace]:

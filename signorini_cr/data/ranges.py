@@ -477,11 +477,11 @@ class Pieces:
         cells: Cells,
         corners: FloatArray | None,
     ) -> Boxes:
-        mesh, frame = cells.domain.mesh, self.frame
+        domain, frame = cells.domain, self.frame
         if frame is None:
-            return Boxes(low, high, corners=corners, cells=parent, mesh=mesh)
+            return Boxes(low, high, corners=corners, cells=parent, domain=domain)
         along, normal = frame.along[..., parent], frame.normal[:, parent]
-        return Boxes(low, high, along, corners, frame.cells[parent], normal, mesh)
+        return Boxes(low, high, along, corners, frame.cells[parent], normal, domain)
 
     def _slanted(self, low: FloatArray, high: FloatArray) -> tuple[IndexArray, FloatArray]:
         """Triangles whose boxes are much larger than they are, and two edges; see `Boxes`."""

@@ -21,7 +21,7 @@ from ..arrays import FloatArray
 from ..data.diffusion import diffusion
 from ..data.loads import Certain, Known, Load, Segments, mean_to_norm
 from ..data.moments import Coefficient, OnParts
-from ..fem.cells import Cells, blocks, measures, pick, sum_rows
+from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from .beyond import Beyond
 from .companion import Companion, Masses, companion, on_facet
@@ -66,7 +66,7 @@ class Certificate:
     indicators: FloatArray | None = None
     reason: str | None = None
     seconds: float = 0.0
-    _made: _Made | None = None
+    _made: Made | None = None
 
     def __repr__(self) -> str:
         """A line."""
@@ -139,12 +139,14 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False)
-class _Made:
+class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
     κ is given by its means; whether it varies within cells is told. hats and segments are moments
-    of f and g. force is this rank's share of ∫_Γ1 y·n, reach the radius of the ball around
-    (y + κ∇v)/2 that has κ∇u in it, loose ends added.
+    of f and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces
+    are this rank's shares of the contact forces in y, by the parts' numbers, missed that of what
+    quadrature may have missed of f and g. reach is the radius of the ball around the middle of p
+    and b that A(u − u_h) is in, loose ends added.
     """
 
     level: Level
@@ -159,7 +161,12 @@ class _Made:
     thirds: FloatArray | None
     cusps: Cusps | None
     varies: bool
-    force: float
+    reaction: float
+    left: FloatArray
+    taken_up: bool
+    shed: FloatArray | None
+    forces: dict[int, float]
+    missed: float
     reach: float
 
 
@@ -171,7 +178,8 @@ LIFT_SHARE = 1e-2
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
 TENSOR = "the coefficient is not a scalar"
-ADRIFT = "part of the domain has no way to Γ0, or a figure is not finite"
+ADRIFT = "part of the domain has no way to Γ0"
+HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
 def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) -> Certificate:
@@ -253,12 +261,14 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     w = vertex_rows(u, cells)
     load, edge = data.load, Known.of(data.edges, cells, w)
     of_u = load if reaction == 0.0 else load.less(reaction, w)
-    gap = u[alpha.side.dofs] - alpha.means
-    flux = equilibrate(cells, kappa.mean, w, of_u, edge, alpha.side, gap)
-    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, alpha.side)
+    contact, signs = alpha.side, alpha.signs
+    gap = signs * u[contact.dofs] - alpha.means
+    flux = equilibrate(cells, kappa.mean, w, of_u, edge, contact, signs, gap)
+    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, contact, signs)
     size = _size(cells, kappa, w, flux)
-    certain = Certain.of(data.compiled.f, load, cells, kappa.low, size, reaction)
+    certain = Certain.of(data.compiled.f, data.of_f, cells, kappa.low, size, reaction)
     _insist(certain.reason)
+    certain = replace(certain, load=data.with_source(certain.load))
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
     # y is to have the means that f and g have now
@@ -353,7 +363,8 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     radius = loose / 2 + np.sqrt(far**2 / 4 + contact)
     bound = near / 2 + radius
     bound_h1 = np.sqrt(of_gradients) / 2 + (rounding / 2 + radius) / np.sqrt(kappa.smallest)
-    _insist(v.reason or (None if np.isfinite(bound) else ADRIFT))
+    _insist(v.reason or (ADRIFT if np.isposinf(known.left) else None))
+    _insist(None if np.isfinite(bound) else HUGE)
 
     energy = total.energy - edge_energy
     unsure = lift_energy + hidden_energy + total.energy_slack
@@ -374,7 +385,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             "solver": float(known.left + known.carried),
         },
         indicators=sums.indicators,
-        _made=_Made(
+        _made=Made(
             level=known.level,
             w=w,
             kappa=kappa.mean,
@@ -387,10 +398,29 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             bumps=v.bumps,
             thirds=v.thirds,
             cusps=v.cusps,
-            force=float(flux.contact.sum()),
+            reaction=known.reaction,
+            left=flux.left,
+            taken_up=flux.taken_up,
+            shed=flux.shed,
+            forces=_forces(v.boundary.alpha, flux),
+            missed=float(segments.missed.sum())
+            + (0.0 if certain.missed is None else float(certain.missed.sum())),
             reach=float(bound - near / 2 + loose + lift / 2),
         ),
     )
+
+
+def _forces(alpha: OnParts, flux: Flux) -> dict[int, float]:
+    """This rank's share of the contact force on each part, by the part's number."""
+    found: dict[int, float] = {}
+    first = 0
+    for part in alpha.parts:
+        end = first + len(part.middle)
+        number = part.condition.number
+        own = part.sign * float(flux.contact[first:end].sum())
+        found[number] = found.get(number, 0.0) + own
+        first = end
+    return found
 
 
 def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
@@ -482,15 +512,6 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     loose = np.sqrt(square) + np.sqrt(on_edge)
     missed_in_all = unbalanced(level, cells, missed, kappa.low, size, known.reaction)
     return loose + missed_in_all, float(change)
-
-
-def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
-    """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
-    out = np.empty(cells.facets.shape)
-    for part in blocks(cells.number):
-        values = u[cells.facets[:, part]]
-        np.subtract(sum_rows(values), cells.tdim * values, out=out[:, part])
-    return out
 
 
 def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, float, float]:

@@ -76,7 +76,8 @@ class Companion:
         vertices: v at the vertices, ghosts included.
         bumps: Heights of v's bumps by facet dof, ghosts included.
         excess: v − u_h at the cells' vertices, before the bumps, shape (d + 1, cells).
-        contact: Σ over Γ1 of ∫_F (y·n)(v + ℓ − α), by facet, shape (n,).
+        contact: Σ over Γ1 of ∫_F of y·n times what v + ℓ is off the bound, by facet, once for each
+            bound, shape (n,).
         lift: Cells, bounds of ‖∇ℓ‖_T and ‖ℓ‖_T on them, shapes (n,); and of ‖ℓ‖_F on Γ1's facets.
         reason: Why v is not admissible, if it isn't.
         boundary: What v has to be on Γ0 and above on Γ1.
@@ -118,6 +119,63 @@ class Companion:
         return at
 
 
+@dataclass(frozen=True, eq=False)
+class Floors:
+    """What the bounds ask of v: s v is not below the quadratic through three values on each facet.
+
+    Attributes:
+        side: The facets of Γ1, once for each bound.
+        signs: s, shape (n,).
+        ends: The bounds at their ends, shape (d, n).
+        middle: At their midpoints, shape (n,).
+        at_vertices: The values of s, and for each the largest bound at each vertex, −∞ for none:
+            where parts with obstacles of their own meet, the higher one counts.
+        facets: Number of facets.
+    """
+
+    side: Side
+    signs: FloatArray
+    ends: FloatArray
+    middle: FloatArray
+    at_vertices: tuple[tuple[int, FloatArray], ...]
+    facets: int
+
+    @classmethod
+    def of(cls, cells: Cells, bounds: OnParts) -> Floors:
+        """Collect them; collective."""
+        side, signs, ends = bounds.side, bounds.signs, bounds.ends
+        limits = []
+        for sign in sorted({each.sign for each in bounds.parts}, reverse=True):
+            here = signs == sign
+            limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
+        return cls(side, signs, ends, bounds.middle, tuple(limits), len(cells.exterior))
+
+    def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The least and the largest heights of bumps that they allow for, by facet dof.
+
+        Args:
+            v: v at the vertices, within the bounds.
+        """
+        least = _lowest(self.signs * v[self.side.ends], self.ends, self.middle)
+        low, high = np.full(self.facets, -np.inf), np.full(self.facets, np.inf)
+        up = self.signs > 0.0
+        low[self.side.dofs[up]] = least[up]
+        high[self.side.dofs[~up]] = -least[~up]
+        return low, high
+
+
+def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArray:
+    """Least heights of the bumps with which v stays above the quadratic through α's three values.
+
+    Args:
+        v: At the facets' ends, not below α, shape (2, n).
+        obstacle: α there.
+        middle: α at the midpoints, shape (n,).
+    """
+    room: FloatArray = np.sqrt(np.maximum(v - obstacle, 0.0)).sum(axis=0) ** 2 / 4
+    return middle - obstacle.mean(axis=0) - room
+
+
 def companion(
     cells: Cells,
     kappa: FloatArray,
@@ -147,9 +205,9 @@ def companion(
         masses: What E has beside gradients.
     """
     fixed, contact = u_D.side, alpha.side
-    obstacle, middle = alpha.ends, alpha.middle
+    floors, signs = Floors.of(cells, alpha), alpha.signs
     touching = flux.touching
-    v = _at_vertices(cells, kappa, masses, w, fixed, u_D.ends, contact, obstacle, touching)
+    v = _at_vertices(cells, kappa, masses, w, u_D, floors, touching)
     scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
     scale = max(cells.comm.allgather(scale))
     wrong = [
@@ -157,19 +215,21 @@ def companion(
         if differs(cells, fixed, np.abs(v[fixed.ends] - u_D.ends), scale, *u_D.traces)
         else None,
         BELOW
-        if differs(cells, contact, obstacle - v[contact.ends], scale, *u_D.traces, *alpha.traces)
+        if differs(
+            cells, contact, alpha.ends - signs * v[contact.ends], scale, *u_D.traces, *alpha.traces
+        )
         else None,
     ]
     bumps = np.zeros(len(u))
-    lowest = np.full(len(u), -np.inf)
     free = np.ones(len(u), dtype=bool)
     if cells.tdim == 2:
-        bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
         free[fixed.dofs] = False
-        lowest[contact.dofs] = _lowest(v[contact.ends], obstacle, middle)
+        ranges = floors.heights(v)
         free[contact.dofs[touching]] = False
-        bumps[contact.dofs] = np.maximum(lowest[contact.dofs], 0.0)
-        bumps[contact.dofs[touching]] = lowest[contact.dofs[touching]]
+        bumps = np.clip(0.0, *ranges)
+        bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
+        ends = np.where(signs > 0.0, *(limit[contact.dofs] for limit in ranges))
+        bumps[contact.dofs[touching]] = ends[touching]
         # A facet's values reach the ranks that share it
         if cells.comm.size > 1:
             cells.share(bumps)
@@ -184,14 +244,14 @@ def companion(
         energy, promise = _sweep(
             cells, kappa, masses, excess, bumps, free, (fixed, contact), sweeps
         )
-        bumps[contact.dofs] = np.maximum(bumps[contact.dofs], lowest[contact.dofs])
+        bumps[contact.dofs] = np.clip(bumps, *ranges)[contact.dofs]
         held = np.zeros(len(v))
         held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
         loose = cells.share(held, 0) == 0.0
         promise += _promise(cells, kappa, excess, bumps, loose)
         if promise > PROMISE * energy and not masses.some:
             v[:], bumps[:], cusps = _solved(
-                cells, kappa, steady, w, (v, bumps), (loose, free), contact, (obstacle, middle)
+                cells, kappa, steady, w, (v, bumps), (loose, free), floors
             )
             excess = v[cells.vertices] - w
     boundary = Boundary(u_D, alpha, scale, goal)
@@ -236,9 +296,10 @@ class Boundary:
             for data, obstacle in ((self.u_D, False), (self.alpha, True))
         ]
         # y·n is constant on a facet: the mean of v + ℓ − α
-        above = v[contact.ends].mean(axis=0) - lifts[1].least
+        signs = self.alpha.signs
+        above = signs * v[contact.ends].mean(axis=0) - lifts[1].least
         if cells.tdim == 2:
-            above += 2.0 / 3.0 * bumps[contact.dofs]
+            above += signs * 2.0 / 3.0 * bumps[contact.dofs]
         above += lifts[1].beyond / measures(cells, contact)
         return (
             np.where(flux.contact > 0, flux.contact * np.maximum(above, 0.0), 0.0),
@@ -257,13 +318,11 @@ def _at_vertices(
     kappa: FloatArray,
     masses: Masses,
     w: FloatArray,
-    fixed: Side,
-    u_D: FloatArray,
-    contact: Side,
-    obstacle: FloatArray,
+    u_D: OnParts,
+    floors: Floors,
     touching: BoolArray,
 ) -> FloatArray:
-    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, u_D."""
+    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D."""
     index_map = cells.domain.mesh.topology.index_map(0)
     size = index_map.size_local + index_map.num_ghosts
     flat = cells.vertices.ravel()
@@ -280,13 +339,14 @@ def _at_vertices(
     else:
         v = collect(flat, w.ravel())
         v /= np.maximum(collect(flat, None), 1.0)
-    # where parts with obstacles of their own meet, the higher one counts
-    value = cells.largest_at_vertices(contact.ends, obstacle)
-    held = collect(contact.ends[:, touching].ravel(), None) > 0
-    np.copyto(v, np.where(held, value, np.maximum(v, value)), where=value > -np.inf)
-    ends = fixed.ends.ravel()
+    for sign, limit in floors.at_vertices:
+        there = floors.side.ends[:, touching & (floors.signs == sign)]
+        held = collect(there.ravel(), None) > 0
+        moved = np.where(held, limit, np.maximum(sign * v, limit))
+        np.copyto(v, sign * moved, where=limit > -np.inf)
+    ends = u_D.side.ends.ravel()
     count = collect(ends, None)
-    np.copyto(v, collect(ends, u_D.ravel()) / np.maximum(count, 1.0), where=count > 0)
+    np.copyto(v, collect(ends, u_D.ends.ravel()) / np.maximum(count, 1.0), where=count > 0)
     return v
 
 
@@ -297,8 +357,7 @@ def _solved(
     w: FloatArray,
     start: tuple[FloatArray, FloatArray],
     loosened: tuple[BoolArray, BoolArray],
-    contact: Side,
-    alpha: tuple[FloatArray, FloatArray],
+    floors: Floors,
 ) -> tuple[FloatArray, FloatArray, Cusps | None]:
     """The best v of degree 2, with cusps where they are called for, by solving; collective.
 
@@ -309,27 +368,28 @@ def _solved(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         start: v at the vertices and the heights of its bumps, to begin with.
         loosened: Which values at vertices and which heights may be changed.
-        contact: The facets of Γ1.
-        alpha: α at their ends and at their midpoints.
+        floors: What the bounds ask of v.
 
     Returns:
         v at the vertices, the heights, and the cusps.
     """
-    (v, bumps), (loose, free), (obstacle, middle) = start, loosened, alpha
-    floor = np.where(loose, cells.largest_at_vertices(contact.ends, obstacle), -np.inf)
+    (v, bumps), (loose, free), bounded = start, loosened, floors.side.dofs
     cusps: Cusps | None = None
     best = v, bumps, cusps
     slopes = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
     least = cells.total(np.sum(slopes.energies))[0]
     for turn in range(ROUNDS):
         step = nearest(cells, kappa, slopes, loose, free)
-        v, bumps, free = np.maximum(v + step[0], floor), bumps + step[1], free.copy()
-        lowest = _lowest(v[contact.ends], obstacle, middle)
-        low = free[contact.dofs] & (bumps[contact.dofs] <= lowest)
+        v, bumps, free = v + step[0], bumps + step[1], free.copy()
+        down = np.zeros_like(loose)
+        for sign, limit in floors.at_vertices:
+            down |= loose & (sign * v <= limit)
+            v = np.where(loose, sign * np.maximum(sign * v, limit), v)
+        low, high = floors.heights(v)
+        out = np.unique(bounded[free[bounded] & ((bumps <= low) | (bumps >= high))[bounded]])
         # also where they are held since an earlier round: the facet's ends may have come down
-        bumps[contact.dofs] = np.maximum(bumps[contact.dofs], lowest)
-        free[contact.dofs[low]] = False
-        down = loose & (v <= floor)
+        bumps[bounded] = np.clip(bumps, low, high)[bounded]
+        free[out] = False
         loose = loose & ~down
         excess = v[cells.vertices] - w
         slopes = Slopes.of(cells, kappa, excess, bumps)
@@ -342,24 +402,12 @@ def _solved(
                 (slopes.vertices, slopes.facets), cusps.pulls(cells), strict=True
             ):
                 rows[:, cusps.at] -= pull
-        energy, changes = cells.total(np.sum(slopes.energies), float(low.sum() + down.sum()))
+        energy, changes = cells.total(np.sum(slopes.energies), float(len(out) + down.sum()))
         if energy < least:
             best, least = (v, bumps, cusps), energy
         if changes == 0.0 and cusps is None:
             break
     return best
-
-
-def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArray:
-    """Least heights of the bumps with which v stays above the quadratic through α's three values.
-
-    Args:
-        v: At the facets' ends, not below α, shape (2, n).
-        obstacle: α there.
-        middle: α at the midpoints, shape (n,).
-    """
-    room: FloatArray = np.sqrt(np.maximum(v - obstacle, 0.0)).sum(axis=0) ** 2 / 4
-    return middle - obstacle.mean(axis=0) - room
 
 
 def _sweep(
@@ -545,9 +593,12 @@ def _lift(
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
     side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
+    v, bumps, thirds = (data.sign * values for values in (v, bumps, thirds))
     if cells.tdim != 2:
         return affine(cells, side, trace, v[side.ends], ends, scale)
     third = cells.ways_between(*side.ends) * thirds[side.dofs]
     companion = Cubic(v[side.ends], bumps[side.dofs], third)
-    base = Cubic(ends, middle - ends.mean(axis=0), third) if obstacle else companion
+    base = None
+    if obstacle and len(data.condition.bounds) == 1:
+        base = Cubic(ends, middle - ends.mean(axis=0), third)
     return lift(cells, side, trace, base, companion, scale, goal, obstacle)

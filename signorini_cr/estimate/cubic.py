@@ -32,9 +32,15 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         v: Without cusps.
     """
     boundary, thirds = v.boundary, np.zeros(len(cells.exterior))
+    distance = np.full(len(thirds), np.inf)  # of two bounds the nearer one is that which counts
     for data in (*boundary.u_D.parts, *boundary.alpha.parts):
         side = data.side(cells)
-        thirds[side.dofs] = cells.ways_between(*side.ends) * _of_data(data)
+        middle = v.vertices[side.ends].mean(axis=0) + v.bumps[side.dofs]
+        apart = np.abs(data.sign * middle - data.middle)
+        near = apart < distance[side.dofs]
+        distance[side.dofs[near]] = apart[near]
+        own = data.sign * cells.ways_between(*side.ends) * _of_data(data)
+        thirds[side.dofs[near]] = own[near]
     cells.share(thirds)
     thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
     contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)

@@ -30,9 +30,9 @@ class Flux:
 
     Attributes:
         excess: Fluxes out of each cell of y − κ_T ∇u_h, shape (d + 1, cells), κ_T the mean of κ.
-        contact: Contact forces on the facets of Γ1: y's flux less that which is known, not
-            negative, shape (n,).
-        touching: Whether the facet of Γ1 is in contact, shape (n,).
+        contact: Contact forces off each bound of the facets of Γ1: y's flux less that which is
+            known, not negative, shape (n,).
+        touching: Whether the facet is in contact with it, shape (n,).
         left: ∫_T (f + div y), shape (cells,).
         steepness: ‖∇u_h‖²_T, shape (cells,).
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
@@ -57,6 +57,7 @@ def equilibrate(
     load: Load,
     edge: Known,
     on_contact: Side,
+    signs: FloatArray,
     gap: FloatArray,
 ) -> Flux:
     """Find the facet fluxes of y from the local residuals of u_h.
@@ -71,8 +72,9 @@ def equilibrate(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         load: Moments of f − c u_h.
         edge: Integrals of g − b u_h.
-        on_contact: The facets of Γ1.
-        gap: u_h − α on them, by means, shape (n,).
+        on_contact: The facets of Γ1, once for each bound.
+        signs: 1 for α, −1 for β, shape (n,).
+        gap: u_h − α or β − u_h on them, by means, shape (n,).
     """
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
@@ -100,9 +102,11 @@ def equilibrate(
     # In contact: the primal-dual criterion with the facet's diagonal entry of A
     diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
     force, through = fluxes[there] - known[on_contact.dofs], known[on_contact.dofs]
+    force *= signs
     touching = force > np.maximum(diagonal * gap, 0.0)
     contact = np.where(touching, force, 0.0)
-    excess[there] += contact + through - fluxes[there]
+    excess[there] += through - fluxes[there]
+    np.add.at(excess, there, signs * contact)
     natural = ~edge.bounded
     there = side.local[natural], side.cells[natural]
     excess[there] += known[side.dofs[natural]] - fluxes[there]
@@ -112,7 +116,13 @@ def equilibrate(
 
 
 def relax(
-    cells: Cells, kappa: FloatArray, flux: Flux, reaction: float, edge: Known, on_contact: Side
+    cells: Cells,
+    kappa: FloatArray,
+    flux: Flux,
+    reaction: float,
+    edge: Known,
+    on_contact: Side,
+    signs: FloatArray,
 ) -> bool:
     """Bring y nearer to κ∇u_h where c can take up what it then lacks; collective.
 
@@ -128,7 +138,8 @@ def relax(
         flux: y, changed in place.
         reaction: c.
         edge: Integrals of g − b u_h.
-        on_contact: The facets of Γ1.
+        on_contact: The facets of Γ1, once for each bound.
+        signs: 1 for α, −1 for β, shape (n,).
 
     Returns:
         Whether it was called for, and c and b are to take up all that is left.
@@ -140,8 +151,9 @@ def relax(
     for part in cells.fixed:
         held[cells.sides[part].dofs] = 0.0
     lossy[edge.side.dofs] = edge.loss
-    held[on_contact.dofs] = ~flux.touching & (lossy[on_contact.dofs] == 0.0)
-    lossy[on_contact.dofs[flux.touching]] = 0.0
+    touched = on_contact.dofs[flux.touching]
+    held[on_contact.dofs] = lossy[on_contact.dofs] == 0.0
+    held[touched] = lossy[touched] = 0.0
     sides = edge.side.local, edge.side.cells
     loss = lossy[edge.side.dofs] * measures(cells, edge.side)
     of_edge = np.divide(1.0, loss, out=np.zeros_like(loss), where=loss > 0.0)
@@ -181,8 +193,9 @@ def relax(
         before = now
     fluxes = sign * change[cells.facets]
     there = on_contact.local[flux.touching], on_contact.cells[flux.touching]
-    force = np.maximum(flux.contact[flux.touching] + fluxes[there], 0.0)
-    fluxes[there] = force - flux.contact[flux.touching]
+    off = signs[flux.touching]
+    force = np.maximum(flux.contact[flux.touching] + off * fluxes[there], 0.0)
+    fluxes[there] = off * (force - flux.contact[flux.touching])
     flux.contact[flux.touching] = force
     flux.shed = np.where(loss > 0.0, -fluxes[sides], 0.0)
     flux.excess += fluxes

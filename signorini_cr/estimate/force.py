@@ -1,30 +1,34 @@
-"""Guaranteed bounds of the contact force, where the contact boundary keeps clear of Γ0."""
+"""Guaranteed bounds of what flows through parts of the boundary: contact forces, fluxes at Γ0."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
-import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
 
+from ..arrays import FloatArray
 from ..data.diffusion import diffusion
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, sum_rows
-from ..fem.conditions import facets_of
-from ..fem.space import ghosted_vector, shared_sum
+from ..fem.conditions import Condition, facets_of
+from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
-from ..jit import compiled
 from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
-from .certificate import Certificate
+from .certificate import Certificate, Made
+from .companion import on_facet
 
 NO_BOUNDS = "the contact force has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
+MEETS = (
+    "the part touches another one on which u is set or bounded: what flows through it is no bounded"
+    " functional of the solution"
+)
 VARIES = "the coefficient varies within cells"
-LOST = "terms without gradients are not worked out"
 SPATIAL = "they are worked out for d = 2 only"
 
 
@@ -36,12 +40,24 @@ class Certified(Solved, Protocol):
         """What is certain about the error."""
 
 
-def force_bounds(solution: Certified) -> tuple[float, float]:
-    """Two numbers with ∫_Γ1 κ∂ₙu between them; collective.
+class Interval(NamedTuple):
+    """What is known of a number that u has.
 
-    With φ = 1 on Γ1 and 0 on Γ0, ∫_Γ1 κ∂ₙu − ∫_Γ1 y·n is the integral of (κ∇u − y)·∇φ, and the
-    certificate knows a ball in which κ∇u is. φ is found by solving for a harmonic function, as
-    accurately as the figures deserve; that costs about as much as the solve.
+    Attributes:
+        value: The same number of u_h.
+        lower: It is not below this.
+        upper: It is not above this.
+    """
+
+    value: float
+    lower: float
+    upper: float
+
+
+def force_bounds(solution: Certified) -> tuple[float, float]:
+    """Two numbers with the contact force of u itself between them; collective.
+
+    The force is ∫_Γ1 λ, λ = κ∂ₙu + b (u − u_ext) − g, which is κ∂ₙu unless the condition says more.
 
     Args:
         solution: One with a certified bound.
@@ -49,70 +65,156 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     Raises:
         InputError: There is no bound; the message says why.
     """
+    return _interval(solution, diffusion(_certified(solution).level.data).forms.bounded)[1:]
+
+
+def flux(solution: Certified, *parts: str) -> Interval:
+    """What flows into Ω through parts of the boundary, between two numbers; collective.
+
+    On a Dirichlet part that is ∫ κ∂ₙu, on a contact part the contact force, as in `force_bounds`.
+
+    Args:
+        solution: One with a certified bound.
+        *parts: Names of Dirichlet or contact parts that touch no others of these.
+
+    Raises:
+        InputError: There is no such part, or there is no bound; the message says why.
+    """
+    forms = diffusion(_certified(solution).level.data).forms
+    known = {c.part: c for c in (*forms.fixed, *forms.bounded)}
+    for part in parts:
+        if part not in known:
+            raise InputError(
+                f"{part!r} is no Dirichlet or contact part of the boundary; there are"
+                f" {', '.join(known)}"
+            )
+    return _interval(solution, [known[part] for part in parts])
+
+
+def _certified(solution: Certified) -> Made:
+    """What the certificate is made of; an error where there is none."""
     certificate = solution.certificate
-    made = certificate._made
-    if made is None or certificate.bound_h1 is None:
+    if certificate._made is None or certificate.bound_h1 is None:
         raise InputError(f"{NO_BOUNDS}: {certificate.reason}")
-    level = made.level
+    return certificate._made
+
+
+def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
+    """Bound ∫ λ over parts; collective.
+
+    With φ = 1 on them and φ = 0 on the rest of Γ0 and Γ1 it is a(u, φ) − χ(φ), and the certificate
+    knows a ball that A u is in. φ is found by solving for nearly the least ‖Aφ‖, as accurately as
+    the figures deserve; that costs about as much as the solve.
+    """
+    made = _certified(solution)
+    level, d = made.level, made.level.domain.mesh.topology.dim
+    if made.varies or d != 2:
+        raise InputError(f"{NO_BOUNDS}: {VARIES if made.varies else SPATIAL}")
     cells = Cells(level.domain, level.V)
-    lost = diffusion(level.data).forms.of_one is not None
-    if lost or made.varies or cells.tdim != 2:
-        why = LOST if lost else VARIES if made.varies else SPATIAL
-        raise InputError(f"{NO_BOUNDS}: {why}")
-    phi = _weight(solution)
-    at_vertices = np.ascontiguousarray(
-        phi.x.array[phi.function_space.dofmap.list[: cells.number]].T
-    )
+    phi = _weight(solution, conditions)
+    at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     everywhere = slice(0, cells.number)
-    slopes = cells.apply(at_vertices, everywhere)
-    w = made.w
+    w, P, total = made.w, made.excess, sum_rows(at)
+    own = cells.apply(w, everywhere)
+    # (A v − p', Aφ) with p' = p + A u_h, cell by cell: first gradients, then c, then b
     v = made.vertices[cells.vertices]
-    P, d = made.excess, cells.tdim
-    # ½ ∫ (κ∇v − y − σ)·∇φ
-    total = sum_rows(at_vertices)
-    work = made.kappa * (dot_rows(v, slopes) - dot_rows(w, slopes))
-    work -= made.kappa * 4 / 3 * dot_rows(made.bumps[cells.facets], slopes)
+    slopes = cells.apply(at, everywhere)
+    height = made.bumps[cells.facets]
+    work = made.kappa * (
+        dot_rows(v, slopes) - dot_rows(w, slopes) - 4 / 3 * dot_rows(height, slopes)
+    )
     if made.cusps is not None:
         pull, _ = made.cusps.pulls(cells)
-        work[made.cusps.at] += dot_rows(pull, at_vertices[:, made.cusps.at])
+        work[made.cusps.at] += dot_rows(pull, at[:, made.cusps.at])
     s = sum_rows(P)
-    work -= (s * total - dot_rows(P, at_vertices)) / d - s * total / (d + 1)
+    work -= (s * total - dot_rows(P, at)) / d - s * total / (d + 1)
     if made.hats is not None:
-        work -= cells.volume * dot_rows(made.hats, at_vertices)
+        work -= cells.volume * dot_rows(made.hats, at)
+    if made.reaction:
+        apart = v - w
+        means = (sum_rows(apart) * total + dot_rows(apart, at)) / 12.0
+        means += (2.0 * sum_rows(height) * total - dot_rows(height, at)) / 15.0
+        work += made.reaction * cells.volume * means
+    slack = np.abs(made.left * total) / (d + 1)
+    if made.taken_up:
+        work -= made.left * total / (d + 1)
+        slack[:] = 0.0
     edge = made.segments
-    ends = at_vertices[cells.others[edge.side.local].T, edge.side.cells]
+    ends = at[cells.others[edge.side.local].T, edge.side.cells]
     on_edge = np.einsum("qin,in->qn", edge.hats, ends)
-    edge_work = np.sum(edge.measure * edge.weights[:, None] * edge.rest * on_edge)
-    energy = np.sum(made.kappa * dot_rows(at_vertices, slopes))
-    middle, energy = cells.total(
-        made.force + 0.5 * (float(np.sum(work)) - float(edge_work)), float(energy)
+    of_edge = edge.measure * np.sum(edge.weights[:, None] * edge.rest * on_edge, axis=0)
+    if edge.loss.any():
+        jump = on_facet(cells, edge.side, edge.hats, made.vertices, made.bumps)
+        trace = w[cells.others[edge.side.local].T, edge.side.cells]
+        jump -= np.einsum("qin,in->qn", edge.hats, trace)
+        loss = edge.loss[edge.place] * edge.measure
+        of_edge = of_edge - loss * np.sum(edge.weights[:, None] * jump * on_edge, axis=0)
+    if made.shed is not None:
+        share = edge.measure / np.bincount(edge.place, edge.measure)[edge.place]
+        of_edge = of_edge + made.shed[edge.place] * share * (edge.weights @ on_edge)
+    force = 0.0
+    for condition in conditions:
+        if condition.number in made.forces:
+            force += made.forces[condition.number]
+        else:
+            side = cells.sides[condition.number]
+            through = P - d * made.kappa * own
+            force += float(np.sum(through[side.local, side.cells]))
+    at_fixed = any(condition.fixed is not None for condition in conditions)
+    value, middle, energy, unsure = cells.total(
+        force,
+        force + 0.5 * (np.sum(work) - np.sum(of_edge)),
+        _square(made, cells, at),
+        # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
+        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if at_fixed else 0.0,
     )
-    reach = made.reach * np.sqrt(energy)
-    return max(float(middle - reach), 0.0), float(middle + reach)
+    reach = made.reach * np.sqrt(energy) + unsure
+    # a force off one bound only has its sign
+    signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
+    lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
+    lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
+    return Interval(float(value), lower, upper)
 
 
-def _weight(solution: Certified) -> fem.Function:
-    """A P1 function that is 1 on Γ1, 0 on Γ0, and nearly harmonic between them."""
+def _square(made: Made, cells: Cells, at: FloatArray) -> float:
+    """‖Aφ‖², this rank's share, from φ at the cells' vertices."""
+    total, edge = sum_rows(at), made.segments
+    slopes = cells.apply(at, slice(0, cells.number))
+    square = float(np.sum(made.kappa * dot_rows(at, slopes)))
+    square += made.reaction / 12.0 * float(cells.volume @ (total**2 + dot_rows(at, at)))
+    a, b = at[cells.others[edge.facets.local].T, edge.facets.cells]
+    measure = np.bincount(edge.place, edge.measure, minlength=len(a))
+    return square + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
+
+
+def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Function:
+    """A P1 function, 1 on some parts, 0 on the rest of Γ0 and Γ1, with nearly the least ‖Aφ‖."""
     domain = solution.domain
     mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
-    V = fem.functionspace(mesh, ("Lagrange", 1))
+    data = diffusion(solution.level.data)
+    V, forms = function_space(mesh, "P1"), data.forms
     phi, marks = fem.Function(V), fem.Function(V)
-    forms, parts = diffusion(solution.level.data).forms, []
-    for conditions in (forms.bounded, forms.fixed):
+    others = [c for c in (*forms.fixed, *forms.bounded) if c not in conditions]
+    parts = []
+    for each in (conditions, others):
         marks.x.array[:] = 0.0
-        marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, conditions))] = 1.0
+        marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, each))] = 1.0
         seen = shared_sum(mesh.comm, V.dofmap.index_map, marks.x.array)
         parts.append(np.flatnonzero(seen > 0).astype(np.int32))
-    bounded, fixed = parts
-    both = len(np.intersect1d(bounded, fixed))
-    if mesh.comm.allreduce(both) > 0:
-        raise InputError(f"{NO_BOUNDS}: {TOUCHES}")
-    u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
+    chosen, rest = parts
+    both, zeros = mesh.comm.allreduce(np.array([len(np.intersect1d(chosen, rest)), len(rest)]))
+    if both > 0:
+        all_of_it = len(conditions) == len(forms.bounded) and not any(
+            condition.fixed is not None for condition in conditions
+        )
+        raise InputError(f"{NO_BOUNDS}: {TOUCHES if all_of_it else MEETS}")
+    if zeros == 0 and forms.of_one is None:
+        phi.x.array[:] = 1.0
+        return phi
     known = np.concatenate(parts)
     marks.x.array[:] = 0.0
-    marks.x.array[bounded] = 1.0
-    bc = fem.dirichletbc(marks, known)
-    form = compiled(mesh.comm, fem.form, ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    marks.x.array[chosen] = 1.0
+    bc, form = fem.dirichletbc(marks, known), forms.a_p1.on(domain, [V, V])
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])
@@ -122,7 +224,7 @@ def _weight(solution: Certified) -> fem.Function:
     solve_once(A, load, found, WEIGHT, ESTIMATE_PREFIX)
     release(A, load, found)
     # Exactly so, whatever the solver did
-    phi.x.array[bounded] = 1.0
-    phi.x.array[fixed] = 0.0
+    phi.x.array[chosen] = 1.0
+    phi.x.array[rest] = 0.0
     phi.x.scatter_forward()
     return phi

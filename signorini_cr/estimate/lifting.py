@@ -1,8 +1,9 @@
 """What u_D and α have beyond v on boundary facets, enclosed and lifted into the cells.
 
-δ is u_D − v on Γ0, and (α − α_I)⁺ on Γ1, where α_I ≤ v is the polynomial that α is interpolated by.
-It vanishes at the facets' ends, and ℓ(P + t(z − P)) = t^k δ(z) brings it into the cell, P opposite
-the facet. What is needed are bounds of |δ| and |δ'|, piece by piece; k is the best for them.
+δ is u_D − v on Γ0, and (α − α_I)⁺ on Γ1, where α_I ≤ v is the polynomial that α is interpolated by;
+with bounds on both sides, so that v + ℓ passes neither, it is (α − v)⁺ − (v − β)⁺. It vanishes at
+the facets' ends, and ℓ(P + t(z − P)) = t^k δ(z) brings it into the cell, P opposite the facet.
+What is needed are bounds of |δ| and |δ'|, piece by piece; k is the best for them.
 """
 
 from __future__ import annotations
@@ -88,23 +89,28 @@ class Lift:
     edge: FloatArray
     reason: str | None = None
 
+    @classmethod
+    def none(cls, least: FloatArray, reason: str | None = None) -> Lift:
+        """Nothing to lift, or nothing that can be."""
+        zero = np.zeros_like(least)
+        return cls(zero, zero, zero, least, zero, reason)
+
 
 def joined(lifts: Sequence[Lift]) -> Lift:
     """Those of several parts, one after the other; with one reason, if there is one."""
-    rows = [
-        np.concatenate([np.empty(0), *(getattr(each, name) for each in lifts)])
+    rows = {
+        name: np.concatenate([np.empty(0), *(getattr(each, name) for each in lifts)])
         for name in ("steep", "area", "beyond", "least", "edge")
-    ]
+    }
     reason = next((each.reason for each in lifts if each.reason), None)
-    steep, area, beyond, least, edge = rows
-    return Lift(steep, area, beyond, least, edge, reason)
+    return Lift(**rows, reason=reason)
 
 
 def lift(
     cells: Cells,
     side: Side,
     trace: Trace,
-    base: Cubic,
+    base: Cubic | None,
     v: Cubic,
     scale: float,
     goal: float,
@@ -116,16 +122,15 @@ def lift(
         cells: The mesh, of triangles.
         side: The facets.
         trace: The data.
-        base: What δ is measured from.
-        v: The companion, for an obstacle; where the obstacle is below it δ is 0.
+        base: α_I, for an obstacle; None to measure δ from v.
+        v: The companion; on facets where the obstacle is below it δ is 0.
         scale: Size of the values, by which rounding is told.
         goal: What ‖∇ℓ‖ need not be known better than.
         obstacle: Whether δ is the positive part of the difference.
     """
     n, name = len(side.cells), "α" if obstacle else "u_D"
     if trace.constant is not None:
-        zero = np.zeros(n)
-        return Lift(zero, zero, zero, np.full(n, trace.constant), zero)
+        return Lift.none(np.full(n, trace.constant))
     apex, (a, b) = corner_points(cells, side)
     length = np.linalg.norm(b - a, axis=1)
     height = 2.0 * cells.volume[side.cells] / length
@@ -140,7 +145,7 @@ def lift(
         return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
 
     def steepness(pieces: Pieces) -> FloatArray:
-        bound = _bounds(trace, pieces, base, cells, length, scale)
+        bound = _bounds(trace, pieces, base or v, cells, length, scale)
         return np.stack([parts(pieces, *bound[:2]).sum(axis=0), *bound])
 
     weights = np.zeros((4, n))
@@ -151,14 +156,15 @@ def lift(
             pieces = pieces.halves()
         room = 8 * cells.comm.allreduce(n) + 1000
         pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
-        jumps = _jump_at_ends(trace, whole, base, cells, JUMP * scale, obstacle)
+        jumps = _jump_at_ends(trace, whole, base or v, cells, JUMP * scale, obstacle)
         clear = np.zeros(n, dtype=bool)
         if obstacle:
             below = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0] <= 0
             clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
+            if base is None:
+                size, steep = (np.where(below, 0.0, values) for values in (size, steep))
     except Unknown as error:
-        zero = np.zeros(n)
-        return Lift(zero, zero, zero, zero, zero, NO_RANGE.format(name, error))
+        return Lift.none(np.zeros(n), NO_RANGE.format(name, error))
 
     def mean(values: FloatArray) -> FloatArray:
         sums = np.bincount(pieces.parent, pieces.part * values, minlength=n)
@@ -281,13 +287,13 @@ def affine(
     """
     zero = np.zeros(len(side.cells))
     if trace.constant is not None:
-        return Lift(zero, zero, zero, zero + trace.constant, zero)
+        return Lift.none(zero + trace.constant)
     whole = Pieces.of_facets(cells, side)
     boxes = whole.boxes(cells, decide=True)
     try:
         jet = Enclosure(boxes)(trace.deviation.expression)
     except Unknown as error:
-        return Lift(zero, zero, zero, zero, zero, NO_RANGE.format("u_D or α", error))
+        return Lift.none(zero, NO_RANGE.format("u_D or α", error))
     off = zero.copy()
     half = whole.half(boxes)
     for row, mid, rad in zip(jet.rest.rows, jet.rest.mid, jet.rest.rad, strict=True):
@@ -297,4 +303,4 @@ def affine(
             off = off + 2.0 * (np.abs(mid) + rad) * size
     curved = not (off <= JUMP * scale).all() or (values - v > JUMP * scale).any()
     reason = CURVED if curved else None
-    return Lift(zero, zero, zero, values.mean(axis=0) - off, zero, reason)
+    return Lift.none(values.mean(axis=0) - off, reason)

@@ -407,3 +407,12 @@ def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArr
         for i, j in combinations(range(size + 1), 2)
     ]
     return volume, np.stack(rows)
+
+
+def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
+    """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
+    out = np.empty(cells.facets.shape)
+    for part in blocks(cells.number):
+        values = u[cells.facets[:, part]]
+        np.subtract(sum_rows(values), cells.tdim * values, out=out[:, part])
+    return out

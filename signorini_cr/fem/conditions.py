@@ -29,6 +29,12 @@ def number(expression: Expr) -> float | None:
     return None
 
 
+def negative(expression: Expr) -> Expr:
+    """The same with the other sign; a number remains one."""
+    value = number(expression)
+    return -expression if value is None else ufl.as_ufl(-value)
+
+
 @dataclass(frozen=True)
 class Given:
     """What conditions are made from.
@@ -54,7 +60,6 @@ class Condition:
         label: What its main datum is called, for messages: a key of a problem file.
         source: What that is from: the same, or "exact.u".
         uncertified: Why no certificate covers it; None where one does.
-        optional: Whether the main datum may be None, for what follows from an exact solution, or 0.
     """
 
     part: str = ""
@@ -62,7 +67,6 @@ class Condition:
     label: str = ""
     source: str = ""
     uncertified: ClassVar[str | None] = None
-    optional: ClassVar[bool] = True
 
     def made(self, given: Given, part: str, number: int, label: str) -> Self:
         """Make it from expressions, for a part of the boundary.
@@ -78,7 +82,9 @@ class Condition:
         own = {name: getattr(self, name) for name in self.names()} | (
             {main: 0.0} if left_out else {}
         )
-        expressions = {name: given.expression(value) for name, value in own.items()}
+        expressions = {
+            name: None if value is None else given.expression(value) for name, value in own.items()
+        }
         if left_out and (derived := self._derived(given, expressions)) is not None:
             expressions[main], source = derived, "exact.u"
         return replace(self, part=part, number=number, label=label, source=source, **expressions)
@@ -99,11 +105,17 @@ class Condition:
         return getattr(self, self.names()[0])
 
     @property
+    def optional(self) -> bool:
+        """Whether the main datum, if it is None, follows from an exact solution, or is 0."""
+        return True
+
+    @property
     def data(self) -> dict[str, Any]:
         """All its data by what they are called in messages."""
         first, *others = self.names()
         called = {first: self.label, **{name: f"boundary.{self.part}.{name}" for name in others}}
-        return {called[name]: getattr(self, name) for name in self.names()}
+        values = {called[name]: getattr(self, name) for name in self.names()}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def fixed(self) -> Any:
@@ -111,9 +123,9 @@ class Condition:
         return None
 
     @property
-    def lower(self) -> Any:
-        """What u must not be below."""
-        return None
+    def bounds(self) -> tuple[tuple[int, Any], ...]:
+        """What bounds u: s u must not be below a, for each pair (s, a), where s is 1 or −1."""
+        return ()
 
     @property
     def flux(self) -> Any:
@@ -197,25 +209,34 @@ class Robin(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Contact(Condition):
-    """u ≥ α, λ ≥ 0, and one of them with equality, for λ = κ∂ₙu + b (u − u_ext) − g.
+    """α ≤ u ≤ β: λ = κ∂ₙu + b (u − u_ext) − g is not below 0 where u > α, nor above 0 where u < β.
+
+    So λ = 0 between the bounds; with α alone it is the condition u ≥ α, λ ≥ 0, λ (u − α) = 0.
 
     Attributes:
-        obstacle: α.
+        obstacle: α; None for none if there is a β, else 0.
+        upper: β; None for none.
         coefficient: b ≥ 0.
         external: u_ext.
-        g: A flux into the domain that does not come from the obstacle.
+        g: A flux into the domain that does not come from an obstacle.
     """
 
-    optional = False
-    obstacle: Data = 0.0
+    obstacle: Data | None = None
+    upper: Data | None = field(default=None, kw_only=True)
     coefficient: Data = field(default=0.0, kw_only=True)
     external: Data = field(default=0.0, kw_only=True)
     g: Data = field(default=0.0, kw_only=True)
 
     @property
-    def lower(self) -> Any:
-        """All of α."""
-        return self.obstacle
+    def optional(self) -> bool:
+        """Not if there is no α."""
+        return self.upper is None
+
+    @property
+    def bounds(self) -> tuple[tuple[int, Any], ...]:
+        """That is u ≥ α and −u ≥ −β."""
+        below = () if self.obstacle is None else ((1, self.obstacle),)
+        return below if self.upper is None else (*below, (-1, negative(self.upper)))
 
     @property
     def flux(self) -> Any:

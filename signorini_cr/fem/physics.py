@@ -29,6 +29,7 @@ class Imposed:
         components: Which unknowns of a facet it is about, shape (c,).
         means: Their values' means over the facets, shape (n, c).
         ends: Their values at the vertices, shape (n, d, c).
+        sign: Of a bound: s, where s times the unknown must not be below the values.
     """
 
     key: str
@@ -36,6 +37,7 @@ class Imposed:
     components: Int32Array
     means: FloatArray
     ends: FloatArray
+    sign: int = 1
 
 
 class OnMesh(Protocol):
@@ -58,8 +60,8 @@ class OnMesh(Protocol):
         """What is set on Γ0: all unknowns of a facet."""
 
     @property
-    def lower(self) -> tuple[Imposed, ...]:
-        """Lower bounds on Γ1: of one unknown a facet."""
+    def bounds(self) -> tuple[Imposed, ...]:
+        """Bounds on Γ1: of one unknown a facet."""
 
     def chi(self) -> FloatArray:
         """χ by unknown, this rank's cells' share, ghosts included."""

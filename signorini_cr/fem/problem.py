@@ -11,7 +11,7 @@ have conditions of their own (see `conditions`).
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -26,10 +26,26 @@ from ufl.core.expr import Expr
 from ..arrays import Int32Array
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import PARTS, Domain
+from ..mesh.domain import PARTS, Domain, is_by_cells
+from ..mesh.materials import Materials
 from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, number
 from .simplified import simplified
 from .space import facet_entities, ufl_element
+
+
+@dataclass(frozen=True)
+class Material:
+    """Data where the domain consists of a material; None for those of the `Problem`.
+
+    Attributes:
+        coefficient: κ.
+        f: Volume load.
+        reaction: c.
+    """
+
+    coefficient: Data | None = None
+    f: Data | None = None
+    reaction: Data | None = None
 
 
 @dataclass(frozen=True)
@@ -45,6 +61,8 @@ class Problem:
         reaction: c, not below 0.
         conditions: What holds on parts of the boundary, by their names in the domain; g, obstacle
             and dirichlet are for the parts neumann, contact and dirichlet where they aren't here.
+        materials: The data of materials, by their names in the domain; what is not said there, and
+            cells without material, have coefficient, f and reaction.
         exact: The exact solution, where it is known. f, g and u_D that are None are then
             derived from it by differentiation; without it, None means 0.
         quadrature_degree: Polynomial degree up to which loads and coefficient are integrated
@@ -59,6 +77,7 @@ class Problem:
     coefficient: Data = 1.0
     reaction: Data = 0.0
     conditions: Mapping[str, Condition] = field(default_factory=dict)
+    materials: Mapping[str, Material] = field(default_factory=dict)
     exact: Data | None = None
     quadrature_degree: int = 4
     error_degree: int = 6
@@ -68,7 +87,7 @@ class Problem:
         given = []
         for each in fields(self):
             value = getattr(self, each.name)
-            if each.name == "conditions":
+            if each.name in ("conditions", "materials"):
                 value = list(value) or each.default
             if value is not each.default and value != each.default:
                 given.append(
@@ -112,11 +131,11 @@ class Kernel:
         self._compiled = compiled(mesh.comm, fem.compile_form, mesh.comm, form)
         self._mesh = mesh
         self._stand_ins = tuple(stand_ins)
-        self._own = {
-            w: w
+        self._own = [
+            w
             for w in ufl.algorithms.extract_coefficients(form)
             if not any(w is s for s in self._stand_ins)
-        }
+        ]
         self._constants = {c: c for c in ufl.algorithms.analysis.extract_constants(form)}
         self._sides = sorted(
             {
@@ -144,7 +163,8 @@ class Kernel:
             list(spaces),
             domain.mesh,
             subdomains,
-            self._own | dict(zip(self._stand_ins, functions, strict=True)),
+            {w: domain.own(w) for w in self._own}
+            | dict(zip(self._stand_ins, functions, strict=True)),
             self._constants,
         )
 
@@ -157,6 +177,7 @@ class Forms:
         mesh: A mesh of the kind they will be used on; data tied to a mesh must be tied to this one.
         element: "CR" or "P1".
         parts: The parts of the boundary by name, and their values in facet tags.
+        materials: What the mesh's cells consist of.
 
     Attributes:
         f: Volume load.
@@ -173,6 +194,7 @@ class Forms:
         mesh: Mesh,
         element: str = "CR",
         parts: Mapping[str, int] = PARTS,
+        materials: Materials | None = None,
     ):
         self.problem, self.mesh, self.element = problem, mesh, element
         cell = mesh.ufl_domain()
@@ -180,7 +202,9 @@ class Forms:
         self.w = ufl.Coefficient(self.space)
         self.dx, self.ds = ufl.Measure("dx", cell), ufl.Measure("ds", cell)
         self.x = ufl.SpatialCoordinate(cell)
-        self.kappa = as_expression(problem.coefficient, self.x)
+        materials = materials or Materials()
+        _check_materials(problem, materials)
+        self.kappa = self._by_material("coefficient", problem.coefficient, materials)
         if self.uniform and not float(self.kappa) > 0.0:
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
@@ -190,15 +214,12 @@ class Forms:
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
         self.asked = None if flux is None else simplified(-ufl.div(flux))
-        self.reaction = as_expression(problem.reaction, self.x)
+        self.reaction = self._by_material("reaction", problem.reaction, materials)
         if self.exact is not None and number(self.reaction) != 0.0:
             gain = self.reaction * self.exact
             self.asked = gain if self.asked is None else simplified(self.asked + gain)
-        own = problem.f
-        if own is None and self.asked is not None:
-            self.f = self.asked
-        else:
-            self.f = as_expression(0.0 if own is None else own, self.x)
+        derived = 0.0 if self.asked is None else self.asked
+        self.f = self._by_material("f", derived if problem.f is None else problem.f, materials)
         given = Given(lambda data: as_expression(data, self.x), self.exact, outward)
         self.conditions = _conditions(problem, given, parts)
         d = mesh.geometry.dim
@@ -207,6 +228,46 @@ class Forms:
                 raise InputError(f"data: {key} has the shape {data.ufl_shape}; a scalar is needed")
             if any(found != cell for found in ufl.domain.extract_domains(data)):
                 raise InputError(f"data: {key} is given on another mesh than the one to solve on")
+
+    def _by_material(self, name: str, usual: Data, materials: Materials) -> Expr:
+        """A datum that materials may have of their own, and elsewhere is the usual one."""
+        base = as_expression(usual, self.x)
+        own = {
+            material: as_expression(datum, self.x)
+            for material, data in self.problem.materials.items()
+            if (datum := getattr(data, name)) is not None
+        }
+        numbers = [number(each) for each in (base, *own.values())]
+        if None not in numbers:
+            if len(set(numbers)) == 1:
+                return base
+            return self._on_cells(name, numbers, materials, own)
+        found = base
+        for material, datum in own.items():
+            if datum.ufl_shape != base.ufl_shape:
+                raise InputError(
+                    f"materials: {name} of {material} has the shape {datum.ufl_shape}, but"
+                    f" {base.ufl_shape} elsewhere"
+                )
+            there = self._on_cells(f"in {material}", [0.0, 1.0], materials, (material,))
+            found = ufl.conditional(ufl.gt(there, 0.5), datum, found)
+        return found
+
+    def _on_cells(
+        self,
+        name: str,
+        numbers: Sequence[float | None],
+        materials: Materials,
+        own: Iterable[str],
+    ) -> fem.Function:
+        """A number for cells without material of its own, and one for each that has."""
+        function = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=name)
+        dofs = function.function_space.dofmap.list[:, 0]
+        function.x.array[dofs] = numbers[0]
+        for material, value in zip(own, numbers[1:], strict=True):
+            function.x.array[dofs[materials.where(material)]] = value
+        function.x.scatter_forward()
+        return function
 
     @property
     def _data(self) -> dict[str, Expr]:
@@ -231,7 +292,7 @@ class Forms:
     @property
     def bounded(self) -> tuple[Condition, ...]:
         """The conditions that bound u: their parts make Γ1."""
-        return tuple(c for c in self.conditions if c.lower is not None)
+        return tuple(c for c in self.conditions if c.bounds)
 
     @property
     def natural(self) -> tuple[Condition, ...]:
@@ -252,6 +313,8 @@ class Forms:
     @property
     def uncertified(self) -> str | None:
         """Why there is no certificate, if the reaction or some condition has none."""
+        if is_by_cells(self.reaction):
+            return "the reaction differs from cell to cell, and has one number in the bounds"
         if number(self.reaction) is None:
             return "the reaction is no number: its part of the energy has no enclosure"
         for condition in self.conditions:
@@ -267,23 +330,25 @@ class Forms:
         u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         return Kernel(self._bilinear(u, v), self.mesh)
 
-    def insist_on_mesh(self, mesh: Mesh) -> None:
+    def insist_on_data(self, domain: Domain) -> None:
         """Refuse a mesh on which the data are not to be had.
 
         Raises:
-            InputError: The data hold a Function on another mesh.
+            InputError: The data hold a Function on another mesh that can't be carried to this one.
         """
-        held = (ufl.algorithms.extract_coefficients(each) for each in self._data.values())
-        if mesh is not self.mesh and any(held):
-            raise InputError(
-                "data given as a dolfinx Function live on one mesh only; give a function of x "
-                "to solve on a sequence of meshes"
-            )
+        for each in self._data.values():
+            for function in ufl.algorithms.extract_coefficients(each):
+                domain.own(function)
 
     @property
     def uniform(self) -> bool:
         """Whether κ is a number."""
         return number(self.kappa) is not None
+
+    @property
+    def steady(self) -> bool:
+        """Whether κ is a number on each cell of the coarsest mesh."""
+        return self.uniform or is_by_cells(self.kappa)
 
     @property
     def loaded(self) -> bool:
@@ -321,7 +386,7 @@ class Forms:
 
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
         """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
-        rule = {} if self.uniform else {"quadrature_degree": self.problem.quadrature_degree}
+        rule = {} if self.steady else {"quadrature_degree": self.problem.quadrature_degree}
         form = ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
         return sum(self._without_gradients(u, v), form)
 
@@ -364,6 +429,16 @@ class Forms:
         return float(h1), float(l2)
 
 
+def _check_materials(problem: Problem, materials: Materials) -> None:
+    """Insist on materials that are there."""
+    for name, material in problem.materials.items():
+        if name not in materials.numbers:
+            there = ", ".join(materials.numbers) or "none"
+            raise InputError(f"materials: the domain has none called {name!r}; there are: {there}")
+        if not isinstance(material, Material):
+            raise InputError(f"materials: {name!r} is {material!r}; a Material is needed")
+
+
 def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tuple[Condition, ...]:
     """What holds on each part of the boundary.
 
@@ -373,7 +448,7 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
     usual: dict[str, tuple[Condition, str]] = {
         "dirichlet": (Dirichlet(problem.dirichlet), "data.dirichlet"),
         "neumann": (Neumann(problem.g), "data.g"),
-        "contact": (Contact(problem.obstacle), "data.obstacle"),
+        "contact": (Contact(given.expression(problem.obstacle)), "data.obstacle"),
     }
     for name, condition in problem.conditions.items():
         if name not in parts:

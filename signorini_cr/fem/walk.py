@@ -22,8 +22,8 @@ def along_boundary(
     Args:
         mesh: The mesh.
         facets: The contact facets that this rank owns, shape (n,).
-        fields: What `Contact` has of them: vertices, measure, obstacle, u, pressure, active and
-            gap_at_vertices.
+        fields: What `Contact` has of them: vertices, measure, obstacle, upper, u, pressure, active
+            and gap_at_vertices.
 
     Returns:
         The table on rank 0 (None elsewhere), and the transition points on all ranks.
@@ -56,7 +56,9 @@ def _columns(
 ) -> dict[str, npt.NDArray]:
     """The columns of the table, rows in the order they are in."""
     midpoints = rows["vertices"].mean(axis=1)
-    given = {name: rows[name] for name in ("obstacle", "u", "pressure", "active")}
+    names = ["obstacle", "upper"] if np.isfinite(rows["upper"]).any() else ["obstacle"]
+    bounds = {name: np.where(np.isfinite(rows[name]), rows[name], np.nan) for name in names}
+    given = bounds | {name: rows[name] for name in ("u", "pressure", "active")}
     place = {"part": part, "arc_length": arc_length, "x": midpoints[:, 0], "y": midpoints[:, 1]}
     return place | {"length": rows["measure"]} | given
 
@@ -137,7 +139,8 @@ def _transitions(
     free_is_later = active[earlier]
     free = np.where(free_is_later, later, earlier)
     vertex_gap = gaps[free, np.where(free_is_later, 0, 1)]
-    middle_gap = rows["u"][free] - rows["obstacle"][free]
+    u = rows["u"][free]
+    middle_gap = np.minimum(u - rows["obstacle"][free], rows["upper"][free] - u)
     inside = (vertex_gap < 0) & (middle_gap > 0)
     share = np.where(inside, middle_gap / np.where(inside, middle_gap - vertex_gap, 1.0), 1.0)
     return midpoints[free] + share[:, None] * (ends[later, 0] - midpoints[free]), earlier

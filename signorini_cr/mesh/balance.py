@@ -13,6 +13,7 @@ from .. import compat
 from ..arrays import IndexArray, Int32Array
 from .domain import Domain
 from .exchange import Exchange
+from .materials import Materials
 from .partition import bisect
 from .refinement import labels, tagged
 
@@ -46,9 +47,15 @@ def balance(domain: Domain, parent: Int32Array) -> Refined:
     rank = np.searchsorted(starts, number, side="right") - 1
     before = Exchange(comm, rank, number - starts[rank])
     known = before.fetch(np.column_stack([parent, labels(domain)]))[before.place]
+    materials = domain.materials
+    if materials.numbers:
+        of_cells = before.fetch(materials.of_cells)[before.place]
+        materials = Materials(materials.numbers, of_cells)
     parents = Exchange(comm, rank, known[:, 0])
     tags = tagged(mesh, known[:, 1:])
-    return Domain(mesh, tags, parts=domain.parts), parents.place, parents
+    coarser = domain.coarser and (domain.coarser[0], parents.place, parents)
+    moved = Domain(mesh, tags, parts=domain.parts, materials=materials, coarser=coarser)
+    return moved, parents.place, parents
 
 
 def _moved(mesh: Mesh) -> Mesh:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import basix.ufl
 import numpy as np
-from dolfinx import la
+from dolfinx import fem, la
 from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
 from dolfinx.mesh import (
@@ -28,10 +28,13 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
 from ..errors import InputError, on_root, raise_together
 from . import gmshmesh
+from .exchange import Exchange
+from .materials import Materials
+from .materials import numbered as numbered_materials
 from .partition import by_position
 from .polygon import check_labels, check_loops, coordinates
 
@@ -50,6 +53,9 @@ class Domain:
         mesh: Affine simplices; no ghost cells when we make it.
         tags: Facet tags; each exterior facet has the value of one part.
         parts: The parts' names, and their values in the tags.
+        materials: What the cells consist of.
+        coarser: What it was refined from, the cell there that holds each cell, and what fetches
+            these cells from other ranks, as `balance.balance` returns them.
         seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
@@ -57,6 +63,8 @@ class Domain:
     tags: MeshTags
     seconds: float = 0.0
     parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
+    materials: Materials = field(default_factory=Materials)
+    coarser: tuple[Domain, Int32Array | IndexArray, Exchange | None] | None = None
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
@@ -86,12 +94,49 @@ class Domain:
             for part in self.parts.values()
         }
 
+    @cached_property
+    def _own(self) -> dict[fem.Function, fem.Function]:
+        """What `own` has made."""
+        return {}
+
+    def own(self, function: fem.Function) -> fem.Function:
+        """Carry a function that is constant on each cell of a coarser mesh to this one; collective.
+
+        Args:
+            function: Of degree 0, on this mesh or on one that it was refined from.
+
+        Raises:
+            InputError: It is of another degree, or on another mesh.
+        """
+        V = function.function_space
+        if V.mesh is self.mesh:
+            return function
+        if self.coarser is None or not is_by_cells(function):
+            raise InputError(
+                "data given as a dolfinx Function live on one mesh only, unless they are of degree"
+                " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
+            )
+        if function not in self._own:
+            coarse, parents, exchange = self.coarser
+            above = coarse.own(function)
+            fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
+            at = (space.dofmap.list[:, 0] for space in (fine.function_space, above.function_space))
+            here, there = at
+            values = above.x.array[there]
+            if exchange is not None:
+                values = exchange.fetch(values)
+            fine.x.array[here[: len(parents)]] = values[parents]
+            self._own[function] = fine
+        return self._own[function]
+
     @classmethod
     def from_tags(
         cls,
         mesh: Mesh,
         facet_tags: MeshTags,
         *,
+        cell_tags: MeshTags | None = None,
+        materials: Mapping[str, int | Sequence[int]] | None = None,
         contact: int | Sequence[int] | None = None,
         dirichlet: int | Sequence[int] | None = None,
         neumann: int | Sequence[int] | None = None,
@@ -109,6 +154,9 @@ class Domain:
         Args:
             mesh: Triangles or tetrahedra, straight-sided, any ghost mode.
             facet_tags: Values on facets.
+            cell_tags: Values on cells, for the materials.
+            materials: The value or values there that stand for each material, by names of your
+                own; `Problem.materials` has their data. Cells without any have those of `Problem`.
             contact: The value or values that stand for Γ1; 1 if there are no further parts.
             dirichlet: The value or values that stand for Γ0; 2 if there are no further parts.
             neumann: The value or values that stand for Γg; named so that they can be checked.
@@ -172,7 +220,17 @@ class Domain:
                 f"exterior facets are tagged {_list(left)}, which stands for nothing:"
                 f" {', '.join(words[:-1])} and {words[-1]}"
             )
-        return cls(mesh, meshtags(mesh, fdim, exterior, values[exterior]), parts=parts)
+        made = Materials.from_tags(mesh, cell_tags, materials or {})
+        tags = meshtags(mesh, fdim, exterior, values[exterior])
+        return cls(mesh, tags, parts=parts, materials=made)
+
+
+def is_by_cells(function: object) -> bool:
+    """Whether it is a scalar function that is constant on each cell."""
+    if not isinstance(function, fem.Function) or function.ufl_shape:
+        return False
+    element = function.function_space.ufl_element()
+    return bool(element.embedded_superdegree == 0)
 
 
 def numbered(names: Iterable[str]) -> dict[str, int]:
@@ -225,6 +283,9 @@ class Polygon:
         holes: Polygons inside this one, apart from each other.
         names: Further parts that there may be, whose conditions are in `Problem.conditions`. With
             some, there need be no edge that is contact, and none that is dirichlet.
+        materials: What lies in a polygon, shape (n, 2), consists of a material, whose data are in
+            `Problem.materials`. These polygons may share edges and reach beyond the domain, but not
+            overlap; lines of the mesh follow their edges.
 
     Raises:
         InputError: An outline crosses itself or another one, or a label is not known.
@@ -234,6 +295,7 @@ class Polygon:
     boundary: tuple[str, ...]
     holes: tuple[Polygon, ...] = ()
     names: tuple[str, ...] = ()
+    materials: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Take lists as well as arrays and check everything that can be checked at once."""
@@ -243,6 +305,13 @@ class Polygon:
         object.__setattr__(self, "names", tuple(self.names))
         check_labels(self.boundary, len(self.vertices), (*PARTS, *self.names))
         check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
+        polygons = {name: coordinates(polygon) for name, polygon in self.materials.items()}
+        object.__setattr__(self, "materials", polygons)
+        for name, polygon in polygons.items():
+            try:
+                check_loops([polygon])
+            except InputError as error:
+                raise InputError(f"the material {name}: {error}") from None
         if any(hole.holes for hole in self.holes):
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
@@ -286,7 +355,9 @@ class Polygon:
         loops = [self.vertices, *(hole.vertices for hole in self.holes)]
         names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
         labels = np.array([self.parts[name] for name in names], dtype=np.int32)
-        return _distribute(comm, self.parts, gmshmesh.triangulate, loops, labels, float(size))
+        numbers = numbered_materials(list(self.materials))
+        what = loops, labels, float(size), self.materials, numbers
+        return _distribute(comm, self.parts, numbers, gmshmesh.triangulate, *what)
 
     @property
     def parts(self) -> dict[str, int]:
@@ -296,7 +367,10 @@ class Polygon:
 
 
 def read_gmsh(
-    path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD, names: Sequence[str] = ()
+    path: str | Path,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    names: Sequence[str] = (),
+    materials: Sequence[str] = (),
 ) -> Domain:
     """Read a gmsh file (2.2 or 4.1, ASCII or binary) with named physical curves; collective.
 
@@ -309,21 +383,24 @@ def read_gmsh(
         comm: The ranks that share the mesh.
         names: Further curves to look for, whose conditions are in `Problem.conditions`. With some,
             there need be no curve named contact, and none named dirichlet.
+        materials: Physical surfaces to look for, whose data are in `Problem.materials`.
 
     Raises:
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
-    parts = numbered(names)
-    return _distribute(comm, parts, gmshmesh.read, Path(path), parts, not names)
+    parts, numbers = numbered(names), numbered_materials(materials)
+    what = Path(path), parts, not names, numbers
+    return _distribute(comm, parts, numbers, gmshmesh.read, *what)
 
 
 def _distribute(
     comm: MPI.Comm,
     parts: Mapping[str, int],
+    numbers: Mapping[str, int],
     make: Callable[..., gmshmesh.Triangulation],
     *args: object,
 ) -> Domain:
-    """Make arrays on rank 0, share them out as a mesh without ghost cells, and carry the labels."""
+    """Make arrays on rank 0, share them out as a mesh without ghost cells, labels and materials."""
     began = time.perf_counter()
     raw: gmshmesh.Triangulation | None = None
 
@@ -352,4 +429,11 @@ def _distribute(
     values = np.full(_count(mesh, 1), REST, dtype=np.int32)
     values[found.indices] = found.values
     tags = meshtags(mesh, 1, exterior, values[exterior])
-    return Domain(mesh, tags, time.perf_counter() - began, parts)
+    materials = Materials()
+    if numbers:
+        corners, of_cells = distribute_entity_data(mesh, 2, raw.triangles, raw.materials)
+        materials = Materials(numbers, np.zeros(_count(mesh, 2), dtype=np.int32))
+        mesh.topology.create_connectivity(2, 2)
+        cells = meshtags_from_entities(mesh, 2, adjacencylist(corners), of_cells)
+        materials.of_cells[cells.indices] = cells.values
+    return Domain(mesh, tags, time.perf_counter() - began, parts, materials)

@@ -52,7 +52,9 @@ def structured(
         raise InputError(
             f"shift is {shift} and jitter {jitter}: less than 0.5 and 0.25 keep triangles upright"
         )
-    return _distribute(comm, polygon.parts, _squares, polygon, n, shift, jitter, seed)
+    if polygon.materials:
+        raise InputError("squares do not follow the edges of materials; Polygon.mesh does")
+    return _distribute(comm, polygon.parts, {}, _squares, polygon, n, shift, jitter, seed)
 
 
 def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -> Triangulation:

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import difflib
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, Int32Array, Int64Array
+from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..errors import InputError
 from . import mshfile
+from .lines import arranged, sorted_out
 from .mshfile import KINDS, MshFile
 from .planar import overlap, pieces
 
@@ -51,12 +53,15 @@ class Triangulation(NamedTuple):
         triangles: Corners, shape (triangles, 3).
         facets: Ends of the labelled facets, shape (facets, 2).
         labels: Index of each facet's label, shape (facets,).
+        materials: Number of each triangle's material, 0 for none, shape (triangles,); empty where
+            none has a name.
     """
 
     points: FloatArray
     triangles: Int64Array
     facets: Int64Array
     labels: Int32Array
+    materials: Int32Array = np.empty(0, dtype=np.int32)
 
 
 def _keep_sigpipe() -> None:
@@ -99,7 +104,13 @@ def _session() -> Iterator[Any]:
                 gmsh.option.setNumber(name, value)
 
 
-def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) -> Triangulation:
+def triangulate(
+    loops: Sequence[FloatArray],
+    labels: Int32Array,
+    size: float,
+    polygons: Mapping[str, FloatArray],
+    numbers: Mapping[str, int],
+) -> Triangulation:
     """Triangulate a polygon with holes; its vertices become mesh vertices.
 
     Edges are cut into equal facets. Only an edge beside one with much shorter facets is graded
@@ -109,8 +120,12 @@ def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) ->
         loops: Vertices of the polygon and of each hole, shapes (n, 2).
         labels: Label of every edge, one loop after the other.
         size: Facet length wanted; shorter edges get one facet.
+        polygons: Vertices of each material's polygon, whose edges become lines of the mesh.
+        numbers: The materials' numbers.
     """
+    loops, labels, inner = arranged(loops, labels, list(polygons.values()))
     lengths = [np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1) for loop in loops]
+    lengths += [np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)]
     counts = [np.maximum(1, np.ceil(length / size - 1e-9)) for length in lengths]
     triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
     if sum(map(np.sum, counts)) > _MOST_FACETS or triangles > _MOST_TRIANGLES:
@@ -118,9 +133,12 @@ def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) ->
             f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
         )
     facets = [length / count for length, count in zip(lengths, counts)]
-    shortest = min(map(np.min, facets))
-    near_vertices = _sizes(loops, facets)
-    graded = _graded(lengths, facets, near_vertices)
+    ends = [np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in loops] + [inner]
+    shortest = min(each.min(initial=np.inf) for each in facets)
+    x, edges = _numbered(np.concatenate(ends))
+    near = _sizes(x, edges, np.concatenate(facets))
+    near_ends = near[edges]
+    graded = _graded(np.concatenate(lengths), np.concatenate(facets), near_ends)
     if graded > _MOST_GRADED:
         raise InputError(
             f"an edge has facets of {shortest:.3g} beside much longer edges: those that grow from"
@@ -129,18 +147,16 @@ def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) ->
         )
     with _session() as gmsh:
         geo = gmsh.model.geo
-        curves: list[int] = []
-        rings = []
-        for loop, facet, count, near in zip(loops, facets, counts, near_vertices):
-            even = np.minimum(near, np.roll(near, -1)) > _UNEVEN * facet
-            points = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(loop, near)]
-            lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1])]
-            for i in np.flatnonzero(even):
-                geo.mesh.setTransfiniteCurve(lines[i], int(count[i]) + 1)
-            rings.append(geo.addCurveLoop(lines))
-            curves += lines
-        surface = geo.addPlaneSurface(rings)
+        points = [geo.addPoint(*at, 0.0, h) for at, h in zip(x, near)]
+        curves = [geo.addLine(points[a], points[b]) for a, b in edges]
+        even = near_ends.min(axis=1) > _UNEVEN * np.concatenate(facets)
+        for i in np.flatnonzero(even):
+            geo.mesh.setTransfiniteCurve(curves[i], int(np.concatenate(counts)[i]) + 1)
+        *rings, within = np.split(np.array(curves), np.cumsum([len(loop) for loop in loops]))
+        surface = geo.addPlaneSurface([geo.addCurveLoop(ring.tolist()) for ring in rings])
         geo.synchronize()
+        if len(within):
+            gmsh.model.mesh.embed(1, within.tolist(), 2, surface)
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         if shortest < _UNEVEN * size:
             _widen_inwards(gmsh, curves, surface, size)
@@ -148,49 +164,65 @@ def triangulate(loops: Sequence[FloatArray], labels: Int32Array, size: float) ->
             gmsh.model.mesh.generate(2)
         except Exception as error:
             raise InputError(f"gmsh could not triangulate the polygon: {error}") from error
-        found = [_elements(gmsh, 1, _LINE, curve) for curve in curves]
-        tags, points, _ = gmsh.model.mesh.getNodes()
-        return _compact(
+        found = [_elements(gmsh, 1, _LINE, curve) for curve in curves[: len(labels)]]
+        tags, nodes, _ = gmsh.model.mesh.getNodes()
+        raw = _compact(
             tags,
-            points,
+            nodes,
             _elements(gmsh, 2, _TRIANGLE),
             np.concatenate(found),
             np.repeat(labels, [len(ends) for ends in found]),
         )
+    if not polygons:
+        return raw
+    middles = raw.points[raw.triangles].mean(axis=1)
+    return raw._replace(materials=sorted_out(middles, polygons, numbers))
 
 
-def _graded(
-    lengths: Sequence[FloatArray], facets: Sequence[FloatArray], sizes: Sequence[FloatArray]
-) -> float:
-    """About how many facets there are on edges that are graded, sizes linear between their ends."""
-    total = 0.0
-    for length, facet, near in zip(lengths, facets, sizes, strict=True):
-        low, high = np.sort([near, np.roll(near, -1)], axis=0)
-        mean = (high - low) / np.log(np.maximum(high / low, 1 + 1e-9))
-        total += float(np.sum((length / np.maximum(mean, low))[low <= _UNEVEN * facet]))
-    return total
-
-
-def _sizes(loops: Sequence[FloatArray], facets: Sequence[FloatArray]) -> list[FloatArray]:
-    """Facet length at every vertex: the shorter of its edges', growing slowly.
+def _numbered(ends: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Points in the order in which edges meet them, and the edges' ends among them.
 
     Args:
-        loops: Vertices of the polygon and of each hole, shapes (n, 2).
-        facets: Facet length of every edge, shapes (n,).
+        ends: Shape (edges, 2, 2).
     """
-    near = [np.minimum(facet, np.roll(facet, 1)) for facet in facets]
-    x, h = np.concatenate(loops), np.concatenate(near)
-    slow = np.array([np.min(h + _GROWTH * np.hypot(*(x - p).T)) for p in x])
-    return np.split(slow, np.cumsum([len(loop) for loop in loops])[:-1])
+    number: dict[tuple[float, ...], int] = {}
+    edges = [number.setdefault(tuple(x), len(number)) for x in ends.reshape(-1, 2).tolist()]
+    return np.array(list(number)), np.array(edges).reshape(-1, 2)
 
 
-def read(path: Path, parts: dict[str, int], usual: bool = True) -> Triangulation:
-    """Read a planar triangle mesh with named physical curves.
+def _graded(lengths: FloatArray, facets: FloatArray, sizes: FloatArray) -> float:
+    """About how many facets there are on edges that are graded, sizes linear between their ends."""
+    low, high = np.sort(sizes, axis=1).T
+    mean = (high - low) / np.log(np.maximum(high / low, 1 + 1e-9))
+    return float(np.sum((lengths / np.maximum(mean, low))[low <= _UNEVEN * facets]))
+
+
+def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
+    """Facet length at every vertex: the shortest of its edges', growing slowly.
+
+    Args:
+        x: The vertices, shape (n, 2).
+        edges: The edges' ends, shape (edges, 2).
+        facets: Facet length of every edge, shape (edges,).
+    """
+    h = np.full(len(x), np.inf)
+    np.minimum.at(h, edges, facets[:, None])
+    return np.array([np.min(h + _GROWTH * np.hypot(*(x - p).T)) for p in x])
+
+
+def read(
+    path: Path,
+    parts: dict[str, int],
+    usual: bool = True,
+    materials: Mapping[str, int] = MappingProxyType({}),
+) -> Triangulation:
+    """Read a planar triangle mesh with named physical curves, and perhaps surfaces.
 
     Args:
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
         usual: Whether there must be a contact and a dirichlet curve.
+        materials: Numbers of the physical surfaces that are asked for, by name.
     """
     file = mshfile.load(path)
     _check_cells(file, path)
@@ -213,9 +245,42 @@ def read(path: Path, parts: dict[str, int], usual: bool = True) -> Triangulation
     labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])
     triangles = file.elements(_TRIANGLE)
     raw = _compact(file.tags, file.points, triangles, facets, labels)
+    if materials:
+        raw = raw._replace(materials=_of_materials(file, path, materials))
     _check_names(triangles, facets, others, path, tuple(parts))
     _check_facets(raw, path, {label: name for name, label in parts.items()})
     return raw
+
+
+def _of_materials(file: MshFile, path: Path, materials: Mapping[str, int]) -> Int32Array:
+    """The number of the physical surface that each triangle lies in, or 0, shape (triangles,).
+
+    Raises:
+        InputError: There is no such surface, or two of them have a triangle in common.
+    """
+    called: dict[str, set[int]] = {name: set() for name in materials}
+    for tag in file.groups(2):
+        name = file.names.get((2, tag), "").strip()
+        called.setdefault(name if name in materials else name.lower(), set()).add(tag)
+    blocks = [block for block in file.blocks if block.kind == _TRIANGLE]
+    found = []
+    for block in blocks:
+        here = [name for name in materials if called[name] & block.groups]
+        if len(here) > 1 and len(block.nodes):
+            raise InputError(
+                f"{path}: {len(block.nodes)} triangles lie in the physical surfaces {here[0]!r} and"
+                f" {here[1]!r}: a cell consists of one material"
+            )
+        found.append(np.full(len(block.nodes), materials[here[0]] if here else 0, np.int32))
+    numbers: Int32Array = np.concatenate(found)
+    for name, number in materials.items():
+        if number not in numbers:
+            there = [each for (dim, _), each in sorted(file.names.items()) if dim == 2]
+            raise InputError(
+                f"{path}: no physical surface with triangles is named {name!r}; the names there"
+                f" are: {', '.join(there) or 'none'}"
+            )
+    return numbers
 
 
 def _check_names(

@@ -1,6 +1,6 @@
 """Nested meshes: every triangle into four, or marked triangles only.
 
-Both keep the children of a cell on its rank and carry the boundary parts along.
+Both keep the children of a cell on its rank and carry boundary parts and materials along.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
         topology.create_connectivity(1, 2)
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
-    return Domain(fine, _child_tags(domain, fine, facets), parts=domain.parts), parent
+    return _child(domain, fine, _child_tags(domain, fine, facets), parent), parent
 
 
 def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, Int32Array]:
@@ -126,7 +126,7 @@ def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]
 
     label = labels(domain)[parent[:, None], parent_facet]
     label[parent_facet < 0] = 0
-    return Domain(fine, tagged(fine, label), parts=domain.parts), parent
+    return _child(domain, fine, tagged(fine, label), parent), parent
 
 
 def labels(domain: Domain) -> Int32Array:
@@ -148,6 +148,14 @@ def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
     facet = _table(mesh.topology.connectivity(2, 1))[label > 0]
     order = np.argsort(facet)
     return meshtags(mesh, 1, facet[order], label[label > 0][order])
+
+
+def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
+    """The fine domain: its cells consist of what their parents do."""
+    materials = domain.materials.of_children(parent)
+    return Domain(
+        fine, tags, parts=domain.parts, materials=materials, coarser=(domain, parent, None)
+    )
 
 
 def _count(index_map: Any) -> int:

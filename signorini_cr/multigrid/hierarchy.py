@@ -52,11 +52,13 @@ class NestedMesh:
         physics: What is solved, shared by all meshes.
         domain: Mesh and boundary parts.
         parents: The cells of the mesh below that hold this one's, None on the coarsest.
+        given: The physics on it, if somebody has that.
     """
 
     physics: Physics
     domain: Domain
     parents: Parents | None = None
+    given: OnMesh | None = None
 
     def __post_init__(self) -> None:
         """Free what meshes before have left, and hold this one while there are objects on it."""
@@ -66,7 +68,7 @@ class NestedMesh:
     @cached_property
     def data(self) -> OnMesh:
         """The physics on this mesh."""
-        return self.physics.on(self.domain)
+        return self.physics.on(self.domain) if self.given is None else self.given
 
     @property
     def V(self) -> fem.FunctionSpace:
@@ -199,7 +201,7 @@ def conforming(mesh: NestedMesh) -> tuple[ConstrainedMatrix, Layout, Int32Array]
     matrix = assemble_matrix(empty_matrix(p1), form)
     matrix.assemble()
     matrix.scale(scale)
-    dirichlet, bounded = p1.owned_at(data.fixed), p1.owned_at(data.lower)
+    dirichlet, bounded = p1.owned_at(data.fixed), p1.owned_at(data.bounds)
     matrix.zeroRowsColumns(numbers_of(matrix, dirichlet), 1.0)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
     return ConstrainedMatrix(matrix, bounded), p1, dirichlet

@@ -112,6 +112,13 @@ def draw_lines(axes: Axes, segments: FloatArray | Sequence[FloatArray], **style:
     axes.add_collection(LineCollection(list(segments), **style), autolim=False)
 
 
+def draw_cells(axes: Axes, corners: FloatArray, **style: Any) -> None:
+    """Fill triangles given by their corners, shape (n, 3, 2), beneath everything else."""
+    from matplotlib.collections import PolyCollection
+
+    axes.add_collection(PolyCollection(list(corners), zorder=0, **style), autolim=False)
+
+
 def legend(
     figure: Figure | SubFigure, *entries: Any, ncols: int, above: str = "", ax: Axes | None = None
 ) -> None:

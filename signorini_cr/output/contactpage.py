@@ -52,7 +52,7 @@ def contact_page(
     longest = f"its {MOST_PARTS} longest parts of {number}:\n" if number > MOST_PARTS else ""
     along = f"arc length along $\\Gamma_1$, {longest}" + ",\n".join(lines)
     # Not the rounding errors of a function that is zero
-    _enlarge(panels[0, 0], np.append(table["u"], table["obstacle"]), size)
+    _enlarge(panels[0, 0], np.concatenate([table["u"], *_bounds(table)]), size)
     _enlarge(panels[1, 0], table["pressure"], size / lengths.sum())
     panels[0, 0].set_ylabel(r"$u_h$ and $\alpha$, facet means", fontsize=13)
     panels[1, 0].set_ylabel(r"contact pressure $\lambda_h$", fontsize=13)
@@ -129,7 +129,9 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
         axes.grid(alpha=0.25)
     marker: dict[str, Any] = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
     upper.plot(arc, rows["u"], color=BLUE, linewidth=2, label="$u_h$", **marker)
-    upper.plot(arc, rows["obstacle"], color="black", linestyle="--", label=r"obstacle $\alpha$")
+    for bound, label in zip(_bounds(rows), ("$\\alpha$", "$\\beta$"), strict=False):
+        if np.isfinite(bound).any():
+            upper.plot(arc, bound, color="black", linestyle="--", label=f"obstacle {label}")
     lower.stairs(rows["pressure"], edges, color=RED, linewidth=2, label=r"$\lambda_h$")
     ends = middle[[0, -1]] + along[[0, -1]] * (edges[[0, -1]] - arc[[0, -1]])[:, None]
     ends[np.abs(ends) < 1e-9 * np.abs(middle).max()] = 0.0
@@ -138,8 +140,14 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
     return f"round from {start}" if closed else f"from {start} to {stop}"
 
 
+def _bounds(table: Table) -> list[npt.NDArray]:
+    """α, and β where any facet has one."""
+    return [table[name] for name in ("obstacle", "upper") if name in table]
+
+
 def _enlarge(axes: Axes, values: npt.NDArray, size: float) -> None:
     """See that the vertical axis shows more than differences of 1e-6 of `size`."""
+    values = values[np.isfinite(values)]
     if np.ptp(values) < 1e-6 * size:
         axes.set_ylim(values[0] - size, values[0] + size)
 

@@ -51,7 +51,7 @@ def run_page(
         "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
         for kind, row in [("th", head), *(("td", row) for row in rows)]
     )
-    certain = certified(levels[-1], report["force_bounds"])
+    certain = certified(levels[-1])
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     launch = ["mpirun", "-n", str(report["ranks"])] if report["ranks"] > 1 else []
     pictures = "".join(

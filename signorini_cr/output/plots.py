@@ -20,6 +20,7 @@ from dolfinx.mesh import Mesh, entities_to_geometry
 from mpi4py import MPI
 
 from ..arrays import FloatArray
+from ..compat import cell_nodes
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
 from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
@@ -29,6 +30,7 @@ from .canvas import (
     RED,
     YELLOW,
     chains,
+    draw_cells,
     draw_lines,
     grouped,
     headline,
@@ -57,6 +59,8 @@ STYLES: dict[int, dict[str, Any]] = {
 }
 OTHERS = ("#009e73", "#cc79a7", "#56b4e9", "#e69f00", "black")
 """Colours of further parts, one after the other."""
+TINTS = ("#d0d0d0", "#c6dbef", "#fdd8b0", "#d5ecd0", "#dadaeb")
+"""Colours of materials, one after the other."""
 SERIES = {
     "error_h1": {"color": BLUE, "marker": "o", "label": r"$\|\nabla_h(u-u_h)\|$"},
     "bound_h1": {
@@ -89,7 +93,7 @@ def can_draw(comm: MPI.Comm) -> bool:
 def plot_mesh(
     domain: Domain, path: Where | None = None, title: str = "", ax: Axes | None = None
 ) -> Figure | SubFigure | None:
-    """Draw the mesh with Γ0, Γ1 and Γg.
+    """Draw the mesh with Γ0, Γ1 and Γg, and its materials.
 
     Args:
         domain: A plane domain.
@@ -103,9 +107,13 @@ def plot_mesh(
     mesh = _plane(domain)
     cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
     parts = {part: _segments(domain, part) for part in domain.parts.values()}
+    triangles = {name: _triangles(domain, name) for name in domain.materials.numbers}
 
     def draw() -> Figure | SubFigure:
         figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2), ax=ax)
+        for (name, cells_of), tint in zip(triangles.items(), itertools.cycle(TINTS)):
+            if len(cells_of):
+                draw_cells(axes, cells_of, color=tint, label=name.replace("$", r"\$"))
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
         for part, style in _styles(domain).items():
             if len(parts[part]):
@@ -324,6 +332,15 @@ def _edges(mesh: Mesh) -> FloatArray:
     if number:  # entities_to_geometry divides by it
         ends = entities_to_geometry(mesh, 1, np.arange(number, dtype=np.int32)).reshape(-1, 2)
     return _gather(mesh.comm, mesh.geometry.x[ends, :2])
+
+
+def _triangles(domain: Domain, material: str) -> FloatArray:
+    """Corners of a material's cells, on rank 0, shape (n, 3, 2); none where edges aren't drawn."""
+    mesh = domain.mesh
+    number = mesh.topology.index_map(2).size_local
+    few = mesh.topology.index_map(1).size_global <= MOST_EDGES
+    nodes = cell_nodes(mesh)[:number][few & domain.materials.where(material)[:number]]
+    return _gather(mesh.comm, mesh.geometry.x[nodes, :2])
 
 
 def _segments(domain: Domain, part: int) -> FloatArray:

@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import dolfinx
@@ -25,7 +26,7 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
-from ..estimate.force import NO_BOUNDS, force_bounds
+from ..estimate.force import NO_BOUNDS, flux, force_bounds
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .tables import contact_csv, levels_csv, markdown_table
@@ -50,6 +51,8 @@ FILES = (
     "contact.png",
     "convergence.png",
     "report.html",
+    "times.csv",
+    "series.pvd",
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 
@@ -63,12 +66,15 @@ Record = dict[str, Any]
 def level_record(
     solution: Solution,
     previous: Mapping[str, Any] | None = None,
+    quantities: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Record:
     """The numbers of one level, as they stand in report.json.
 
     Args:
         solution: What was found on this mesh.
         previous: The record of the level before, for the rates.
+        quantities: The kind, "force" or "flux", and the part of the boundary of what is wanted in
+            an interval, by name. Each takes about as long as a linear solve.
 
     Returns:
         Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
@@ -101,12 +107,17 @@ def level_record(
                 "length": contact.length,
                 "force": contact.force,
                 "transitions": contact.transitions[:, :gdim],
+                "force_bounds": _bounded(solution, None),
+            },
+            "quantities": {
+                name: _bounded(solution, [part]) for name, (_, part) in quantities.items()
             },
             "error_h1": h1,
             "error_l2": l2,
             "rate_h1": _rate("error_h1", h1, solution, previous),
             "rate_l2": _rate("error_l2", l2, solution, previous),
             "bound_h1": bound,
+            "bound_energy_norm": certificate.bound_energy_norm,
             "effectivity": bound / h1 if bound is not None and h1 else None,
             "bound_reason": certificate.reason,
             "bound_parts": {name: certificate.parts.get(name) for name in SHARES},
@@ -118,16 +129,17 @@ def level_record(
     )
 
 
-def force_record(solution: Solution) -> Record:
-    """Bounds of the contact force of u itself, None with a reason where there are none; collective.
-
-    It takes about as long as the solve, and that is why no record of a level has it.
-    """
+def _bounded(solution: Solution, parts: Sequence[str] | None) -> Record:
+    """What flows through parts, None for all of Γ1, or nothing, and why; collective."""
     try:
+        if parts is not None:
+            return {**flux(solution, *parts)._asdict(), "reason": None}
         lower, upper = force_bounds(solution)
+        return {"lower": lower, "upper": upper, "reason": None}
     except InputError as error:
-        return {"lower": None, "upper": None, "reason": str(error).removeprefix(f"{NO_BOUNDS}: ")}
-    return {"lower": lower, "upper": upper, "reason": None}
+        value = {} if parts is None else {"value": None}
+        reason = str(error).removeprefix(f"{NO_BOUNDS}: ")
+        return {**value, "lower": None, "upper": None, "reason": reason}
 
 
 def make_report(
@@ -136,7 +148,6 @@ def make_report(
     comm: MPI.Comm,
     records: Sequence[Record],
     complete: bool = True,
-    force: Record | None = None,
 ) -> Record:
     """The whole of report.json from the records of its levels.
 
@@ -146,7 +157,6 @@ def make_report(
         comm: The ranks that solved it.
         records: From `level_record`, coarsest level first.
         complete: Whether these are all the levels that were asked for.
-        force: From `force_record`, of the finest level, at the end of the run.
     """
     versions = {
         "signorini_cr": __version__,
@@ -160,7 +170,7 @@ def make_report(
         "ranks": comm.size,
         "versions": versions,
         "complete": complete,
-        "force_bounds": force or {"lower": None, "upper": None, "reason": "the run has not ended"},
+        "force_bounds": records[-1]["contact"]["force_bounds"],
         "levels": list(records),
     }
 
@@ -218,6 +228,7 @@ def write_output(
     solution: Solution,
     pictures: bool = True,
     resumable: bool = False,
+    steps: bool = False,
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
 
@@ -230,6 +241,7 @@ def write_output(
         pictures: Whether to draw. There are none of three-dimensional domains, and none where
             Matplotlib is not installed.
         resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
+        steps: Whether what `series.write_step` has left is of this one.
 
     Returns:
         The names of the files written.
@@ -250,7 +262,8 @@ def write_output(
             writers["convergence.png"] = lambda path: plots.drawn(
                 comm, lambda: plots.plot_convergence(records, path, title)
             )
-    removed = set(FILES) - ({checkpoint.NAME} if resumable else set())
+    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if steps else set()
+    removed = set(FILES) - kept
     write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)
 

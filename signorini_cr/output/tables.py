@@ -29,12 +29,11 @@ def legend(first: Mapping[str, Any]) -> str:
     return "; ".join(f"{name}: {short}" for name, short in words.items() if short)
 
 
-def certified(record: Mapping[str, Any], force: Mapping[str, Any] | None = None) -> str:
+def certified(record: Mapping[str, Any]) -> str:
     """What is certain about a level, rounded so that it stays certain.
 
     Args:
-        record: The level's.
-        force: From `output.report.force_record`, where that has been asked for.
+        record: The last level's.
     """
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
@@ -42,10 +41,12 @@ def certified(record: Mapping[str, Any], force: Mapping[str, Any] | None = None)
     energy = record["energy_bounds"]
     if energy["lower"] is not None and energy["upper"] is not None:
         facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")
-    if force is not None and force["reason"] is None:
-        facts.append(f"the contact force is in {_interval(force['lower'], force['upper'])}")
-    elif force is not None:
-        facts.append(f"the contact force has no bounds: {force['reason']}")
+    wanted = {"the contact force": record["contact"]["force_bounds"], **record["quantities"]}
+    for name, found in wanted.items():
+        if found["reason"] is None:
+            facts.append(f"{name} is in {_interval(found['lower'], found['upper'])}")
+        else:
+            facts.append(f"{name} has no bounds: {found['reason']}")
     return "; ".join(facts)
 
 

@@ -68,8 +68,9 @@ def write_solution(solution: Solution, path: Path) -> None:
 
     At the corners of each cell, and of each facet of Γ1: `u`, and `companion`, the vertex values
     of the conforming companion. On each cell: `indicator`, the square root of its share of the
-    certified bound. On each facet of Γ1: `pressure`, `contact` (0 or 1) and `obstacle`. Elsewhere
-    these are 0, and the obstacle is NaN. The certificate is made if there is none.
+    certified bound. On each facet of Γ1: `pressure`, `contact` (0 or 1), `obstacle`, and `upper`
+    if there is an upper bound. Elsewhere these are 0, and bounds are NaN. The certificate is made
+    if there is none.
 
     Args:
         solution: The solution.
@@ -100,7 +101,9 @@ def write_solution(solution: Solution, path: Path) -> None:
     on_cells = {
         "pressure": np.append(nowhere, contact.pressure),
         "contact": np.append(nowhere, contact.active).astype(np.uint8),
-        "obstacle": np.append(np.full(owned, np.nan), contact.obstacle),
+        **{
+            name: np.append(np.full(owned, np.nan), bound) for name, bound in contact.bounds.items()
+        },
     }
     if certificate.indicators is not None:
         on_facets = np.zeros(len(contact.facets))

@@ -36,7 +36,13 @@ def errors(solution: Solution, degree: int) -> tuple[float, float]:
         ‖u − u_h‖_h in the broken norm (1.6) and ‖u − u_h‖ in L2.
     """
     problem = replace(solution.problem, error_degree=degree)
-    forms = Forms(problem, solution.domain.mesh, solution.element, solution.domain.parts)
+    forms = Forms(
+        problem,
+        solution.domain.mesh,
+        solution.element,
+        solution.domain.parts,
+        solution.domain.materials,
+    )
     return forms.errors(solution.domain, solution.u)
 
 

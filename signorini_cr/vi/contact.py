@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.physics import OnMesh
@@ -30,10 +31,11 @@ class Kkt:
     """How well u_h satisfies the discrete conditions on Γ1.
 
     Attributes:
-        min_gap: Smallest u_h − α at a contact dof; 0 or above when feasible.
-        min_pressure: Smallest λ_h at a contact dof on its bound; 0 or above, up to the solver's
-            tolerance.
-        complementarity: Σ |λ_h (u_h − α)| over the contact dofs, weighted by their facets' measure.
+        min_gap: Smallest u_h − α, or β − u_h, at a contact dof; 0 or above when feasible.
+        min_pressure: Smallest λ_h at a contact dof on α, or −λ_h on β; 0 or above, up to the
+            solver's tolerance.
+        complementarity: Σ |λ_h| times the distance from the nearer bound, over
+            the contact dofs, weighted by their facets' measure.
         residual: Norm of what is left of the equations, relative to `System.residual_scale`; or to
             what the rows are made of, in the class of stiffness where that is larger (`stopping`).
             Rounding of A u_h does not count.
@@ -56,15 +58,19 @@ class Contact:
         facets: Local indices of the contact facets this rank owns, shape (n,).
         vertices: Their vertices' coordinates, shape (n, d, 3).
         measure: Their length, shape (n,).
-        obstacle: Bound on the facet, the mean of α for CR, shape (n,).
+        obstacle: Lower bound on the facet, the mean of α for CR; −∞ for none, shape (n,).
+        upper: Upper bound on the facet, the mean of β for CR; ∞ for none, shape (n,).
         u: u_h at the facet's midpoint, shape (n,).
-        pressure: λ_h, shape (n,), 0 off the bound, where r is what the solver left of an equation,
-            and where r is rounding alone; for P1 the mean of the pressures at the vertices.
+        pressure: λ_h, shape (n,), below 0 where u_h is on β, 0 off the bounds, where r is
+            what the solver left of an equation, and where r is rounding alone; for P1 the mean of
+            the pressures at the vertices.
         active: Whether the facet is in contact, shape (n,).
-        gap_at_vertices: u_h − α at the facet's vertices, shape (n, d); negative in places even for
-            a feasible CR function, which respects the bound at midpoints only.
+        gap_at_vertices: The smaller of u_h − α and β − u_h at the facet's vertices, shape (n, d);
+            negative in places even for a feasible CR function, which respects the bounds at
+            midpoints only.
         active_set: The dofs in contact.
-        force: Σ r over the dofs in contact, the total contact force (per unit depth).
+        force: Σ r over the dofs in contact, the total contact force (per unit depth); what β
+            contributes is negative.
         length: Total length of the active facets.
         number: Number of contact facets.
         number_active: Number of active ones.
@@ -77,6 +83,7 @@ class Contact:
     vertices: FloatArray
     measure: FloatArray
     obstacle: FloatArray
+    upper: FloatArray
     u: FloatArray
     pressure: FloatArray
     active: BoolArray
@@ -98,6 +105,14 @@ class Contact:
         )
 
     @property
+    def bounds(self) -> dict[str, FloatArray]:
+        """α as `obstacle`, and β as `upper` where any facet has one, NaN for none; collective."""
+        found = {"obstacle": self.obstacle}
+        if self.comm.allreduce(bool(np.isfinite(self.upper).any()), op=MPI.LOR):
+            found["upper"] = self.upper
+        return {name: np.where(np.isfinite(row), row, np.nan) for name, row in found.items()}
+
+    @property
     def midpoints(self) -> FloatArray:
         """Midpoints of the facets, shape (n, 3)."""
         return self.vertices.mean(axis=1)
@@ -106,7 +121,8 @@ class Contact:
         """All contact facets in order along the boundary, on rank 0; None on the others.
 
         Columns: part (connected piece of Γ1, from 0), arc_length (of the facet's midpoint, from
-        the part's beginning, Ω to the left), x, y, length, obstacle, u, pressure, active.
+        the part's beginning, Ω to the left), x, y, length, obstacle, upper (where any facet has
+        an upper bound), u, pressure, active.
         """
         return self._table
 
@@ -139,15 +155,18 @@ def contact_facts(
 
     state = on_facets(np.where(at_dofs.active.mask, 1.0, -1.0))
     is_active: BoolArray = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
-    obstacle, local = system.obstacle_at_vertices, data.at_vertices(u, facets)
+    below, above = system.obstacles_at_vertices
+    local = data.at_vertices(u, facets)
+    means = dofs.shape[1] > 1
     fields: dict[str, npt.NDArray] = {
         "vertices": vertices,
         "measure": measure,
-        "obstacle": obstacle.mean(axis=1) if dofs.shape[1] > 1 else system.lower[dofs[:, 0]],
+        "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]),
+        "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]),
         "u": local.mean(axis=1),
         "pressure": on_facets(pressure).mean(axis=1),
         "active": is_active,
-        "gap_at_vertices": local - obstacle,
+        "gap_at_vertices": np.minimum(local - below, above - local),
     }
     table, transitions = along_boundary(mesh, facets, fields)
     of_load = float(np.sqrt(total.sum(at_dofs.left @ at_dofs.left))) / (
@@ -165,7 +184,7 @@ def contact_facts(
         transitions=transitions,
         kkt=Kkt(
             min_gap=total.min(at_dofs.gap),
-            min_pressure=total.min(pressure),
+            min_pressure=total.min(at_dofs.side * pressure) + 0.0,  # no -0
             complementarity=total.sum(np.abs(at_dofs.force * at_dofs.gap)),
             residual=max(of_load, iterations.imbalance),
             force_error=iterations.force_error,
@@ -179,14 +198,16 @@ class _AtDofs:
     """What a solution does at the dofs.
 
     Attributes:
-        gap: u − α at the bounded dofs, shape (n,).
+        gap: Distance of the bounded dofs from the nearer bound, shape (n,).
+        side: Which that is, see `Bounds`, shape (n,).
         force: Contact forces there, 0 where they are rounding alone, shape (n,).
         active: The active set.
-        left: What is left of the equations at owned dofs: all of r off Γ1, min(r, a_ii gap) on it,
-            and 0 where that is rounding alone.
+        left: What is left of the equations at owned dofs: all of r off Γ1, on it the smaller of
+            the force off the bound and a_ii gap, and 0 where that is rounding alone.
     """
 
     gap: FloatArray
+    side: FloatArray
     force: FloatArray
     active: ActiveSet
     left: FloatArray
@@ -200,14 +221,20 @@ class _AtDofs:
         entries = system.A.getDiagonal()
         diagonal = entries.array_r.copy()
         release(entries)
-        gap, raw = u.x.array[bounded] - system.lower[bounded], residual.x.array[bounded]
+        x, raw = u.x.array[bounded], residual.x.array[bounded]
+        gap, side = system.bounds.gap(x), system.bounds.side(x)
         force = np.where(np.abs(raw) > NOISE * terms, raw, 0.0)
         left = residual.x.array[: len(diagonal)].copy()
-        left[bounded] = np.minimum(raw, diagonal[bounded] * gap)
+        left[bounded] = np.minimum(side * raw, diagonal[bounded] * gap)
         left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[: len(diagonal)])] = 0.0
-        active = ActiveSet.of(bounded, gap, force)
+        active = ActiveSet.of(bounded, gap, side * force)
         # Off the bound r is what is left of an equation; on it, a pull is a pressure of wrong sign
-        return cls(gap, np.where(gap <= 0.0, force, 0.0), active, left)
+        return cls(gap, side, np.where(gap <= 0.0, force, 0.0), active, left)
+
+
+def _bound(values: FloatArray) -> FloatArray:
+    """Bounds as they are told: infinite where PETSc's number says that there is none."""
+    return np.where(np.abs(values) < PETSc.INFINITY, values, np.copysign(np.inf, values))
 
 
 class _Totals:

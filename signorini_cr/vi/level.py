@@ -26,10 +26,12 @@ class Level:
         meshes: The meshes up to this one, coarsest first.
         held: Whether every piece of the domain is known to have a Dirichlet facet, which
             refinement keeps.
+        like: A system with the same matrix, if there is one.
     """
 
     meshes: tuple[NestedMesh, ...]
     held: bool = False
+    like: System | None = None
 
     def __post_init__(self) -> None:
         """Insist on a PETSc of real numbers in double precision."""
@@ -73,7 +75,7 @@ class Level:
     @cached_property
     def system(self) -> System:
         """The assembled variational inequality."""
-        return System(self.data)
+        return System(self.data, self.like)
 
     @cached_property
     def loose(self) -> Loose | None:

@@ -67,9 +67,9 @@ def nested_start(
     vector = ghosted_vector(level.V, start.x.array)
     order = np.argsort(system.contact_dofs[:, 0])  # as the bounded dofs are
     facets = system.bounded_facets[order]
-    active, force = _expected(_Inherited.of(coarse, level, facets), system, vector)
-    _put_on_bounds(start, system, active)
-    _make_forces(start, vector, system, facets, np.where(active.mask, force, 0.0))
+    expected = _Expected.of(_Inherited.of(coarse, level, facets), system, vector)
+    _put_on_bounds(start, system, expected)
+    _make_forces(start, vector, system, facets, expected)
     release(vector)
 
 
@@ -85,38 +85,69 @@ def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
     values = start.x.array[system.dirichlet].copy()
     start.x.array[:] = u.x.array
     start.x.array[system.dirichlet] = values
-    bounded, above = system.bounded, _just_above(start, system)
+    bounded, bounds = system.bounded, system.bounds
     x = start.x.array[bounded]
-    start.x.array[bounded] = np.where(x < above, system.lower[bounded], x)
+    side = bounds.side(x)
+    bound = bounds.on(side)
+    near = side * (x - bound) < _margin(start, bound)
+    start.x.array[bounded] = np.where(near, bound, x)
 
 
-def _expected(inherited: _Inherited, system: System, x: PETSc.Vec) -> tuple[ActiveSet, FloatArray]:
-    """The active set to begin with, and the forces there, shape (n,)."""
-    operator, bounded = system.operator, system.bounded
-    gap = x.array_r[bounded] - system.lower[bounded]
-    on_bound = operator.times(x) - system.b.x.array[bounded] - operator.diagonal * gap
-    force = np.where(inherited.at_front, on_bound, inherited.force)
-    # with its parent off the bound a facet has no force, as the criterion sees it
-    pushing = np.where(inherited.at_front | inherited.active, force, 0.0)
-    return ActiveSet.of(bounded, 0.0, pushing), force
+@dataclass(frozen=True, eq=False)
+class _Expected:
+    """What the bounded dofs are expected to do.
+
+    Attributes:
+        active: The active set to begin with.
+        side: The side of the bound that a dof is on or nearer to, shape (n,).
+        force: Forces wanted on active dofs, off the bound; 0 on others, shape (n,).
+    """
+
+    active: ActiveSet
+    side: FloatArray
+    force: FloatArray
+
+    @classmethod
+    def of(cls, inherited: _Inherited, system: System, vector: PETSc.Vec) -> _Expected:
+        """Put together what parents and the prolonged u say."""
+        operator, bounded, bounds = system.operator, system.bounded, system.bounds
+        x = vector.array_r[bounded]
+        of_parent = inherited.active & ~inherited.at_front
+        side = np.where(of_parent, np.sign(inherited.force), bounds.side(x))
+        gap = x - bounds.on(side)
+        on_bound = operator.times(vector) - system.b.x.array[bounded] - operator.diagonal * gap
+        force = side * np.where(inherited.at_front, on_bound, inherited.force)
+        # with its parent off the bound a facet has no force, as the criterion sees it
+        pushing = np.where(inherited.at_front | inherited.active, force, 0.0)
+        active = ActiveSet.of(bounded, 0.0, pushing)
+        return cls(active, side, np.where(active.mask, force, 0.0))
 
 
-def _put_on_bounds(start: fem.Function, system: System, active: ActiveSet) -> None:
-    """Put active dofs on their bounds and the others above, if only by rounding; collective."""
-    x, bounded, lower = start.x.array, system.bounded, system.lower[system.bounded]
-    above = _just_above(start, system)
-    x[bounded] = np.where(active.mask, lower, np.maximum(x[bounded], above))
+def _put_on_bounds(start: fem.Function, system: System, expected: _Expected) -> None:
+    """Put active dofs on their bounds and the others off them, if only by rounding; collective."""
+    x, bounds = start.x.array[system.bounded], system.bounds
+    low, high = (
+        bound - sign * _margin(start, bound)
+        for sign, bound in ((-1.0, bounds.lower), (1.0, bounds.upper))
+    )
+    free = np.where(low < high, np.clip(x, low, high), 0.5 * (bounds.lower + bounds.upper))
+    start.x.array[system.bounded] = np.where(expected.active.mask, bounds.on(expected.side), free)
 
 
-def _just_above(start: fem.Function, system: System) -> FloatArray:
-    """The bounds, and as much more as rounding cannot hide; collective."""
-    comm, lower = start.function_space.mesh.comm, system.lower[system.bounded]
+def _margin(start: fem.Function, bound: FloatArray) -> FloatArray:
+    """A distance from bounds that rounding cannot hide; collective."""
+    comm = start.function_space.mesh.comm
     scale = comm.allreduce(float(np.abs(start.x.array).max(initial=0.0)), op=MPI.MAX)
-    return lower + 4.0 * np.spacing(np.maximum(np.abs(lower), scale))
+    finite = np.where(np.isfinite(bound), np.abs(bound), 0.0)
+    return 4.0 * np.spacing(np.maximum(finite, scale))
 
 
 def _make_forces(
-    start: fem.Function, vector: PETSc.Vec, system: System, facets: Int32Array, force: FloatArray
+    start: fem.Function,
+    vector: PETSc.Vec,
+    system: System,
+    facets: Int32Array,
+    expected: _Expected,
 ) -> None:
     """Make forces the residual of active facets where it is far from them; collective.
 
@@ -125,7 +156,7 @@ def _make_forces(
         vector: The same numbers as PETSc has them.
         system: The variational inequality.
         facets: The contact facets, as the bounded dofs are.
-        force: The forces wanted, positive; 0 where the residual is to be left alone.
+        expected: The forces wanted.
     """
     V, operator, b = start.function_space, system.operator, system.b.x.array[system.bounded]
     block = V.dofmap.index_map_bs
@@ -133,17 +164,18 @@ def _make_forces(
     others += (system.bounded % block)[:, None]
     free = np.ones(len(start.x.array), dtype=bool)
     free[system.dirichlet] = free[system.bounded] = False
-    surplus = operator.times(vector) - b - force
+    side, force = expected.side, expected.force
+    surplus = side * (operator.times(vector) - b) - force
     weak = (force > 0.0) & (surplus < (ENOUGH - 1.0) * force)
     movable = free[others] & weak[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
     layout, moves = Layout.of_space(V), np.zeros(len(free))
     for _ in range(ROUNDS):
-        shift = surplus / operator.diagonal * (others.shape[1] - 1) / number
+        shift = side * surplus / operator.diagonal * (others.shape[1] - 1) / number
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
         start.x.array[:] += layout.shared_sum(moves)
         moves[:] = 0.0
-        surplus = operator.times(vector) - b - force
+        surplus = side * (operator.times(vector) - b) - force
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,11 @@
 """Pieces that the domain falls into, and what holds those that have no Dirichlet facet.
 
-Only the obstacle can hold such a piece, and only where the net force ∫ f + ∫ g over it is below 0,
-which presses it on: then the solution exists and is unique, as J(u + c) − J(u) = −c (∫ f + ∫ g)
-grows with c, and admissible functions are bounded below. The reduced matrices are definite as long
-as each such piece has an active dof. A start with one is enough: where all other equations hold,
-the forces of the active dofs add up to −(∫ f + ∫ g) > 0, so that one of them stays active.
+Only an obstacle can hold such a piece, and only where the net force ∫ f + ∫ g over it is below 0,
+which presses it on; or above 0 with an obstacle above it, which is the same upside down. Then the
+solution exists and is unique, as J(u + c) − J(u) = −c (∫ f + ∫ g) grows with c, and admissible
+functions are bounded below. The reduced matrices are definite as long as each such piece has an
+active dof. A start with one is enough: where all other equations hold, the forces of the active
+dofs add up to −(∫ f + ∫ g) > 0, so that one of them stays active.
 """
 
 from __future__ import annotations
@@ -72,14 +73,17 @@ class Loose:
         V = system.chi.function_space
         owned, comm = Layout.of_space(V).size[0], V.mesh.comm
         piece, chi = self.piece[:owned], system.chi.x.array[:owned]
-        sums = [
-            np.bincount(piece, values, self.count + 1) for values in (chi, np.abs(chi), piece > 0)
-        ]
-        bounded = np.bincount(piece[system.bounded], minlength=self.count + 1)
-        net, size, number, contact = comm.allreduce(np.array([*sums, bounded]))
-        adrift = (contact == 0.0) | (net >= -NOISE * np.sqrt(number) * size)
+        sums = [np.bincount(piece, values, self.count + 1) for values in (np.abs(chi), piece > 0)]
+        finite = [np.isfinite(_floors(system, side)[system.bounded]) for side in (1.0, -1.0)]
+        sums += [np.bincount(piece[system.bounded], which, self.count + 1) for which in finite]
+        size, number, *contact = comm.allreduce(np.array(sums))
+        net, (below, above) = self._net(system), contact
+        pressed = np.where(below > 0.0, -net, -np.inf)
+        pressed = np.maximum(pressed, np.where(above > 0.0, net, -np.inf))
+        adrift = pressed <= NOISE * np.sqrt(number) * size
         adrift[0] = False
         complaint, bad = None, int(np.argmax(adrift))
+        wanted = " or ".join(["below 0"] * bool(below[bad]) + ["above 0"] * bool(above[bad]))
         if adrift.any() and len(dofs := np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == bad)):
             nodes = compat.cell_nodes(V.mesh)[dofs[0] // V.dofmap.index_map_bs]
             middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
@@ -87,17 +91,17 @@ class Loose:
                 "the domain falls into pieces, and the one around "
                 f"({', '.join(f'{x:g}' for x in middle)}) has no Dirichlet facet and "
             ) + (
-                f"a net force ∫f + ∫g of {net[bad]:g}: only one below 0, which presses it onto the "
-                "obstacle, would hold it"
-                if contact[bad]
+                f"a net force ∫f + ∫g of {net[bad]:g}: only one {wanted}, which presses it onto "
+                "the obstacle, would hold it"
+                if below[bad] or above[bad]
                 else "no contact facet: nothing holds it"
             )
         raise_together(comm, complaint)
 
     def hold(self, system: System, start: fem.Function) -> None:
-        """Put pieces of which no dof is active onto the obstacle; collective.
+        """Put pieces of which no dof is active onto the obstacle they are pressed to; collective.
 
-        All their contact dofs go on their bounds, and all others so far below that the residual
+        All dofs that it bounds go on their bounds, and all others so far beyond that the residual
         makes the former active.
 
         Args:
@@ -107,17 +111,23 @@ class Loose:
         x, comm = start.x.array, start.function_space.mesh.comm
         residual = fem.Function(start.function_space)
         system.residual(start, residual)
-        bounded, lower = system.bounded, system.lower
-        pushed = ActiveSet.of(bounded, x[bounded] - lower[bounded], residual.x.array[bounded])
+        bounded, bounds = system.bounded, system.bounds
+        at = x[bounded]
+        forces = bounds.side(at) * residual.x.array[bounded]
+        pushed = ActiveSet.of(bounded, bounds.gap(at), forces)
         active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
         entries = system.A.getDiagonal()
         lift = np.abs(system.b.x.array[: entries.local_size]) / entries.array_r
         release(entries)
+        # upside down where the net force pulls
+        side = np.where(self._net(system) <= 0.0, 1.0, -1.0)
+        floor = np.where(side[self.piece] > 0.0, _floors(system, 1.0), _floors(system, -1.0))
         bottom, depth = np.full(self.count + 1, np.inf), np.zeros(self.count + 1)
         top = -bottom
         np.maximum.at(depth, self.piece[: len(lift)], lift)
-        np.minimum.at(bottom, self.piece[bounded], lower[bounded])
-        np.maximum.at(top, self.piece[bounded], lower[bounded])
+        own = bounded[np.isfinite(floor[bounded])]
+        np.minimum.at(bottom, self.piece[own], floor[own])
+        np.maximum.at(top, self.piece[own], floor[own])
         active = comm.allreduce(active)
         bottom = np.min(comm.allgather(bottom), axis=0)
         top, depth = np.max(comm.allgather([top, depth]), axis=0)
@@ -125,7 +135,21 @@ class Loose:
             if active[piece] == 0.0:
                 below = BELOW * depth[piece] + (top[piece] - bottom[piece])
                 there = self.piece == piece
-                x[there] = np.where(lower > PETSc.NINFINITY, lower, bottom[piece] - below)[there]
+                held = np.where(np.isfinite(floor), floor, bottom[piece] - below)
+                x[there] = side[piece] * held[there]
+
+    def _net(self, system: System) -> FloatArray:
+        """The net force ∫ f + ∫ g on each piece, shape (count + 1,); collective."""
+        owned = system.A.getLocalSize()[0]
+        chi = np.bincount(self.piece[:owned], system.chi.x.array[:owned], self.count + 1)
+        net: FloatArray = system.chi.function_space.mesh.comm.allreduce(chi)
+        return net
+
+
+def _floors(system: System, side: float) -> FloatArray:
+    """α, or −β for the other side, by dof; −∞ where there is none."""
+    floor = system.lower if side > 0.0 else -system.upper
+    return np.where(floor > PETSc.NINFINITY, floor, -np.inf)
 
 
 def _cell_dofs(V: fem.FunctionSpace) -> Int32Array:

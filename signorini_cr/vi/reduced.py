@@ -24,6 +24,7 @@ from ..garbage import release
 from ..multigrid.cycle import PATIENCE, SLOW, Grid, Multigrid
 from ..options import PREFIX, REDUCED, defaults, read
 from .active import ActiveSet
+from .bounds import Bounds
 from .stopping import FORCES, LOST, NOISE, Stiffness
 from .system import Vectors
 
@@ -94,7 +95,7 @@ class ReducedSolver:
     def __init__(
         self,
         cycle: Multigrid,
-        lower: FloatArray,
+        bounds: Bounds,
         snes: PETSc.SNES,
         vectors: Vectors,
         atol: float,
@@ -105,17 +106,17 @@ class ReducedSolver:
 
         Args:
             cycle: The preconditioner, with the matrix on its finest grid.
-            lower: Bounds of that grid's bounded dofs, shape (n,).
+            bounds: Of that grid's bounded dofs.
             snes: The solver that it works for, which knows the active set.
             vectors: Right-hand side, and where SNES keeps the iterate and the residual.
             atol: What the linear solver may leave at the end.
             stiffness: Classes of these dofs.
             loose: How many times more than usual may be wrong with the forces.
         """
-        self._cycle, self._lower, self._snes = cycle, lower, snes
+        self._cycle, self._bounds, self._snes = cycle, bounds, snes
         self._x, self._residual, self._b = vectors.x, vectors.residual, vectors.b
         self._stiffness, self._share = stiffness, loose * FORCES
-        self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(lower), dtype=bool))
+        self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(bounds.lower), dtype=bool))
         self.reached, self.reduction, self.iterations = np.inf, SET_SHARE, 0
         self.force_errors: FloatArray = np.full(stiffness.number, np.inf)
         self._step = self._x.duplicate()
@@ -155,7 +156,7 @@ class ReducedSolver:
         first, end = self.matrix.getOwnershipRange()
         inactive = self._snes.getVIInactiveSet().array - first
         self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, end - first)
-        forces = self.forces()
+        forces = self._residual.array_r[self.active.bounded].copy()
         self._residual.array[self.active.dofs] = 0.0
         with self._cycle.constrained(self.active.dofs, deep=self._uses_cycle):
             test = self._run(forces)
@@ -170,9 +171,8 @@ class ReducedSolver:
 
     def _run(self, forces: FloatArray) -> LinearTest:
         """Run the inner solver, and return what its test has found out."""
-        gap = self._x.array_r[self.active.bounded] - self._lower
         system = ReducedSystem(
-            self._cycle.finest, self._stiffness, self.active, self._x, gap, forces
+            self._cycle.finest, self._stiffness, self.active, self._x, self._bounds, forces
         )
         test = LinearTest(system, self._is_cg, self._share, self.reduction)
         if self._uses_cycle and self._cycle.may_give_up:
@@ -185,12 +185,12 @@ class ReducedSolver:
     def active_now(self) -> ActiveSet:
         """The active set of the iterate as it is now, which SNES will go on with."""
         bounded = self.active.bounded
-        return ActiveSet.of(bounded, self._x.array_r[bounded] - self._lower, self.forces())
+        return ActiveSet.of(bounded, self._bounds.gap(self._x.array_r[bounded]), self.forces())
 
     def forces(self) -> FloatArray:
-        """The residual in the bounded dofs, shape (n,)."""
-        forces: FloatArray = self._residual.array_r[self.active.bounded]
-        return forces
+        """The residual in the bounded dofs, above 0 where it pushes them off, shape (n,)."""
+        bounded = self.active.bounded
+        return self._bounds.side(self._x.array_r[bounded]) * self._residual.array_r[bounded]
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ class ReducedSystem:
         stiffness: Classes of the bounded dofs.
         active: The active set.
         x: The iterate.
-        gap: u − α at the bounded dofs, shape (n,).
+        bounds: Bounds of the bounded dofs.
         forces: A u − b there, shape (n,).
     """
 
@@ -228,7 +228,7 @@ class ReducedSystem:
     stiffness: Stiffness
     active: ActiveSet
     x: PETSc.Vec
-    gap: FloatArray
+    bounds: Bounds
     forces: FloatArray
 
     def indicator(self, step: PETSc.Vec | None = None) -> FloatArray:
@@ -239,11 +239,14 @@ class ReducedSystem:
         Args:
             step: What is subtracted from the iterate; None for nothing.
         """
-        operator, gap, forces = self.grid.operator, self.gap, self.forces
+        operator, forces = self.grid.operator, self.forces
+        x = self.x.array_r[operator.dofs]
         if step is not None:
-            gap = gap - step.array_r[operator.dofs]
-            forces = forces - operator.times(step)
-        return np.where(self.active.mask, forces, -operator.diagonal * gap)
+            x, forces = x - step.array_r[operator.dofs], forces - operator.times(step)
+        bounds = self.bounds
+        return np.where(
+            self.active.mask, bounds.side(x) * forces, -operator.diagonal * bounds.gap(x)
+        )
 
     def outlook(self, now: FloatArray, before: FloatArray) -> Outlook:
         """Judge a step by its indicator and by that of the step before; collective."""

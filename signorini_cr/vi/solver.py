@@ -25,6 +25,7 @@ from ..garbage import release
 from ..multigrid.cycle import Multigrid
 from ..options import NEWTON, PREFIX, REDUCED_PREFIX, defaults, explained, read, read_number
 from .active import ActiveSet
+from .bounds import Bounds
 from .reduced import LINEAR_SHARE, SET_SHARE, FullJacobian, ReducedSolver
 from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, Stiffness
 from .system import Vectors
@@ -109,7 +110,7 @@ def solve_vi(
     stiffness = Stiffness(cycle.finest, row_sums)
     linear = ReducedSolver(
         cycle,
-        vectors.lower.array_r[cycle.operator.dofs],
+        Bounds(*(each.array_r[cycle.operator.dofs] for each in (vectors.lower, vectors.upper))),
         snes,
         vectors,
         LINEAR_SHARE * wanted,
@@ -168,10 +169,8 @@ def _prepare(
     jacobian = PETSc.Mat().createPython(sizes, FullJacobian(linear.matrix), comm=snes.getComm())
     jacobian.setUp()
     snes.setJacobian(lambda *_: None, jacobian)
-    upper = vectors.b.duplicate()
-    upper.set(PETSc.INFINITY)
-    snes.setVariableBounds(vectors.lower, upper)
-    return outer, jacobian, upper
+    snes.setVariableBounds(vectors.lower, vectors.upper)
+    return outer, jacobian
 
 
 def _report(snes: PETSc.SNES, linear: ReducedSolver, monitor: Monitor | None) -> None:

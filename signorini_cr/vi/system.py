@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields
 
 import numpy as np
 from dolfinx import fem
@@ -22,6 +21,7 @@ from ..multigrid.constrained import ConstrainedMatrix
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import MATRICES, defaults
+from .bounds import Bounds
 
 ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
@@ -33,7 +33,8 @@ class Vectors:
 
     Attributes:
         b: Right-hand side, with the Dirichlet values in their rows.
-        lower: Bound of each dof, `PETSc.NINFINITY` for all but the bounded ones.
+        lower: Lower bound of each dof, `PETSc.NINFINITY` where there is none.
+        upper: Upper bound of each dof, `PETSc.INFINITY` where there is none.
         x: For the solver the start on entry, with the Dirichlet values in place, and the solution
             on exit.
         residual: On exit A x − b.
@@ -41,6 +42,7 @@ class Vectors:
 
     b: PETSc.Vec
     lower: PETSc.Vec
+    upper: PETSc.Vec
     x: PETSc.Vec
     residual: PETSc.Vec
 
@@ -49,27 +51,31 @@ class System:
     """The variational inequality (1.8) as matrix, vector and bounds.
 
     Attributes:
+        operator: A as the solver uses it.
         A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
         b: Vector of χ less the Dirichlet values' share, the values themselves in their rows.
         chi: Vector of χ alone, ghosts up to date.
-        lower: Bounds, α on Γ1 and `PETSc.NINFINITY` elsewhere, ghosts up to date, shape (dofs,).
+        lower: α on Γ1, `PETSc.NINFINITY` where there is none, ghosts up to date, shape (dofs,).
+        upper: β on Γ1, `PETSc.INFINITY` where there is none, likewise.
         dirichlet: Local dofs on Γ0, ghosts included.
-        bounded: Owned local dofs with a bound, ascending.
+        bounded: Owned local dofs with a bound, ascending, shape (n,).
+        bounds: These bounds.
         u_D: Function with the Dirichlet values, 0 elsewhere.
         bounded_facets: Owned facets of Γ1, ascending, shape (n,).
         contact_dofs: The dofs with a bound that each of them has, shape (n, 1) or (n, d).
-        obstacle_at_vertices: α at the vertices of the contact facets, shape (n, d).
+        obstacles_at_vertices: α and β at the vertices of the contact facets, shape (2, n, d).
         residual_scale: Norm of the residual at the most trivial start, which all residuals are
             measured against: the number in the middle of the values u_D takes, raised to α on Γ1
             where that is larger, u_D on Γ0. A constant added to u_D and α makes no difference
             unless it is so large that differences drown in it.
     """
 
-    def __init__(self, data: OnMesh):
+    def __init__(self, data: OnMesh, like: System | None = None):
         """Assemble it; collective.
 
         Args:
             data: The physics on the mesh.
+            like: A system on the same mesh and parts whose matrix is the same, and is taken.
 
         Raises:
             InputError: Data are not finite, or κ is not above 0.
@@ -77,26 +83,23 @@ class System:
         self._data, V = data, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
         on_dirichlet, self.u_D = _imposed(data.fixed, V)
-        on_contact, lower = _imposed(data.lower, V)
-        self._read_contact(data.lower)
+        floors, ceilings = ([b for b in data.bounds if b.sign == sign] for sign in (1, -1))
+        has_floor, floor = _imposed(floors, V)
+        has_ceiling, ceiling = _imposed(ceilings, V)
+        self._read_contact(data.bounds)
         # Where the two parts meet in a P1 vertex the Dirichlet value holds
-        bounded = on_contact & ~on_dirichlet
-        self.lower = np.where(bounded, lower.x.array, PETSc.NINFINITY)
+        bounded = (has_floor | has_ceiling) & ~on_dirichlet
+        self.lower = np.where(has_floor & bounded, floor.x.array, PETSc.NINFINITY)
+        self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
         self.bounded = np.flatnonzero(bounded[: layout.size[0]]).astype(np.int32)
+        self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
         bc, a = self._bc(self.u_D), data.a
-        with defaults(MATRICES, prefix=""):
-            if layout.cr:
-                self.A = assemble_matrix(empty_matrix(layout), a, [bc])
-            else:
-                self.A = assemble_matrix(a, [bc])
-        self.A.assemble()
-        diagonal = self.A.getDiagonal()
-        positive = bool((diagonal.array_r > 0.0).all())
-        release(diagonal)
-        complaint = "data: the coefficient must be finite and above 0 everywhere"
-        raise_together(comm, None if positive else complaint)
-        self.A.setOption(PETSc.Mat.Option.SPD, True)
+        if like is None:
+            self.A = _assembled(a, bc, layout)
+            self.operator = ConstrainedMatrix(self.A, self.bounded)
+        else:
+            self.A, self.operator = like.A, like.operator
         self.chi = fem.Function(V)
         self.chi.x.array[:] = data.chi()
         self.b = fem.Function(V)
@@ -123,17 +126,12 @@ class System:
             start, residual = (fem.Function(self.u_D.function_space) for _ in range(2))
             start.x.array[:] = number
             start.x.array[self.dirichlet] = values
-            start.x.array[bounded] = np.maximum(self.lower[bounded], number)
+            start.x.array[bounded] = np.clip(number, self.lower[bounded], self.upper[bounded])
             norms.append(self.residual(start, residual))
         scale = max(norms[0], ROUNDING * norms[-1])
         if not np.isfinite(scale):
             raise InputError("data: so large that their squares overflow; choose other units")
         return scale
-
-    @cached_property
-    def operator(self) -> ConstrainedMatrix:
-        """A as the solver uses it."""
-        return ConstrainedMatrix(self.A, self.bounded)
 
     @property
     def owned_dirichlet(self) -> Int32Array:
@@ -144,12 +142,12 @@ class System:
     def vectors(self, u: fem.Function, residual: fem.Function) -> Iterator[Vectors]:
         """Lend the complementarity problem's vectors for a block, on the functions' memory."""
         V = u.function_space
-        arrays = self.b.x.array, self.lower, u.x.array, residual.x.array
+        arrays = self.b.x.array, self.lower, self.upper, u.x.array, residual.x.array
         vectors = Vectors(*(ghosted_vector(V, array) for array in arrays))
         try:
             yield vectors
         finally:
-            release(vectors.b, vectors.lower, vectors.x, vectors.residual)
+            release(*(getattr(vectors, each.name) for each in fields(vectors)))
 
     @property
     def held(self) -> Int32Array:
@@ -169,14 +167,22 @@ class System:
     def _read_contact(self, bounds: Sequence[Imposed]) -> None:
         """Note what the owned facets of Γ1 have, in ascending order."""
         V = self._data.V
-        facets = np.concatenate([each.facets for each in bounds])
-        dofs = [unknowns(V, each.facets, each.components) for each in bounds]
-        order = np.argsort(facets)
         topology = V.mesh.topology
-        order = order[facets[order] < topology.index_map(topology.dim - 1).size_local]
-        self.bounded_facets = facets[order]
-        self.contact_dofs = np.concatenate([each[:, :, 0] for each in dofs])[order]
-        self.obstacle_at_vertices = np.concatenate([each.ends[:, :, 0] for each in bounds])[order]
+        owned = topology.index_map(topology.dim - 1).size_local
+        facets = np.concatenate([each.facets for each in bounds])
+        dofs = np.concatenate(
+            [unknowns(V, each.facets, each.components)[:, :, 0] for each in bounds]
+        )
+        # with bounds on both sides a facet is there twice
+        self.bounded_facets, first = np.unique(facets[facets < owned], return_index=True)
+        self.contact_dofs = dofs[facets < owned][first]
+        size = len(self.bounded_facets), bounds[0].ends.shape[1]
+        self.obstacles_at_vertices = np.stack([np.full(size, -np.inf), np.full(size, np.inf)])
+        for each in bounds:
+            own = each.facets < owned
+            row = self.obstacles_at_vertices[0 if each.sign > 0 else 1]
+            at = np.searchsorted(self.bounded_facets, each.facets[own])
+            row[at] = each.sign * each.ends[own, :, 0]
 
     def row_sums(self) -> FloatArray:
         """Sum up the owned rows of A: a_h(1, ·) but where a neighbour is on Γ0."""
@@ -206,6 +212,24 @@ class System:
             vector.destroy()
         r.x.scatter_forward()
         return norm
+
+
+def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
+    """The matrix of a_h, with the identity's rows and columns on Γ0; collective."""
+    with defaults(MATRICES, prefix=""):
+        A = (
+            assemble_matrix(empty_matrix(layout), a, [bc])
+            if layout.cr
+            else assemble_matrix(a, [bc])
+        )
+    A.assemble()
+    diagonal = A.getDiagonal()
+    positive = bool((diagonal.array_r > 0.0).all())
+    release(diagonal)
+    complaint = "data: the coefficient must be finite and above 0 everywhere"
+    raise_together(A.comm.tompi4py(), None if positive else complaint)
+    A.setOption(PETSc.Mat.Option.SPD, True)
+    return A
 
 
 def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:

@@ -63,6 +63,13 @@ def part_case(section: str, more: str = 'type = "contact"') -> str:
     return f"{text}\n[boundary.{section}]\n{more}\n"
 
 
+SOIL = "polygon = [[-1, 0], [1, 0], [1, 0.5], [-1, 0.5]]"
+
+
+def material_case(more: str, section: str = "[material.soil]") -> str:
+    return f"{CASE}\n{section}\n{more}\n"
+
+
 # name: (text of the file, what the message must hold)
 BAD: dict[str, tuple[str, list[str]]] = {
     "unknown section": (
@@ -147,6 +154,49 @@ BAD: dict[str, tuple[str, list[str]]] = {
     "coefficient of a part below 0": (
         part_case("deck", 'type = "contact"\ncoefficient = "x - 5"'),
         ["boundary.deck.coefficient: the value at", "must be 0 or more everywhere"],
+    ),
+    "material no section": (
+        "material = 3\n" + CASE,
+        ["material: sections [material.NAME] are needed, found 3"],
+    ),
+    "unknown key of a material": (
+        material_case("kapa = 3"),
+        ["material.soil.kapa: there is no such key; allowed are polygon, coefficient, f, reaction"],
+    ),
+    "material without a polygon": (
+        material_case("f = 1"),
+        ["material.soil.polygon: this key is missing; a list of points [x, y] is needed"],
+    ),
+    "polygon of a material not simple": (
+        material_case("polygon = [[0, 0], [1, 1], [1, 0], [0, 1]]"),
+        ["material.soil.polygon: edge 0 crosses edge 2; the polygon must be simple"],
+    ),
+    "polygon of a material no points": (
+        material_case("polygon = [[0, 0], [1, 1], 3]"),
+        ["material.soil.polygon[2]: a point [x, y] is needed, found 3"],
+    ),
+    "materials that overlap": (
+        material_case(f"{SOIL}\n[material.sand]\npolygon = [[0, 0.2], [0.5, 0.2], [0.1, 0.9]]"),
+        ["domain: the materials soil and sand overlap around ("],
+    ),
+    "material outside the domain": (
+        material_case("polygon = [[2, 2], [3, 2], [3, 3]]"),
+        ["domain: the material soil lies outside the domain"],
+    ),
+    "coefficient of a material 0": (
+        material_case(f'{SOIL}\ncoefficient = "max(y - 0.2, 0)"'),
+        [
+            "material.soil.coefficient: the value at (-1, 0) is 0; the coefficient must be above 0 "
+            "there"
+        ],
+    ),
+    "data of a material not finite": (
+        material_case(f'{SOIL}\nf = "1/y"'),
+        ["material.soil.f: the value at", "in the domain"],
+    ),
+    "polygon beside a mesh file": (
+        mesh_case("junk.msh") + f"[material.soil]\n{SOIL}\n",
+        ["material.soil.polygon: with a mesh file a physical surface named soil is needed"],
     ),
     "reaction below 0": (
         with_("[refine]", "reaction = -1\n[refine]"),
@@ -548,6 +598,30 @@ def test_the_deck(shared_tmp_path: Path) -> None:
     level = json.loads((out / "report.json").read_text())["levels"][-1]
     assert level["bound_h1"] is not None and level["contact"]["active"] == 80
     # u = 0 on the deck: 20 · 10 · 4 is lost there
+    assert 0 < level["contact"]["force"] < 800
+
+
+def test_data_need_to_make_sense_only_where_they_are_used(write) -> None:
+    """1/y does not on Γ1, where the cells' material has a load of its own."""
+    text = with_('f = "1 + r"', 'f = "1/y"')
+    assert "data.f: the value at" in refused("check", write(text), "--out", "out")
+    path = write(f"{text}\n[material.soil]\n{SOIL}\nf = 1\n")
+    status, printed, err = run("check", path, "--out", "out")
+    assert (status, err) == (0, "")
+    assert COMM.rank > 0 or "soil       f = 1; " in printed
+
+
+def test_a_deck_of_three_materials(shared_tmp_path: Path) -> None:
+    """Those of two polygons and, elsewhere, of [data], through the command."""
+    out = shared_tmp_path / "out"
+    path = helpers.MESHES / "materials.toml"
+    status, text, err = run("solve", path, "--out", out, "--levels", "2")
+    assert (status, err) == (0, "")
+    if COMM.rank > 0:
+        return
+    assert "steel      κ = 50; " in text and "foam       κ = 0.04; " in text
+    level = json.loads((out / "report.json").read_text())["levels"][-1]
+    assert level["bound_h1"] is not None
     assert 0 < level["contact"]["force"] < 800
 
 

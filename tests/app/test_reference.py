@@ -15,7 +15,7 @@ from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import _parser
 from signorini_cr.app.datacheck import USED_ON
 from signorini_cr.app.problemfile import load
-from signorini_cr.app.reference import ABOUT, KEYS, PART, TYPES
+from signorini_cr.app.reference import ABOUT, KEYS, MATERIAL, PART, TYPES
 
 BASE = {
     "domain": {
@@ -80,13 +80,15 @@ def test_every_figure_is_in_the_reference(known, shared_tmp_path, capsys) -> Non
     if MPI.COMM_WORLD.rank > 0:
         return
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert report["levels"][0].get("quantities") == {}  # of which each file has its own
     (level,) = report["levels"]
     assert dotted(report) == names_in("Keys of report.json")
-    assert dotted(level) == names_in("Keys of a level")
+    assert dotted(level | {"quantities": None}) == names_in("Keys of a level")
     head = next(csv.reader((folder / "levels.csv").read_text(encoding="utf-8").splitlines()))
-    assert head == [name.replace(".", "_") for name in dotted(level)]
+    assert head == [name.replace(".", "_") for name in dotted(level) if name != "quantities"]
     head = next(csv.reader((folder / "contact.csv").read_text(encoding="utf-8").splitlines()))
-    assert head == names_in("Columns of contact.csv")
+    named = names_in("Columns of contact.csv")
+    assert head == [name for name in named if name != "upper"]  # which is not bounded from above
     (head,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("level "))
     printed = head.replace("H1 error", "H1_error").replace("L2 error", "L2_error").split()
     known_names = names_in("Columns of the printed table")
@@ -122,6 +124,8 @@ def test_examples_are_read(key, tmp_path: Path) -> None:
         kind = next((kind for kind, keys in TYPES.items() if key.name in keys), "")
         sections[PART]["type"] = f'type = "{kind}"'
         sections["domain"]["boundary"] = 'boundary = ["contact", "dirichlet", "NAME", "NAME"]'
+    if key.section == MATERIAL:
+        sections[MATERIAL]["polygon"] = "polygon = [[0, 0], [1, 0], [0, 1]]"
     sections[key.section][key.name] = key.example
     lines = [*sections.pop("").values()]
     for name, rows in sections.items():
@@ -145,11 +149,12 @@ def test_every_key_of_the_ready_files_is_in_the_table() -> None:
     for path in (ROOT / "meshes").glob("*.toml"):
         table = tomllib.loads(path.read_text(encoding="utf-8"))
         for section, content in table.items():
-            if section == "define":
+            if section in ("define", "quantities"):  # names of one's own
                 continue
             parts = {section: content}
-            if section == "boundary":
-                parts = {f"{PART} {name}": part for name, part in content.items()}
+            if section in ("boundary", "material"):
+                whole = {"boundary": PART, "material": MATERIAL}[section]
+                parts = {f"{whole} {name}": part for name, part in content.items()}
             for name, part in parts.items():
                 keys = part if isinstance(part, dict) else [name]
                 where = name.split()[0] if isinstance(part, dict) else ""

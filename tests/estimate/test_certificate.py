@@ -18,13 +18,25 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import Domain, InputError, Polygon, Problem, exact, solve, solve_levels
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Domain,
+    InputError,
+    Neumann,
+    Polygon,
+    Problem,
+    Robin,
+    exact,
+    solve,
+    solve_levels,
+)
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.ranges import range_of
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
-from signorini_cr.estimate.force import force_bounds
+from signorini_cr.estimate.force import flux, force_bounds
 from signorini_cr.fem.cells import Cells
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
@@ -401,6 +413,73 @@ def test_force_is_bracketed():
         assert low <= solution.contact.force <= high
         widths.append(high - low)
     assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
+
+
+STRIP = [[0, 0], [2, 0], [2, 1], [0, 1]]
+STRIP_EDGES = ["floor", "right", "top", "left"]
+
+
+def strip(conditions, size=0.2, **data):
+    """u on the levels of (0, 2) × (0, 1) with a condition for each edge."""
+    named = dict(zip(STRIP_EDGES, conditions, strict=True))
+    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES).mesh(size)
+    return solve_levels(Problem(conditions=named, **data), domain, 4)
+
+
+def test_what_flows_through_is_bracketed_in_one_dimension():
+    """κu'' = c u between u = 0 on top and b (u − u_ext) + pressure below, which holds u at 1."""
+    kappa, c, b, external = 2.0, 3.0, 5.0, -4.0
+    k = np.sqrt(c / kappa)
+    # u = sinh k(1 − y)/sinh k: κ∂ₙu = κ k coth k below, −κ k/sinh k on top
+    force = kappa * k / np.tanh(k) + b * (1.0 - external)
+    out = -kappa * k / np.sinh(k)
+    widths = []
+    for solution in strip(
+        [Contact(1.0, coefficient=b, external=external), Neumann(), Dirichlet(0.0), Neumann()],
+        coefficient=kappa,
+        reaction=c,
+    ):
+        pressed, inflow = flux(solution, "floor"), flux(solution, "top")
+        assert pressed.lower <= 2 * force <= pressed.upper
+        assert inflow.lower <= 2 * out <= inflow.upper
+        assert pressed.value == pytest.approx(solution.contact.force, rel=1e-9)
+        assert pressed[1:] == pytest.approx(force_bounds(solution), rel=1e-12)
+        assert pressed.value == pytest.approx(2 * force, rel=0.02)
+        assert inflow.value == pytest.approx(2 * out, rel=0.05)
+        widths.append([each.upper - each.lower for each in (pressed, inflow)])
+    assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
+    assert widths[-1][0] < 0.01 * 2 * force
+
+
+def test_held_by_contact_alone_there_is_a_force_and_no_interval():
+    """Nothing but the obstacle takes what f and g bring."""
+    (*_, solution) = strip([Contact(0.0), Neumann(0.5), Neumann(), Neumann()], f=-3.0)
+    with pytest.raises(InputError, match="no way to Γ0"):  # held by contact alone
+        flux(solution, "floor")
+    assert solution.contact.force == pytest.approx(5.5, rel=1e-7)
+
+
+def test_forces_of_two_parts_add_up_and_have_their_signs():
+    """One part pushes up, one down; all that b does not take goes through them."""
+    lower, upper = Contact(0.2), Contact(upper=-0.1)
+    for solution in strip([lower, Robin(coefficient=2.0), upper, Robin(coefficient=2.0)]):
+        floor, top = flux(solution, "floor"), flux(solution, "top")
+        both = flux(solution, "floor", "top")
+        assert floor.lower >= 0.0 >= top.upper
+        assert both.value == pytest.approx(solution.contact.force, rel=1e-9)
+        assert floor.value + top.value == pytest.approx(both.value, rel=1e-9)
+        assert both[1:] == pytest.approx(force_bounds(solution), rel=1e-9)
+        assert floor.lower <= floor.value <= floor.upper
+
+
+def test_what_has_no_flux_is_said():
+    (*_, solution) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Dirichlet(0.0)])
+    with pytest.raises(InputError, match="'right' is no Dirichlet or contact part"):
+        flux(solution, "right")
+    with pytest.raises(InputError, match="Γ1 touches Γ0"):
+        force_bounds(solution)
+    with pytest.raises(InputError, match="the part touches another one"):
+        flux(solution, "top")
 
 
 def test_force_needs_distance():

@@ -1068,7 +1068,7 @@ def test_a_flux_that_need_not_balance_the_load(loss):
         excess.copy(), np.zeros(len(contact.cells)), np.zeros(len(contact.cells), dtype=bool),
         left.copy(), None,
     )  # fmt: skip
-    assert flux.relax(cells, kappa, y, c, edge, contact)
+    assert flux.relax(cells, kappa, y, c, edge, contact, np.ones(len(contact.cells)))
     change = y.excess - excess
     assert np.allclose(y.left - left, change.sum(axis=0))
     jumps = np.abs(cells.over_facets(change))[~cells.exterior]
@@ -1146,9 +1146,12 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     for number, side in cells.sides.items():
         free[side.dofs] &= number == 1
     alpha = np.full((2, len(contact.cells)), height), np.full(len(contact.cells), height)
+    signs = np.ones(len(contact.cells))
+    limits = ((1, cells.largest_at_vertices(contact.ends, alpha[0])),)
+    floors = companion.Floors(contact, signs, *alpha, limits, len(cells.exterior))
     start = np.zeros(len(rim)), np.zeros(len(free))
     v, bumps, found = companion._solved(
-        cells, kappa, np.array(True), w, start, (loose, free), contact, alpha
+        cells, kappa, np.array(True), w, start, (loose, free), floors
     )
     assert found is None
     after = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)

@@ -1,13 +1,17 @@
 """Adaptive meshes shared out anew: the same cells, parents on other ranks, the same solutions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from dolfinx import fem
 from mpi4py import MPI
 
 from signorini_cr import Domain, Polygon, Problem, Solution, solve_adaptive
 from signorini_cr.compat import cell_nodes
 from signorini_cr.mesh import balance as module
 from signorini_cr.mesh.balance import balance
+from signorini_cr.mesh.materials import Materials
 from signorini_cr.mesh.refinement import refine_marked
 from signorini_cr.multigrid.parents import Parents
 from signorini_cr.restart import Restart
@@ -96,6 +100,23 @@ def test_children_are_put_together_on_other_ranks():
     smallest = parents.collected(own, np.minimum)
     at_once = Parents(coarse.mesh, fine.mesh, parent).collected(areas(fine), np.minimum)
     assert smallest == pytest.approx(at_once, rel=1e-13)
+
+
+def test_what_cells_have_moves_with_them():
+    """Materials, and a Function that is constant on the coarse cells."""
+    coarse, fine, parent = into_a_corner()
+    left = (corners(fine)[:, :, 0].mean(axis=1) < 0).astype(np.int32)
+    moved, _, _ = balance(replace(fine, materials=Materials({"left": 1}, left)), parent)
+    centres = corners(moved)[:, :, 0].mean(axis=1)
+    assert np.array_equal(moved.materials.of_cells, centres < 0)
+    of_cells = fem.Function(fem.functionspace(coarse.mesh, ("DG", 0)))
+    of_cells.x.array[of_cells.function_space.dofmap.list[:, 0]] = areas(coarse)
+    tables = []
+    for domain in (fine, moved):
+        own = domain.own(of_cells)
+        values = own.x.array[own.function_space.dofmap.list[:, 0]]
+        tables.append(together(np.column_stack([corners(domain).reshape(-1, 6), values])))
+    assert np.array_equal(*tables)
 
 
 def solved(limit: float, monkeypatch: pytest.MonkeyPatch, **more) -> list[Solution]:

@@ -29,7 +29,7 @@ WORLD = MPI.COMM_WORLD
 LEVEL = {
     "level", "cells", "dofs", "h", "newton_iterations", "linear_iterations", "energy", "kkt",
     "contact", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1", "effectivity", "seconds",
-    "bound_reason", "bound_parts", "energy_bounds",
+    "bound_energy_norm", "quantities", "bound_reason", "bound_parts", "energy_bounds",
 }  # fmt: skip
 CONTACT_HEADER = ["part", "arc_length", "x", "y", "length", "obstacle", "u", "pressure", "active"]
 
@@ -81,7 +81,9 @@ def test_the_report_has_the_keys_that_others_rely_on(folder):
         assert set(record) == LEVEL
         kkt = {"min_gap", "min_pressure", "complementarity", "residual", "force_error"}
         assert set(record["kkt"]) == kkt
-        assert set(record["contact"]) == {"facets", "active", "length", "force", "transitions"}
+        contact = {"facets", "active", "length", "force", "force_bounds", "transitions"}
+        assert set(record["contact"]) == contact
+        assert set(record["contact"]["force_bounds"]) == {"lower", "upper", "reason"}
         assert set(record["seconds"]) == {"mesh", "assemble", "solve", "estimate"}
     assert report["ranks"] == WORLD.size
     assert [record["level"] for record in report["levels"]] == [0, 1, 2]
@@ -228,8 +230,10 @@ def test_levels_csv_holds_the_whole_record(finished, folder):
         "kkt_min_gap", "kkt_min_pressure", "kkt_complementarity", "kkt_residual",
         "kkt_force_error",
         "contact_facets", "contact_active", "contact_length", "contact_force",
-        "contact_transitions", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1",
-        "effectivity", "bound_reason", *(f"bound_parts_{name}" for name in SHARES),
+        "contact_transitions", "contact_force_bounds_lower", "contact_force_bounds_upper",
+        "contact_force_bounds_reason", "error_h1", "error_l2", "rate_h1", "rate_l2", "bound_h1",
+        "bound_energy_norm", "effectivity", "bound_reason",
+        *(f"bound_parts_{name}" for name in SHARES),
         "energy_bounds_lower", "energy_bounds_upper", "seconds_mesh", "seconds_assemble",
         "seconds_solve", "seconds_estimate",
     ]  # fmt: skip

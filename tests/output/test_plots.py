@@ -54,6 +54,18 @@ def on_rank_0(value):
     return WORLD.bcast(value, root=0)
 
 
+def test_the_mesh_shows_its_materials(shared_tmp_path):
+    half = np.array([[-1.0, 0.0], [0.0, 0.0], [0.0, 2.0], [-1.0, 2.0]])
+    sides = ("contact", "dirichlet", "dirichlet", "dirichlet")
+    corners = [[-1.0, 0.0], [1.0, 0.0], [1.0, 1.0], [-1.0, 1.0]]
+    domain = Polygon(corners, sides, materials={"price in $": half}).mesh(0.4)
+    path = shared_tmp_path / "mesh.png"
+    plots.plot_mesh(domain, path)
+    assert on_rank_0(share(path, plots.TINTS[0])) > 10
+    plots.plot_mesh(rectangle(4), path)
+    assert on_rank_0(share(path, plots.TINTS[0])) < 0.5
+
+
 def test_the_mesh_shows_each_boundary_part_in_its_colour(shared_tmp_path):
     path = shared_tmp_path / "mesh.png"
     for neumann in (False, True):

@@ -8,7 +8,9 @@ from signorini_cr.output.tables import certified, legend, table_header, times
 
 RECORD = {
     "level": 0, "cells": 8, "dofs": 16, "h": 0.5, "newton_iterations": 1, "linear_iterations": 3,
-    "energy": -2.0, "contact": {"active": 2, "length": 1.0}, "error_h1": None, "error_l2": None,
+    "energy": -2.0, "quantities": {}, "contact": {"active": 2, "length": 1.0,
+    "force_bounds": {"lower": None, "upper": None, "reason": "none"}}, "error_h1": None,
+    "error_l2": None,
     "bound_h1": 0.26683801, "bound_reason": None,
     "energy_bounds": {"lower": -2.68565172, "upper": -2.68529189},
     "seconds": {"mesh": 0.5, "assemble": 0.25, "solve": 1.0, "estimate": None},
@@ -38,15 +40,19 @@ def test_no_bound_no_figures():
 
 @pytest.mark.parametrize("lower, upper", [(0.24871234, 0.25131234), (0.0, 3.1), (0.25, 0.25)])
 def test_the_force_that_is_printed_is_certain(lower, upper):
-    text = certified(RECORD, {"lower": lower, "upper": upper, "reason": None})
+    bounds = {"lower": lower, "upper": upper, "reason": None}
+    text = certified(RECORD | {"contact": {"force_bounds": bounds}})
     low, high = map(float, re.search(r"the contact force is in \[(.*?), (.*?)\]", text).groups())
     assert low <= lower and upper <= high
     assert high - low <= 1.21 * (upper - lower)
 
 
 def test_no_force_but_a_reason():
-    text = certified(RECORD, {"lower": None, "upper": None, "reason": "they touch"})
-    assert text.endswith("; the contact force has no bounds: they touch")
+    bounds = {"lower": None, "upper": None, "reason": "they touch"}
+    inflow = {"value": 1.0, "lower": 0.9, "upper": 1.1, "reason": None}
+    record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"inflow": inflow}}
+    text = certified(record)
+    assert "; the contact force has no bounds: they touch; inflow is in [0.9, 1.1]" in text
 
 
 def test_every_printed_column_has_its_word():

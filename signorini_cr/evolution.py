@@ -1,0 +1,220 @@
+"""Problems in time: one mesh and one matrix, set up once and solved again and again.
+
+capacity ∂u/∂t − ∇·(κ∇u) + c u = f with contact is, step by step, the problem with c + rate in the
+place of c and f + rate w in the place of f: implicit Euler has rate = capacity/Δt and w = u_{n−1},
+the second-order backward difference rate = 3 capacity/(2Δt) and w = (4 u_{n−1} − u_{n−2})/3. w is a
+function of Crouzeix-Raviart, so that all its integrals are exact, the certificate's too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, nullcontext
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from .arrays import FloatArray
+from .data.diffusion import diffusion
+from .data.loads import Load, chi
+from .data.moments import Rule, Volume
+from .diffusion import Diffusion
+from .errors import InputError
+from .fem.conditions import Data, number
+from .fem.problem import Problem, as_expression
+from .levels import Start, solve_level
+from .mesh.domain import Domain
+from .mesh.refinement import check_refinable, refine
+from .multigrid.hierarchy import Hierarchy, NestedMesh
+from .multigrid.parents import Layout
+from .solution import Solution
+from .vi.level import Level
+
+SCHEMES = ("euler", "bdf2")
+
+
+class Clock(Protocol):
+    """What has a time that can be set, as dolfinx's Constant."""
+
+    value: Any
+
+
+class Solver:
+    """A problem on one mesh, set up once; for a `with` block, which frees what it holds.
+
+    What a_h is made of, κ, c and b, must stay. Everything else may change between solves: the
+    values of dolfinx Constants that f, g, u_D and obstacles hold, and a source of its own.
+    """
+
+    def __init__(
+        self, problem: Problem, domain: Domain, levels: int = 1, like: Solver | None = None
+    ):
+        """Assemble the matrix, and set up multigrid; collective.
+
+        Args:
+            problem: The data.
+            domain: The coarsest mesh of multigrid, and its boundary parts.
+            levels: How many meshes there are; solved is on the last of them.
+            like: A solver for another problem on the same domain, whose meshes are taken.
+
+        Raises:
+            InputError: As for `solve_levels`.
+        """
+        if levels < 1:
+            raise InputError(f"levels is {levels}; it must be 1 or more")
+        if levels > 1:
+            check_refinable(domain.mesh)
+        physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
+        physics.check(domain)
+        hierarchy = Hierarchy(physics, domain)
+        if like is None:
+            for _ in range(levels - 1):
+                hierarchy.add(*refine(hierarchy.meshes[-1].domain))
+        else:
+            for mesh in like._hierarchy.meshes[1:]:
+                assert mesh.parents is not None
+                hierarchy.add(mesh.domain, mesh.parents.cell)
+        self.physics = physics
+        self._hierarchy: Hierarchy = hierarchy
+        self._level = Level(hierarchy.meshes)
+        self._held = self._level.loose is None
+        system = self._level.system
+        self._stack = ExitStack()
+        self._stack.callback(hierarchy.free)
+        lent = hierarchy.multigrid(system.operator, system.owned_dirichlet)
+        self._cycle = self._stack.enter_context(lent)
+
+    def __enter__(self) -> Self:
+        """Begin."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Free what there is."""
+        self.close()
+
+    def close(self) -> None:
+        """Free matrix and multigrid; collective."""
+        self._stack.close()
+
+    @property
+    def V(self) -> fem.FunctionSpace:
+        """The discrete space."""
+        return self._level.V
+
+    def solve(self, source: fem.Function | None = None, before: Solution | None = None) -> Solution:
+        """Solve with the data as they are now; collective.
+
+        Args:
+            source: Added to f, a function in `V`, ghosts up to date.
+            before: What to start from, with its active set; from this solver.
+
+        Raises:
+            InputError: As for `solve`.
+            NotConverged: As for `solve`.
+        """
+        meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
+        data = diffusion(self._level.data).renewed(None if source is None else source.x.array)
+        renewed = NestedMesh(last.physics, last.domain, last.parents, data)
+        level = Level((*meshes[:-1], renewed), self._held, self._level.system)
+        start = Start() if before is None else Start(known=before.u)
+        return solve_level(level, lambda _: nullcontext(self._cycle), start, None, {"mesh": 0.0})
+
+    def projected(self, data: Data) -> fem.Function:
+        """The function of `V` that is nearest to data in L²; collective."""
+        forms, on_mesh = self.physics, diffusion(self._level.data)
+        rule = Rule(forms.mesh, forms.problem.quadrature_degree)
+        found, V = fem.Function(self.V), self.V
+        sums: list[FloatArray] = []
+        for each in (data, 1.0):
+            volume = Volume(as_expression(each, forms.x), forms.mesh, rule)
+            moments = chi(Load.of(volume, on_mesh.cells), (), on_mesh.cells)
+            sums.append(Layout.of_space(V).shared_sum(moments))
+        # the matrix of products of CR's functions is diagonal for triangles
+        found.x.array[:] = sums[0] / sums[1]
+        return found
+
+
+def solve_in_time(
+    problem: Problem,
+    domain: Domain,
+    *,
+    end: float,
+    steps: int,
+    scheme: str = "euler",
+    initial: Data = 0.0,
+    capacity: float = 1.0,
+    levels: int = 1,
+    time: Clock | None = None,
+) -> Iterator[tuple[float, Solution]]:
+    """Solve capacity ∂u/∂t − ∇·(κ∇u) + c u = f with contact, step by step; collective.
+
+    The matrix is assembled once. Every step starts from the last one with its active set; its
+    certificate is that of its own problem, in which the steps before are data: it says nothing of
+    what the step's length does to u.
+
+    Args:
+        problem: The data. What depends on the time t holds a Constant on the domain's mesh; κ, c
+            and b must not.
+        domain: The coarsest mesh of multigrid, and its boundary parts.
+        end: The last time; the first is 0.
+        steps: How many steps of the same length there are.
+        scheme: "euler", of first order, or "bdf2", of second order after a first step of Euler's.
+        initial: u at the time 0; it is projected to the discrete space.
+        capacity: Above 0.
+        levels: How many nested meshes there are; solved is on the last of them.
+        time: That Constant; it is set to the time of each step.
+
+    Yields:
+        The time, and u_h then. The solution of a step stays as it is.
+
+    Raises:
+        InputError: An argument is not as it should be, or as for `solve_levels`.
+        NotConverged: A step was not solved.
+    """
+    if not (end > 0.0 and np.isfinite(end)):
+        raise InputError(f"end is {end}; it must be a time after 0")
+    if steps < 1:
+        raise InputError(f"steps is {steps}; it must be 1 or more")
+    if scheme not in SCHEMES:
+        raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
+    if not (capacity > 0.0 and np.isfinite(capacity)):
+        raise InputError(f"capacity is {capacity}; it must be above 0")
+    if domain.mesh.topology.dim != 2:
+        raise InputError("problems in time are worked out for d = 2 only")
+    c = number(as_expression(problem.reaction, ufl.SpatialCoordinate(domain.mesh)))
+    if c is None or any(each.reaction is not None for each in problem.materials.values()):
+        raise InputError("problems in time need a reaction that is a number, the same everywhere")
+    rate, own = capacity * steps / end, 1.0
+    solver: Solver | None = None
+    last: Solution | None = None
+    before = then = np.empty(0)
+    try:
+        for step in range(1, steps + 1):
+            second = scheme == "bdf2" and step > 1
+            if solver is None or second != (own > rate):
+                own, former = 1.5 * rate if second else rate, solver
+                solver = Solver(replace(problem, reaction=c + own), domain, levels, former)
+                if former is None:
+                    then = solver.projected(initial).x.array
+                else:
+                    former.close()
+            source = fem.Function(solver.V)
+            source.x.array[:] = own * ((4.0 * then - before) / 3.0 if second else then)
+            t = end * step / steps
+            if time is not None:
+                time.value = t
+            last = solver.solve(source, last)
+            before, then = then, last.u.x.array
+            yield t, last
+    finally:
+        if solver is not None:
+            solver.close()

@@ -1,0 +1,180 @@
+"""Problems in time: orders of the schemes, contact against a dense solver, certificates, ranks."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scipy.optimize import lsq_linear
+
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    InputError,
+    Neumann,
+    Polygon,
+    Problem,
+    Solver,
+    solve,
+    solve_in_time,
+)
+
+WORLD = MPI.COMM_WORLD
+EDGES = ["floor", "right", "top", "left"]
+SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], EDGES, names=EDGES)
+
+
+def clock(domain):
+    return fem.Constant(domain.mesh, 0.0)
+
+
+@pytest.mark.parametrize(("scheme", "order"), [("euler", 1), ("bdf2", 2)])
+def test_order_in_time(scheme, order):
+    """u = (1 + x) e^{−t} + t³ y is in the space at any time: all of the error is the scheme's."""
+    domain = SQUARE.mesh(0.4)
+    t = clock(domain)
+
+    def u(x):
+        return (1 + x[0]) * ufl.exp(-t) + t**3 * x[1]
+
+    problem = Problem(
+        f=lambda x: 2.0 * (3 * t**2 * x[1] - (1 + x[0]) * ufl.exp(-t)) + 0.5 * u(x),
+        reaction=0.5,
+        conditions={
+            "floor": Contact(-100.0, g=lambda x: -3.0 * t**3),
+            "right": Dirichlet(u),
+            "top": Dirichlet(u),
+            "left": Neumann(lambda x: -3.0 * ufl.exp(-t)),
+        },
+        coefficient=3.0,
+    )
+    errors = []
+    for steps in (8, 16, 32):
+        *_, (end, solution) = solve_in_time(
+            problem, domain, end=1.0, steps=steps, scheme=scheme, capacity=2.0, time=t,
+            initial=lambda x: 1 + x[0], levels=2,
+        )  # fmt: skip
+        assert end == 1.0
+        exact = fem.Function(solution.u.function_space)
+        exact.interpolate(lambda x: (1 + x[0]) * np.exp(-1.0) + x[1])
+        off = np.abs(exact.x.array - solution.u.x.array).max(initial=0.0)
+        errors.append(WORLD.allreduce(float(off), op=MPI.MAX))
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert rates == pytest.approx(order, abs=0.06)
+
+
+def waves(t):
+    """Contact that comes and goes."""
+    walls = {"right": Neumann(), "top": Dirichlet(0.0), "left": Neumann()}
+    return Problem(
+        f=lambda x: -20.0 * ufl.sin(4.0 * t) * x[0],
+        conditions=walls | {"floor": Contact(lambda x: -0.1 - 0.05 * ufl.sin(t), upper=0.08)},
+    )
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+def test_steps_with_contact_against_a_dense_solver(scheme):
+    """Mass and stiffness put together anew, each step SciPy's least squares in a box."""
+    domain, steps, end = SQUARE.mesh(0.3), 12, 3.0
+    t, k = clock(domain), 3.0 / 12
+    past, states = [], set()
+    for time, solution in solve_in_time(
+        waves(t), domain, end=end, steps=steps, scheme=scheme, time=t, initial=lambda x: x[1] - 1
+    ):
+        V = solution.u.function_space
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+
+        def dense(form):
+            return fem.assemble_matrix(fem.form(form)).to_dense()
+
+        M, S = dense(u * v * ufl.dx), dense(ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx)
+        if not past:
+            first = fem.Function(V)
+            first.interpolate(lambda x: x[1] - 1)
+            past = [first.x.array.copy()]
+        x = ufl.SpatialCoordinate(domain.mesh)
+        load = fem.assemble_vector(
+            fem.form(waves(fem.Constant(domain.mesh, time)).f(x) * v * ufl.dx)
+        )
+        if scheme == "bdf2" and len(past) > 1:
+            A, b = 1.5 / k * M + S, load.array + M @ (2.0 * past[-1] - 0.5 * past[-2]) / k
+        else:
+            A, b = M / k + S, load.array + M @ past[-1] / k
+        system = solution.level.system
+        free = np.setdiff1d(np.arange(len(b)), system.dirichlet)
+        low, high = np.full(len(b), -np.inf), np.full(len(b), np.inf)
+        middles = V.tabulate_dof_coordinates()[system.bounded]
+        assert np.allclose(middles[:, 1], 0.0)
+        low[system.bounded], high[system.bounded] = -0.1 - 0.05 * np.sin(time), 0.08
+        L = np.linalg.cholesky(A[np.ix_(free, free)])
+        found = np.zeros(len(b))
+        found[free] = lsq_linear(
+            L.T, np.linalg.solve(L, b[free]), (low[free], high[free]), method="bvls", tol=1e-15
+        ).x
+        assert np.allclose(solution.u.x.array, found, rtol=0, atol=2e-7)
+        force = (A @ found - b)[system.bounded]
+        held = (found <= low)[system.bounded] | (found >= high)[system.bounded]
+        assert solution.contact.force == pytest.approx(force[held].sum(), abs=1e-6)
+        states |= {int(np.sign(force[held].sum())) if held.any() else 0}
+        past = [*past[-1:], found]
+    assert states >= {-1, 1}
+
+
+def test_steps_are_those_of_problems_with_a_reaction():
+    """The first step, solved by itself; and its certificate, which knows u₀ exactly."""
+    domain = SQUARE.mesh(0.3)
+    t = clock(domain)
+    initial = lambda x: 0.5 * (x[1] - 1) + 0.1 * x[0]  # noqa: E731
+    _, first = next(
+        iter(solve_in_time(waves(t), domain, end=1.0, steps=4, time=t, initial=initial))
+    )
+    assert float(t.value) == 0.25
+    alone = waves(t)
+    by_itself = solve(
+        Problem(
+            f=lambda x: alone.f(x) + 4.0 * initial(x), reaction=4.0, conditions=alone.conditions
+        ),
+        domain,
+    )
+    assert np.allclose(first.u.x.array, by_itself.u.x.array, atol=1e-8)
+    assert first.contact.force == pytest.approx(by_itself.contact.force, rel=1e-6)
+    assert first.energy == pytest.approx(by_itself.energy, rel=1e-8)
+    mine, other = first.certificate, by_itself.certificate
+    assert mine.bound_energy_norm == pytest.approx(other.bound_energy_norm, rel=1e-3)
+    assert mine.energy == pytest.approx(other.energy, rel=1e-4)
+
+
+def test_what_goes_on_for_long_stands_still():
+    """u_n tends to the stationary solution; steps then take nothing; multigrid, with its meshes."""
+    domain = SQUARE.mesh(0.3)
+    walls = {name: Dirichlet(0.0) for name in ("right", "top", "left")}
+    problem = Problem(f=-30.0, conditions=walls | {"floor": Contact(-0.05), "right": Neumann()})
+    for _, solution in solve_in_time(problem, domain, end=20.0, steps=10, levels=3):
+        pass
+    with Solver(problem, domain, 3) as solver:
+        still = solver.solve()
+        assert solver.solve(before=still).iterations.newton <= 1
+    assert np.allclose(solution.u.x.array, still.u.x.array, atol=1e-6)
+    assert solution.contact.force == pytest.approx(still.contact.force, rel=1e-5)
+    assert solution.contact.number_active > 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"end": 0.0}, "end is 0.0"),
+        ({"steps": 0}, "steps is 0"),
+        ({"scheme": "crank"}, "one of euler, bdf2"),
+        ({"capacity": -1.0}, "capacity is -1.0"),
+        ({"levels": 0}, "levels is 0"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(wrong, said):
+    domain = SQUARE.mesh(0.5)
+    given = {"end": 1.0, "steps": 2} | wrong
+    with pytest.raises(InputError, match=said):
+        next(solve_in_time(waves(clock(domain)), domain, **given))
+    problem = Problem(reaction=lambda x: x[0], conditions=waves(0.0).conditions)
+    with pytest.raises(InputError, match="a reaction that is a number"):
+        next(solve_in_time(problem, domain, end=1.0, steps=1))
