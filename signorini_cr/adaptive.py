@@ -11,11 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 from mpi4py import MPI
 
-from .arrays import BoolArray, FloatArray, Int32Array
+from .arrays import BoolArray, FloatArray
 from .errors import InputError, NotConverged
 from .fem.problem import Problem
 from .levels import LevelMonitor, solve_sequence
 from .limits import Limits
+from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine_marked
 from .restart import Restart
@@ -70,7 +71,7 @@ def solve_adaptive(
     limits = Limits(max_time)
     limits.begin(domain, element, restart)
 
-    def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
+    def step(solution: Solution) -> Refined | None:
         certificate = solution.certificate
         if certificate.bound_h1 is None or certificate.indicators is None:
             raise InputError(
@@ -93,7 +94,7 @@ def solve_adaptive(
         if dofs > max_dofs:
             return None
         limits.admit(solution, dofs)
-        return fine, parent_cell
+        return balance(fine, parent_cell)
 
     for solution in solve_sequence(problem, domain, step, element, monitor, restart=restart):
         _ = solution.certificate  # made here, so that it doesn't count as time for the mesh

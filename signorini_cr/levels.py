@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 from dolfinx import fem
 
-from .arrays import Int32Array
 from .diffusion import Diffusion
 from .errors import InputError, NotConverged
 from .fem.physics import Physics
 from .fem.problem import Problem
 from .limits import Limits
+from .mesh.balance import Refined
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.cycle import Multigrid
@@ -97,11 +97,11 @@ def solve_levels(
     limits = Limits(max_time)
     limits.begin(domain, element, restart)
 
-    def step(solution: Solution) -> tuple[Domain, Int32Array] | None:
+    def step(solution: Solution) -> Refined | None:
         if solution.level.number + 1 >= levels:
             return None
         limits.admit(solution, 4 * solution.dofs)
-        return refine(solution.domain)
+        return (*refine(solution.domain), None)
 
     yield from solve_sequence(problem, domain, step, element, monitor, nested, restart)
 
@@ -109,7 +109,7 @@ def solve_levels(
 def solve_sequence(
     problem: Problem,
     domain: Domain,
-    step: Callable[[Solution], tuple[Domain, Int32Array] | None],
+    step: Callable[[Solution], Refined | None],
     element: str = "CR",
     monitor: LevelMonitor | None = None,
     nested: bool = True,
@@ -120,8 +120,8 @@ def solve_sequence(
     Args:
         problem: As for `solve_levels`.
         domain: The coarsest mesh and its boundary parts.
-        step: Makes the next domain, and the parent of each of its cells, from a solution; None
-            ends the sequence. `hierarchy.refine` and `hierarchy.refine_marked` return such pairs.
+        step: Makes the next domain and says where its cells' parents are, as `balance` does, from
+            a solution; None ends the sequence.
         element: "CR" or "P1".
         monitor: Called after each step of the solver.
         nested: Start from the solution on the mesh below; otherwise from zero, to compare.
@@ -143,7 +143,7 @@ def solve_sequence(
 def solve_physics(
     physics: Physics,
     domain: Domain,
-    step: Callable[[Solution], tuple[Domain, Int32Array] | None],
+    step: Callable[[Solution], Refined | None],
     monitor: LevelMonitor | None = None,
     nested: bool = True,
     restart: Restart | None = None,
@@ -157,9 +157,9 @@ def solve_physics(
         return hierarchy.multigrid(system.operator, system.owned_dirichlet)
 
     if restart is not None:
-        for mesh, parents in restart.meshes(domain):
+        for refined in restart.meshes(domain):
             level.tidy()
-            hierarchy.add(mesh, parents)
+            hierarchy.add(*refined)
             level = Level(hierarchy.meshes, held=level.loose is None)
         start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
@@ -167,11 +167,11 @@ def solve_physics(
         solution = solve_level(level, lend, start, monitor, seconds)
         yield solution
         began = time.perf_counter()
-        refined = step(solution)
-        if refined is None:
+        following = step(solution)
+        if following is None:
             break
         level.tidy()
-        hierarchy.add(*refined)
+        hierarchy.add(*following)
         level = Level(hierarchy.meshes, held=level.loose is None)
         start = Start()
         if nested:

@@ -19,6 +19,7 @@ from mpi4py import MPI
 from . import compat
 from .arrays import FloatArray, Int32Array
 from .errors import raise_together
+from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine, refine_edges
 from .multigrid.parents import Layout
@@ -61,24 +62,25 @@ class Restart:
             return cls((), (here,))
         added = None
         if adaptive:
-            coarse, fine = (_nodes(each.domain.mesh) for each in solution.level.meshes[-2:])
-            added = _gathered(np.setdiff1d(fine, coarse), comm)
+            meshes = solution.level.meshes[-2:]
+            coarse, fine = (_gathered(_nodes(each.domain.mesh), comm) for each in meshes)
+            added = np.setdiff1d(fine, coarse)
         return cls((*below.added, added), (here, below.u[0]))
 
-    def meshes(self, domain: Domain) -> Iterator[tuple[Domain, Int32Array]]:
+    def meshes(self, domain: Domain) -> Iterator[Refined]:
         """Refine as it was done before; collective.
 
         Args:
             domain: The coarsest mesh.
 
         Yields:
-            The next domain, and the parent of each of its cells.
+            What `Hierarchy.add` takes.
         """
         for places in self.added:
             if places is None:
-                refined = refine(domain)
+                refined: Refined = (*refine(domain), None)
             else:
-                refined = refine_edges(domain, _edges_at(domain.mesh, places))
+                refined = balance(*refine_edges(domain, _edges_at(domain.mesh, places)))
             yield refined
             domain = refined[0]
 

@@ -245,18 +245,13 @@ def unbalanced(
             return taken_up
     meshes = level.meshes
     for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
-        assert mesh.parents is not None
-        parent, domain = mesh.parents.cell[: len(left)].astype(np.intp), coarser.domain
+        parents, domain = mesh.parents, coarser.domain
+        assert parents is not None
         d = domain.mesh.topology.dim
         number = domain.mesh.topology.index_map(d).size_local
-        square, left, volume = (
-            np.bincount(parent, values, minlength=number).astype(np.float64, copy=False)
-            for values in (left**2 / volume, left, volume)
-        )
+        square, left, volume = map(parents.collected, (left**2 / volume, left, volume))
         if kappa_min.ndim:
-            coarse = np.full(number, np.inf)
-            np.minimum.at(coarse, parent, kappa_min)
-            kappa_min = coarse
+            kappa_min = parents.collected(kappa_min, np.minimum)
         h = domain.mesh.h(d, np.arange(number, dtype=np.int32))
         square = np.maximum(square - left**2 / volume, 0.0)
         part = float(np.sum(h**2 * square / kappa_min))

@@ -114,13 +114,17 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
         Coordinates of shape (n, d, 3), vertices in the order of the cell's closure, and measures
         of shape (n,).
     """
-    tdim = mesh.topology.dim
     cells, local = facet_entities(mesh, facets).T
     corners = facet_corners(mesh)
     x = mesh.geometry.x[np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)]
+    return x, measures(x)
+
+
+def measures(x: FloatArray) -> FloatArray:
+    """Measures of simplices with vertices x, shape (n, vertices, 3)."""
     edges = x[:, 1:] - x[:, :1]
     gram = np.einsum("nid,njd->nij", edges, edges)
-    return x, np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, tdim))
+    return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, x.shape[1]))
 
 
 def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> FloatArray:

@@ -28,10 +28,11 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
 from ..errors import InputError, on_root, raise_together
 from . import gmshmesh
+from .exchange import Exchange
 from .materials import Materials
 from .materials import numbered as numbered_materials
 from .partition import by_position
@@ -53,7 +54,8 @@ class Domain:
         tags: Facet tags; each exterior facet has the value of one part.
         parts: The parts' names, and their values in the tags.
         materials: What the cells consist of.
-        coarser: What it was refined from, and the cell there that holds each cell, local indices.
+        coarser: What it was refined from, the cell there that holds each cell, and what fetches
+            these cells from other ranks, as `balance.balance` returns them.
         seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
@@ -62,7 +64,7 @@ class Domain:
     seconds: float = 0.0
     parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
     materials: Materials = field(default_factory=Materials)
-    coarser: tuple[Domain, Int32Array] | None = None
+    coarser: tuple[Domain, Int32Array | IndexArray, Exchange | None] | None = None
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
@@ -98,7 +100,7 @@ class Domain:
         return {}
 
     def own(self, function: fem.Function) -> fem.Function:
-        """Carry a function that is constant on each cell of a coarser mesh to this one.
+        """Carry a function that is constant on each cell of a coarser mesh to this one; collective.
 
         Args:
             function: Of degree 0, on this mesh or on one that it was refined from.
@@ -115,12 +117,15 @@ class Domain:
                 " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
             )
         if function not in self._own:
-            coarse, parents = self.coarser
+            coarse, parents, exchange = self.coarser
             above = coarse.own(function)
             fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
             at = (space.dofmap.list[:, 0] for space in (fine.function_space, above.function_space))
             here, there = at
-            fine.x.array[here[: len(parents)]] = above.x.array[there[parents]]
+            values = above.x.array[there]
+            if exchange is not None:
+                values = exchange.fetch(values)
+            fine.x.array[here[: len(parents)]] = values[parents]
             self._own[function] = fine
         return self._own[function]
 

@@ -74,8 +74,8 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
     """Halve the sides of the marked triangles, and what else conformity takes; collective.
 
     Sides are halved by bisecting longest edges first, which keeps the angles bounded from below
-    however often it is repeated. A rank keeps the children of its cells: the load is not
-    balanced again.
+    however often it is repeated. A rank keeps the children of its cells; `balance.balance`
+    shares them out anew.
 
     Args:
         domain: Straight-sided triangles; ghost cells are left behind.
@@ -112,7 +112,6 @@ def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]
         InputError: The mesh does not consist of straight-sided triangles.
     """
     coarse = _prepared(domain.mesh)
-    of_cells = _table(coarse.topology.connectivity(2, 1))
     fine, parent, parent_facet = split(
         coarse,
         edges,
@@ -125,22 +124,38 @@ def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]
     parent = parent[before]
     parent_facet = parent_facet.reshape(-1, 3)[before]
 
-    label = np.zeros(_count(coarse.topology.index_map(1)), dtype=np.int32)
+    label = labels(domain)[parent[:, None], parent_facet]
+    label[parent_facet < 0] = 0
+    return _child(domain, fine, tagged(fine, label), parent), parent
+
+
+def labels(domain: Domain) -> Int32Array:
+    """The value in the tags of each facet of each cell of this rank, 0 without one.
+
+    Shape (cells, 3), for a mesh of triangles that knows the facets of its cells.
+    """
+    topology = domain.mesh.topology
+    label = np.zeros(_count(topology.index_map(1)), dtype=np.int32)
     label[domain.tags.indices] = domain.tags.values
-    cell, j = np.nonzero(parent_facet >= 0)
-    value = label[of_cells[parent[cell], parent_facet[cell, j]]]
-    fine.topology.create_connectivity(2, 1)
-    fine.topology.create_connectivity(1, 2)
-    facet = _table(fine.topology.connectivity(2, 1))[cell, j][value > 0]
+    of_cells = _table(topology.connectivity(2, 1))
+    return label[of_cells[: topology.index_map(2).size_local]]
+
+
+def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
+    """The tags of exterior facets with the values that `labels` tells, 0 for none; collective."""
+    mesh.topology.create_connectivity(2, 1)
+    mesh.topology.create_connectivity(1, 2)
+    facet = _table(mesh.topology.connectivity(2, 1))[label > 0]
     order = np.argsort(facet)
-    tags = meshtags(fine, 1, facet[order], value[value > 0][order])
-    return _child(domain, fine, tags, parent), parent
+    return meshtags(mesh, 1, facet[order], label[label > 0][order])
 
 
 def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
     """The fine domain: its cells consist of what their parents do."""
     materials = domain.materials.of_children(parent)
-    return Domain(fine, tags, parts=domain.parts, materials=materials, coarser=(domain, parent))
+    return Domain(
+        fine, tags, parts=domain.parts, materials=materials, coarser=(domain, parent, None)
+    )
 
 
 def _count(index_map: Any) -> int:

@@ -24,10 +24,11 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from petsc4py import PETSc
 
-from ..arrays import Int32Array
+from ..arrays import IndexArray, Int32Array
 from ..fem.physics import OnMesh, Physics
 from ..garbage import hold, release, sweep
 from ..mesh.domain import Domain
+from ..mesh.exchange import Exchange
 from ..options import MATRICES, defaults
 from .constrained import ConstrainedMatrix, numbers_of
 from .cycle import (
@@ -89,15 +90,21 @@ class Hierarchy:
         self._operators: list[ConstrainedMatrix] = []  # that belong to the chain alone
         self._given_up = False
 
-    def add(self, domain: Domain, parent_cell: Int32Array) -> None:
+    def add(
+        self,
+        domain: Domain,
+        parent_cell: Int32Array | IndexArray,
+        exchange: Exchange | None = None,
+    ) -> None:
         """Add a mesh.
 
         Args:
             domain: The mesh, whose cells lie in those of the finest so far, and boundary parts.
-            parent_cell: For each local cell the coarse cell that holds it.
+            parent_cell: For each local cell the coarse cell that holds it, as for `Parents`.
+            exchange: The same.
         """
         finest = self.meshes[-1]
-        parents = Parents(finest.domain.mesh, domain.mesh, parent_cell)
+        parents = Parents(finest.domain.mesh, domain.mesh, parent_cell, exchange)
         self.meshes = (*self.meshes, NestedMesh(finest.physics, domain, parents))
 
     @contextmanager

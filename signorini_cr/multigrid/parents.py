@@ -13,14 +13,16 @@ from typing import Any
 
 import basix
 import numpy as np
+import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from petsc4py import PETSc
 
 from .. import compat
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.physics import Imposed
 from ..fem.space import facet_corners, facet_entities, function_space, shared_sum
+from ..mesh.exchange import Exchange
 
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
 """No edge or median of a cell is at right angles to it, unless on purpose."""
@@ -108,17 +110,93 @@ class Parents:
     """Which coarse cell each fine cell lies in, and where.
 
     Attributes:
-        cell: For each local fine cell the local coarse cell that holds it.
+        cell: For each local fine cell the coarse cell that holds it: its local index, or, where
+            fine cells have moved, its row among those fetched from other ranks.
     """
 
-    def __init__(self, coarse: Mesh, fine: Mesh, cell: Int32Array):
-        """Relate two nested meshes."""
+    def __init__(
+        self,
+        coarse: Mesh,
+        fine: Mesh,
+        cell: Int32Array | IndexArray,
+        exchange: Exchange | None = None,
+    ):
+        """Relate two nested meshes.
+
+        Args:
+            coarse: The one.
+            fine: The other.
+            cell: For each local fine cell the local coarse cell that holds it; or its row among
+                those that the exchange fetches.
+            exchange: What fetches them from other ranks, if fine cells have moved.
+        """
         self.cell = cell
-        self._coarse, self._fine = coarse, fine
+        self._coarse, self._fine, self._exchange = coarse, fine, exchange
+
+    def take(
+        self, values: npt.NDArray, nodes: Int32Array, cells: Int32Array | slice = slice(None)
+    ) -> npt.NDArray:
+        """Values at the nodes of fine cells' parents; collective.
+
+        Args:
+            values: For each local node of the coarse mesh, shape (nodes, …).
+            nodes: Those of the local coarse cells, shape (coarse cells, …).
+            cells: Local fine cells; all, if left out.
+
+        Returns:
+            For each of these what `values[nodes]` has for its parent.
+        """
+        parents = self.cell[cells]
+        if self._exchange is None:
+            return values[nodes[parents]]
+        return self._exchange.fetch(values[nodes])[parents]
+
+    def collected(self, values: FloatArray, ufunc: np.ufunc = np.add) -> FloatArray:
+        """What the children of each coarse cell of this rank have, put together; collective.
+
+        Args:
+            values: For each fine cell of this rank.
+            ufunc: What puts two values together: `np.add` or `np.minimum`.
+
+        Returns:
+            For each coarse cell of this rank.
+        """
+        first = 0.0 if ufunc is np.add else np.inf
+        topology = self._coarse.topology
+        result = np.full(topology.index_map(topology.dim).size_local, first)
+        if self._exchange is None:
+            ufunc.at(result, self.cell[: len(values)], values)
+            return result
+        rows = np.full(self._exchange.count, first)
+        ufunc.at(rows, self.cell[: len(values)], values)
+        ufunc.at(result, self._exchange.rows, self._exchange.give_back(rows))
+        return result
+
+    def layout(self, coarse: Layout) -> Layout:
+        """The coarse dofs, with the cells that `cell` numbers; collective."""
+        if self._exchange is None:
+            return coarse
+        index_map = coarse.index_map
+        first, end = index_map.local_range
+        owner = np.full(index_map.size_local + index_map.num_ghosts, coarse.mesh.comm.rank)
+        owner[index_map.size_local :] = index_map.owners
+        nodes = coarse.cells.ravel()
+        of_cells = np.column_stack([index_map.local_to_global(nodes), owner[nodes]])
+        told = self._exchange.fetch(of_cells.reshape(len(coarse.cells), -1)).reshape(-1, 2)
+        number, owner = told.T
+        others = (number < first) | (number >= end)
+        ghosts, at, place = np.unique(number[others], return_index=True, return_inverse=True)
+        cells = (number - first).astype(np.int32)
+        cells[others] = index_map.size_local + place
+        owners = owner[others][at].astype(np.int32)
+        seen = compat.index_map(coarse.mesh.comm, index_map.size_local, ghosts, owners)
+        return replace(coarse, cells=cells.reshape(-1, coarse.cells.shape[1]), index_map=seen)
 
     @cached_property
     def regular(self) -> bool:
         """Whether every coarse cell has its 2^d children in a row, on this rank."""
+        if self._exchange is not None:
+            return False
         topology = self._coarse.topology
         cells = topology.index_map(topology.dim).size_local
         children = 2**topology.dim
@@ -151,7 +229,7 @@ class Parents:
             )
             if deviation <= 1e-10 * np.abs(x_coarse).max():
                 return pattern
-        return barycentric_coordinates(x_coarse[parents[self.cell]], x[nodes])
+        return barycentric_coordinates(self.take(x_coarse, parents), x[nodes])
 
     def weights(self, coarse: Layout, fine: Layout) -> FloatArray:
         """The parent's shape functions at the dofs of each fine cell.

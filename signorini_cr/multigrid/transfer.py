@@ -3,8 +3,8 @@
 On nested meshes every fine cell lies in one coarse cell, its parent, and nothing else has to be
 known: the value at a fine dof is the average, over the fine cells that touch it, of the parents'
 affine functions there. That holds for any pattern of refinement and any dimension; for P1, which is
-continuous, the average is that of equal numbers. Parents live on their children's rank, so each
-rank adds its own cells' share.
+continuous, the average is that of equal numbers. Each rank adds its own cells' share. Where their
+parents live on other ranks, the parents' dofs are ghosts here.
 
 P1 is contained in CR: a conforming function's mean over a facet is the mean of its d vertex values.
 """
@@ -137,7 +137,7 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
         parents: The coarse cells that hold the fine ones.
     """
     weights, parent_cell = parents.weights(coarse, fine), parents.cell
-    corners = fine.cells.shape[1]
+    coarse, corners = parents.layout(coarse), fine.cells.shape[1]
     slot = np.empty(fine.index_map.size_local + fine.index_map.num_ghosts, dtype=np.int32)
     slot[fine.cells] = np.arange(fine.cells.size, dtype=np.int32).reshape(fine.cells.shape)
     slot = slot[: fine.index_map.size_local]
@@ -201,11 +201,12 @@ def prolongate(
             gain = 0.25 * (u.x.array - before)
     result, cells_of_node = np.empty(fine.local), _sums(fine, np.ones(fine.cells.size))
     for component in range(block):
-        local = u.x.array[component::block][coarse.cells]
+        known = u.x.array[component::block]
         if len(weights) == len(parent_cell):
-            values = np.einsum("cij,cj->ci", weights, local[parent_cell])
+            values = np.einsum("cij,cj->ci", weights, parents.take(known, coarse.cells))
         else:  # the same pattern in each parent
-            values = local[: len(parent_cell) // len(weights)] @ weights.reshape(-1, corners).T
+            local = known[coarse.cells[: len(parent_cell) // len(weights)]]
+            values = local @ weights.reshape(-1, corners).T
         if gain is not None and repeats:
             of_families = gain[component::block][coarse.cells].reshape(-1, 1, values.shape[1])
             values.reshape(len(of_families), len(weights), -1)[:] += of_families

@@ -78,7 +78,8 @@ def distance(coarse: Solution, fine: Solution) -> float:
     mesh = fine.domain.mesh
     gradients, volumes = cell_gradients(fine.u)
     coarse_gradients, _ = cell_gradients(coarse.u)
-    difference = gradients - coarse_gradients[parents.cell[: len(gradients)]]
+    each = np.arange(len(coarse_gradients), dtype=np.int32)
+    difference = gradients - parents.take(coarse_gradients, each, slice(len(gradients)))
     return _total(mesh, float(volumes @ (difference**2).sum(axis=1))) ** 0.5
 
 

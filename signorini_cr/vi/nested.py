@@ -27,6 +27,7 @@ from ..fem.space import (
     facet_entities,
     facet_measures,
     ghosted_vector,
+    measures,
 )
 from ..garbage import release
 from ..multigrid.parents import Layout, barycentric_coordinates
@@ -195,25 +196,28 @@ class _Inherited:
     def of(cls, coarse: Solved, level: Level, facets: Int32Array) -> _Inherited:
         """Ask the parents of some fine contact facets; collective."""
         mesh, V = coarse.domain.mesh, coarse.u.function_space
-        assert level.parents is not None
+        parents = level.parents
+        assert parents is not None
         x, measure = facet_measures(level.domain.mesh, facets)
-        parents = level.parents.cell[facet_entities(level.domain.mesh, facets)[:, 0]]
+        cells = facet_entities(level.domain.mesh, facets)[:, 0]
         # The parent facet lies opposite the vertex whose barycentric coordinate vanishes on it
-        simplices = mesh.geometry.x[compat.cell_nodes(mesh)[parents]]
+        simplices = parents.take(mesh.geometry.x, compat.cell_nodes(mesh), cells)
         points = x.mean(axis=1, keepdims=True)
         local = np.argmin(np.abs(barycentric_coordinates(simplices, points)[:, 0]), axis=1)
-        tdim = mesh.topology.dim
-        mesh.topology.create_connectivity(tdim, tdim - 1)
-        c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
-        _, parent_measure = facet_measures(mesh, c2f[parents, local])
+        each, corners = np.arange(len(facets)), facet_corners(mesh)[local]
+        parent_measure = measures(simplices[each[:, None], corners])
         block = V.dofmap.index_map_bs
-        dof = block * V.dofmap.list[parents, local] + level.system.bounded % block
         marks = np.zeros(len(coarse.u.x.array))
         marks[coarse.contact.active_set.dofs] = 1.0
-        active = Layout.of_space(V).shared_sum(marks)[dof] > 0.0
-        force = coarse.residual.x.array[dof] * measure / parent_measure
-        ends = Layout.of_p1(mesh).cells[parents[:, None], facet_corners(mesh)[local]]
-        return cls(active, force, _front(coarse)[ends].any(axis=1))
+        active, force = (
+            parents.take(values.reshape(-1, block), V.dofmap.list, cells)[
+                each, local, level.system.bounded % block
+            ]
+            for values in (Layout.of_space(V).shared_sum(marks), coarse.residual.x.array)
+        )
+        front = parents.take(_front(coarse), Layout.of_p1(mesh).cells, cells)
+        at_front = front[each[:, None], corners].any(axis=1)
+        return cls(active > 0.0, force * measure / parent_measure, at_front)
 
 
 def _front(solution: Solved) -> BoolArray:
