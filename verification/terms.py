@@ -406,8 +406,8 @@ def terms(seed: int, quick: bool) -> Group:
         "own. Passed: no bound below the error in either norm, J(u) and what flows through the "
         f"parts inside their intervals, at most {MISSING:.0%} without bounds.",
         [
-            told(_drawn(seed, 6 if quick else 500)),
-            told(_smooth(2 if quick else 4)),
-            told(_fluxes(seed, 4 if quick else 100)),
+            told(_drawn(seed, 4 if quick else 500)),
+            told(_smooth(1 if quick else 4)),
+            told(_fluxes(seed, 2 if quick else 100)),
         ],
     )
