@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
@@ -17,6 +18,7 @@ from ..fem.cells import Cells, dot_rows, sum_rows
 from ..fem.conditions import Condition, facets_of
 from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
+from ..jit import compiled
 from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
@@ -187,6 +189,21 @@ def _square(made: Made, cells: Cells, at: FloatArray) -> float:
     return square + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
 
 
+def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
+    """About a in P1, with data in functions: the same form for all problems, compiled once."""
+    mesh, edge = V.mesh, made.segments
+    kappa, loss = (fem.Function(fem.functionspace(mesh, ("DG", 0))) for _ in range(2))
+    kappa.x.array[: len(made.left)] = made.kappa
+    loss.x.array[edge.facets.cells] = edge.loss
+    for function in (kappa, loss):
+        function.x.scatter_forward()
+    reaction = fem.Constant(mesh, float(made.reaction))
+    u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
+    inside = kappa * ufl.inner(ufl.grad(u), ufl.grad(w)) + reaction * u * w
+    found: fem.Form = compiled(mesh.comm, fem.form, inside * ufl.dx + loss * u * w * ufl.ds)
+    return found
+
+
 def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Function:
     """A P1 function, 1 on some parts, 0 on the rest of Γ0 and Γ1, with nearly the least ‖Aφ‖."""
     domain = solution.domain
@@ -214,7 +231,7 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
     known = np.concatenate(parts)
     marks.x.array[:] = 0.0
     marks.x.array[chosen] = 1.0
-    bc, form = fem.dirichletbc(marks, known), forms.a_p1.on(domain, [V, V])
+    bc, form = fem.dirichletbc(marks, known), _form(V, _certified(solution))
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])
