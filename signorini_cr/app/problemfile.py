@@ -21,7 +21,7 @@ from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, on_root
-from ..evolution import solve_in_time
+from ..evolution import SCHEMES, solve_in_time
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
@@ -45,7 +45,7 @@ from .readers import (
     string,
     whole,
 )
-from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SCHEMES, SECTIONS, TYPES, allowed
+from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")

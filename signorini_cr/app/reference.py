@@ -45,9 +45,6 @@ TYPES = {
 }
 """The keys that go with each type of a part."""
 
-SCHEMES = ("euler", "bdf2")
-"""Ways to go from one time to the next."""
-
 QUANTITIES = {"force": "contact", "flux": "dirichlet"}
 """Kinds of quantities, and the type of the part that each is of."""
 

@@ -13,8 +13,9 @@ from dolfinx.la import InsertMode
 
 from ..arrays import FloatArray
 from ..data.diffusion import diffusion
+from ..data.loads import trace_of
 from ..errors import InputError
-from ..fem.cells import Cells, dot_rows, sum_rows
+from ..fem.cells import Cells, dot_rows, measures, sum_rows
 from ..fem.conditions import Condition, facets_of
 from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
@@ -22,7 +23,7 @@ from ..jit import compiled
 from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
-from .companion import on_facet
+from .gap import apart
 
 NO_BOUNDS = "the contact force has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
@@ -117,7 +118,6 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     everywhere = slice(0, cells.number)
     w, P, total = made.w, made.excess, sum_rows(at)
-    own = cells.apply(w, everywhere)
     # (A v − p', Aφ) with p' = p + A u_h, cell by cell: first gradients, then c, then b
     v = made.vertices[cells.vertices]
     slopes = cells.apply(at, everywhere)
@@ -133,8 +133,7 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     if made.hats is not None:
         work -= cells.volume * dot_rows(made.hats, at)
     if made.reaction:
-        apart = v - w
-        means = (sum_rows(apart) * total + dot_rows(apart, at)) / 12.0
+        means = (sum_rows(v - w) * total + dot_rows(v - w, at)) / 12.0
         means += (2.0 * sum_rows(height) * total - dot_rows(height, at)) / 15.0
         work += made.reaction * cells.volume * means
     slack = np.abs(made.left * total) / (d + 1)
@@ -142,17 +141,14 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
         work -= made.left * total / (d + 1)
         slack[:] = 0.0
     edge = made.segments
-    ends = at[cells.others[edge.side.local].T, edge.side.cells]
-    on_edge = np.einsum("qin,in->qn", edge.hats, ends)
+    on_edge = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, at))
     of_edge = edge.measure * np.sum(edge.weights[:, None] * edge.rest * on_edge, axis=0)
     if edge.loss.any():
-        jump = on_facet(cells, edge.side, edge.hats, made.vertices, made.bumps)
-        trace = w[cells.others[edge.side.local].T, edge.side.cells]
-        jump -= np.einsum("qin,in->qn", edge.hats, trace)
+        jump = apart(cells, w, edge, made.vertices, made.bumps)
         loss = edge.loss[edge.place] * edge.measure
         of_edge = of_edge - loss * np.sum(edge.weights[:, None] * jump * on_edge, axis=0)
     if made.shed is not None:
-        share = edge.measure / np.bincount(edge.place, edge.measure)[edge.place]
+        share = edge.measure / measures(cells, edge.facets)[edge.place]
         of_edge = of_edge + made.shed[edge.place] * share * (edge.weights @ on_edge)
     force = 0.0
     for condition in conditions:
@@ -160,8 +156,7 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
             force += made.forces[condition.number]
         else:
             side = cells.sides[condition.number]
-            through = P - d * made.kappa * own
-            force += float(np.sum(through[side.local, side.cells]))
+            force += float(np.sum(made.through(cells)[side.local, side.cells]))
     at_fixed = any(condition.fixed is not None for condition in conditions)
     value, middle, energy, unsure = cells.total(
         force,
@@ -184,8 +179,7 @@ def _square(made: Made, cells: Cells, at: FloatArray) -> float:
     slopes = cells.apply(at, slice(0, cells.number))
     square = float(np.sum(made.kappa * dot_rows(at, slopes)))
     square += made.reaction / 12.0 * float(cells.volume @ (total**2 + dot_rows(at, at)))
-    a, b = at[cells.others[edge.facets.local].T, edge.facets.cells]
-    measure = np.bincount(edge.place, edge.measure, minlength=len(a))
+    (a, b), measure = trace_of(cells, edge.facets, at), measures(cells, edge.facets)
     return square + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
 
 

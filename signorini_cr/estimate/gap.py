@@ -212,7 +212,7 @@ def integrate_edge(
     sums.indicators[at] += sizes**2 / low
     sums.neumann = float(np.sum(sizes**2 / low))
     if edge.loss.any():
-        _add_loss(cells, w, edge, flux, _apart(cells, w, edge, v), sums)
+        _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
     if d != 2:
         return sums.neumann
     if flux.beyond is not None:
@@ -236,7 +236,7 @@ def integrate_edge(
         row[at] += more
     ends = cells.others[side.local].T, side.cells
     weights = edge.measure * edge.weights[:, None] * edge.rest
-    jump = _apart(cells, w, edge, v)
+    jump = apart(cells, w, edge, v.vertices, v.bumps)
     sums.load_companion += float(np.sum(weights * jump))
     # The potential of y − κ_T∇u_h, as in _against_potential
     P = flux.excess[:, side.cells]
@@ -261,9 +261,11 @@ def integrate_edge(
     return 0.0
 
 
-def _apart(cells: Cells, w: FloatArray, edge: Segments, v: Companion) -> FloatArray:
+def apart(
+    cells: Cells, w: FloatArray, edge: Segments, vertices: FloatArray, bumps: FloatArray
+) -> FloatArray:
     """Return v − u_h at the points of facets, shape (q, n)."""
-    jump = on_facet(cells, edge.side, edge.hats, v.vertices, v.bumps)
+    jump = on_facet(cells, edge.side, edge.hats, vertices, bumps)
     jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
     return jump
 

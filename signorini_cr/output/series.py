@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import on_root
 from .files import Writer, write_files, write_text
 from .report import FILES, plain
+from .tables import levels_csv
 from .vtu import write_solution
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ def write_step(folder: Path, records: Sequence[Mapping[str, Any]], solution: Sol
         found = on_root(comm, lambda: [path.name for path in folder.glob(FIELDS)])
         removed = {*FILES, *comm.bcast(found)}
     writers: dict[str, Writer] = {
-        TABLE: lambda path: on_root(comm, write_text, path, lambda: _table(records)),
+        TABLE: lambda path: on_root(comm, write_text, path, lambda: levels_csv(records)),
         SERIES: lambda path: on_root(comm, write_text, path, lambda: _series(records)),
         _field(records[-1]): lambda path: write_solution(solution, path),
     }
@@ -96,14 +95,6 @@ def write_step(folder: Path, records: Sequence[Mapping[str, Any]], solution: Sol
 
 def _field(record: Mapping[str, Any]) -> str:
     return FIELDS.replace("*", f"{record['step']:05d}")
-
-
-def _table(records: Sequence[Mapping[str, Any]]) -> str:
-    text = io.StringIO()
-    lines = csv.DictWriter(text, list(records[0]), lineterminator="\n")
-    lines.writeheader()
-    lines.writerows(records)
-    return text.getvalue()
 
 
 def _series(records: Sequence[Mapping[str, Any]]) -> str:
