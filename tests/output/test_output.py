@@ -175,11 +175,12 @@ def test_one_rank_reports_what_all_ranks_report(finished):
             return [x for key, item in value.items() if key not in skip for x in figures(item)]
         return [x for item in value for x in figures(item)] if isinstance(value, list) else [value]
 
+    def wanted(value):
+        words = value is None or isinstance(value, str)  # newer versions of approx take no words
+        return value if words else pytest.approx(value, rel=1e-6, abs=1e-9)
+
     for mine, all_of_us in zip(alone, finished[1]["levels"], strict=True):
-        wanted = [
-            x if x is None else pytest.approx(x, rel=1e-6, abs=1e-9) for x in figures(all_of_us)
-        ]
-        assert figures(mine) == wanted
+        assert figures(mine) == [wanted(x) for x in figures(all_of_us)]
 
 
 def variants(record):
