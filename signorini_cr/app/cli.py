@@ -277,7 +277,7 @@ def _solve_steps(
     """Solve a problem in time; each step is safe in the folder before the next begins."""
     from ..errors import InputError, NotConverged
     from ..output import report as output
-    from ..output import series
+    from ..output import series, strip
     from ..output.tables import certified
 
     for name, given in {
@@ -292,11 +292,15 @@ def _solve_steps(
     records: list[dict[str, Any]] = []
     failure: NotConverged | None = None
     solution: Solution | None = None
+    assert case.time is not None
+    chosen, moments = strip.chosen(case.time.steps), []
     screen.progress("step 1")
     try:
         for time, solution in case.steps(domain, case.levels):
             record = series.step_record(len(records) + 1, time, solution)
             records.append(record)
+            if record["step"] in chosen:
+                moments.append(strip.moment(time, solution))
             with _named("--out"):
                 series.write_step(folder, records, solution)
             if len(records) == 1:
@@ -310,7 +314,7 @@ def _solve_steps(
         report = output.make_report(case.title, "CR", comm, [last], failure is None)
         report["times"] = records
         with _named("--out"):
-            names = output.write_output(folder, report, solution, steps=True)
+            names = output.write_output(folder, report, solution, moments=moments)
         screen.line("")
         screen.text(_facts(last))
         screen.text(f"the last step's own problem, {certified(last)}")

@@ -29,6 +29,7 @@ from ..estimate.certificate import SHARES
 from ..estimate.force import NO_BOUNDS, flux, force_bounds
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
+from .strip import Moment, plot_strip
 from .tables import contact_csv, levels_csv, markdown_table
 from .tables import table_header as table_header
 from .tables import table_row as table_row
@@ -53,6 +54,7 @@ FILES = (
     "report.html",
     "times.csv",
     "series.pvd",
+    "strip.png",
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 
@@ -228,7 +230,7 @@ def write_output(
     solution: Solution,
     pictures: bool = True,
     resumable: bool = False,
-    steps: bool = False,
+    moments: Sequence[Moment] = (),
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
 
@@ -241,7 +243,7 @@ def write_output(
         pictures: Whether to draw. There are none of three-dimensional domains, and none where
             Matplotlib is not installed.
         resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
-        steps: Whether what `series.write_step` has left is of this one.
+        moments: Of a run in time, for the strip; what `series.write_step` has left is of this one.
 
     Returns:
         The names of the files written.
@@ -262,7 +264,11 @@ def write_output(
             writers["convergence.png"] = lambda path: plots.drawn(
                 comm, lambda: plots.plot_convergence(records, path, title)
             )
-    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if steps else set()
+        if moments:
+            writers["strip.png"] = lambda path: plots.drawn(
+                comm, lambda: plot_strip(moments, path, title)
+            )
+    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if moments else set()
     removed = set(FILES) - kept
     write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)

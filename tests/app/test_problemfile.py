@@ -160,13 +160,12 @@ def test_the_deck_is_in_balance() -> None:
     case = load(MESHES / "deck.toml")
     solution = solve(case.problem, case.mesh())
     domain = solution.domain
-    x = ufl.SpatialCoordinate(domain.mesh)
     ds = ufl.Measure("ds", domain.mesh, subdomain_data=domain.tags)
-    losses = {"surface": (20.0, -10.0), "air": (8.0, -10.0 + 2.0 * x[0]), "duct": (25.0, 18.0)}
+    losses = {"surface": (20.0, -5.0), "air": (8.0, -5.0), "duct": (25.0, 20.0)}
     form = sum(b * (solution.u - e) * ds(domain.parts[name]) for name, (b, e) in losses.items())
     total = domain.mesh.comm.allreduce(fem.assemble_scalar(fem.form(form)))
     assert total == pytest.approx(solution.contact.force, rel=1e-7)
-    assert total > 400.0
+    assert total > 200.0
 
 
 def test_no_dirichlet_part_where_something_else_holds_the_solution(read) -> None:
