@@ -90,10 +90,8 @@ class Solution:
     @cached_property
     def h(self) -> float:
         """Largest cell diameter, over all ranks; found when first asked for, collectively."""
-        mesh = self.domain.mesh
-        number = mesh.topology.index_map(mesh.topology.dim).size_local
-        h = mesh.h(mesh.topology.dim, np.arange(number, dtype=np.int32))
-        return float(mesh.comm.allreduce(float(h.max(initial=0.0)), op=MPI.MAX))
+        largest = float(self.level.meshes[-1].diameters.max(initial=0.0))
+        return float(self.domain.mesh.comm.allreduce(largest, op=MPI.MAX))
 
     @cached_property
     def errors(self) -> tuple[float, float] | None:

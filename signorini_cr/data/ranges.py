@@ -780,6 +780,8 @@ def _worst(share: FloatArray, threshold: float, room: int, comm: MPI.Comm) -> Bo
 
 def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
     """A threshold below which shares add up to no more than some number; collective."""
+    if comm.allreduce(float(share.sum())) <= enough:
+        return enough
     threshold = enough / max(comm.allreduce(len(share)), 1)
     while threshold < enough:
         below = share[share <= 2.0 * threshold]

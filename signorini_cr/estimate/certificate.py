@@ -496,10 +496,9 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         missed = certain.missed
         assert sums.steepness is not None
         for part in blocks(cells.number):
-            by_slope, rough = (
-                mean_to_norm(cells, kappa.low, c, part) * certain.rough[part]
-                for c in (0.0, known.reaction)
-            )
+            by_slope = rough = mean_to_norm(cells, kappa.low, 0.0, part) * certain.rough[part]
+            if known.reaction:
+                rough = mean_to_norm(cells, kappa.low, known.reaction, part) * certain.rough[part]
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
             if cells.tdim == 2:
                 means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3

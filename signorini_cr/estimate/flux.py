@@ -245,17 +245,14 @@ def unbalanced(
             return taken_up
     meshes = level.meshes
     for mesh, coarser in zip(meshes[:0:-1], meshes[-2::-1], strict=True):
-        parents, domain = mesh.parents, coarser.domain
+        parents = mesh.parents
         assert parents is not None
-        d = domain.mesh.topology.dim
-        number = domain.mesh.topology.index_map(d).size_local
         square, left, volume = map(parents.collected, (left**2 / volume, left, volume))
         if kappa_min.ndim:
             kappa_min = parents.collected(kappa_min, np.minimum)
-        h = domain.mesh.h(d, np.arange(number, dtype=np.int32))
         square = np.maximum(square - left**2 / volume, 0.0)
-        part = float(np.sum(h**2 * square / kappa_min))
-        bound += poincare(d) * np.sqrt(cells.comm.allreduce(part))
+        part = float(np.sum(coarser.diameters**2 * square / kappa_min))
+        bound += poincare(cells.tdim) * np.sqrt(cells.comm.allreduce(part))
     if len(meshes) > 1:
         cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
     return min(taken_up, float(bound + _carried(cells, left, kappa_min, size)))

@@ -20,11 +20,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from petsc4py import PETSc
 
-from ..arrays import IndexArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.physics import OnMesh, Physics
 from ..garbage import hold, release, sweep
 from ..mesh.domain import Domain
@@ -74,6 +75,13 @@ class NestedMesh:
     def V(self) -> fem.FunctionSpace:
         """The discrete space."""
         return self.data.V
+
+    @cached_property
+    def diameters(self) -> FloatArray:
+        """Of this rank's cells, shape (cells,)."""
+        mesh = self.domain.mesh
+        number = mesh.topology.index_map(mesh.topology.dim).size_local
+        return np.asarray(mesh.h(mesh.topology.dim, np.arange(number, dtype=np.int32)))
 
 
 class Hierarchy:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import basix
@@ -161,6 +161,9 @@ class Parents:
         Returns:
             For each coarse cell of this rank.
         """
+        if self.regular:
+            children = values.reshape(-1, 2**self._coarse.topology.dim).T
+            return reduce(ufunc, children[1:], children[0])
         first = 0.0 if ufunc is np.add else np.inf
         topology = self._coarse.topology
         result = np.full(topology.index_map(topology.dim).size_local, first)
