@@ -27,6 +27,7 @@ from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates
+from ..output.units import Units
 from ..solution import Solution
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
@@ -44,6 +45,7 @@ from .readers import (
     shown,
     string,
     whole,
+    word,
 )
 from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
 
@@ -51,6 +53,8 @@ KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
+TELLING = ("quantities", "units", "names")
+"""Sections that levels do not depend on."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
@@ -97,6 +101,7 @@ class ProblemFile:
         quantities: The kind of each quantity that is asked for, "force" or "flux", and its part of
             the boundary, by name.
         time: What [time] says; None for a problem without time.
+        units: What [units] and [names] say.
         said: All that levels depend on, by key, as it was written.
     """
 
@@ -112,6 +117,7 @@ class ProblemFile:
     adaptive: Mapping[str, Any]
     quantities: Mapping[str, tuple[str, str]]
     time: Time | None
+    units: Units
     said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
@@ -234,11 +240,12 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         adaptive=adaptive,
         time=None if clock is None else _time(sections, expressions, mode, clock),
         quantities=_quantities(sections["quantities"], parts),
+        units=Units(**_words(sections, "units"), names=_words(sections, "names")),
         said={
             f"{name}.{key}": value
             for name, section in sections.items()
             for key, value in section.items()
-            if f"{name}.{key}" not in ENDS and name != "quantities"
+            if f"{name}.{key}" not in ENDS and name not in TELLING
         },
     )
 
@@ -290,6 +297,11 @@ def _quantities(
         own = [each for each, what in types.items() if what == QUANTITIES[kind]]
         found[name] = kind, one_of(own)(f"{key}.{kind}", part)
     return found
+
+
+def _words(sections: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, str]:
+    """[units] or [names]: words by key."""
+    return {key: word(f"{name}.{key}", value) for key, value in sections[name].items()}
 
 
 _SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, the others are optional"

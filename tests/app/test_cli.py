@@ -103,6 +103,13 @@ BAD: dict[str, tuple[str, list[str]]] = {
         with_("levels = 2", "levels = 99"),
         ["refine.levels (or --levels): 99", "at most 13"],
     ),
+    "unit of what is none": (CASE + '[units]\ny = "m"', ["units.y: there is no such key; it belo"]),
+    "unit that is a number": (CASE + "[units]\nx = 3", ["units.x: a string is needed, found 3"]),
+    "unit of two lines": (
+        CASE + '[units]\nx = "m\\nm"',
+        ["units.x: 1 to 40 characters on one line are needed"],
+    ),
+    "empty name": (CASE + '[names]\nu = " "', ["names.u: 1 to 40 characters on one line"]),
     "tolerance negative": (
         with_("tolerance = 0", "tolerance = -1e-3"),
         ["refine.tolerance: 0 or more is needed, found -0.001"],
@@ -598,7 +605,15 @@ def test_the_deck(shared_tmp_path: Path) -> None:
     level = json.loads((out / "report.json").read_text())["levels"][-1]
     assert level["bound_h1"] is not None and level["contact"]["active"] == 80
     # u = 0 on the deck: 20 · 10 · 4 is lost there
-    assert 0 < level["contact"]["force"] < 800
+    force = level["contact"]["force"]
+    assert 0 < force < 800
+    said = " ".join(text.split())
+    assert f"length 4 m, force {force:.6g} W/m certified" in said and "] W/m, 8" in said
+    assert "facets, length 4 m" in said and "h: largest diameter of a cell, in m;" in said
+    assert " h, m |" in (out / "levels.md").read_text().split("\n")[0]
+    report = json.loads((out / "report.json").read_text())
+    assert report["units"] == {"x": "m", "u": "°C", "flux": "W/m²", "force": "W/m"}
+    assert report["names"] == {"u": "temperature", "flux": "heat"}
 
 
 def test_data_need_to_make_sense_only_where_they_are_used(write) -> None:
