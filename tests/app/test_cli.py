@@ -271,6 +271,46 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["domain.boundary:", "'dirichlet'"],
     ),
     "no contact": (with_('"contact"', '"neumann"'), ["domain.boundary:", "'contact'"]),
+    "arc without a point": (
+        with_("size", "arcs = [{ edge = 2 }]\nsize"),
+        ["domain.arcs[0]: { edge = i, through = [x, y] } is needed, found a table"],
+    ),
+    "arc of no edge": (
+        with_("size", "arcs = [{ edge = 7, through = [0, 3] }]\nsize"),
+        ["domain.arcs: there is no edge 7: they are 0 to 3"],
+    ),
+    "arc of an edge twice": (
+        with_("size", f"arcs = [{', '.join(2 * ['{ edge = 2, through = [0, 3] }'])}]\nsize"),
+        ["domain.arcs[1].edge: the number of an edge, from 0, that is no arc yet", "found 2"],
+    ),
+    "arc through half a point": (
+        with_("size", "arcs = [{ edge = 2, through = [0] }]\nsize"),
+        ["domain.arcs[0].through: a point [x, y] is needed, found a list of 1"],
+    ),
+    "straight arc": (
+        with_("size", "arcs = [{ edge = 2, through = [0, 1] }]\nsize"),
+        ["domain.arcs: the arc of edge 2: no circle passes through (1, 1), (0, 1) and (-1, 1)"],
+    ),
+    "arc across an edge": (
+        with_("size", "arcs = [{ edge = 2, through = [0, -0.1] }]\nsize"),
+        ["domain.vertices: edge 0 crosses edge 2; the polygon must be simple"],
+    ),
+    "round hole with corners": (
+        with_("size", 'holes = [{ center = [0, 0.5], vertices = [], boundary = "neumann" }]\nsize'),
+        ["domain.holes[0].vertices: there is no such key; allowed are center, radius, boundary"],
+    ),
+    "round hole without a radius": (
+        with_("size", 'holes = [{ center = [0, 0.5], boundary = "neumann" }]\nsize'),
+        ["domain.holes[0].radius: this key is missing"],
+    ),
+    "round hole of many parts": (
+        with_("size", f"holes = [{{ center = [0, 1], radius = 1, boundary = {NEUMANN} }}]\nsize"),
+        ["domain.holes[0].boundary: a string is needed, found a list of 3"],
+    ),
+    "round hole too large": (
+        with_("size", 'holes = [{ center = [0, 1], radius = 1, boundary = "neumann" }]\nsize'),
+        ["domain.holes: ", " hole 0", "holes must lie inside"],
+    ),
     "hole outside": (with_("size", HOLE + "\nsize"), ["domain.holes:", "hole 0", "outside"]),
     "hole of two": (
         with_("size", FLAT_HOLE + "\nsize"),
