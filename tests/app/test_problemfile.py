@@ -170,7 +170,7 @@ def test_the_deck_is_in_balance() -> None:
 
 
 def test_arcs_and_round_holes(read) -> None:
-    """u = 1 + 2y, which CR has, on a half disk with a round hole, in contact on all of the floor."""
+    """u = 1 + 2y, which CR has, on a half disk with a round hole, in contact on the floor."""
     case = read("""
         [domain]
         vertices = [[-1, 0], [1, 0]]
