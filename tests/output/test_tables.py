@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from signorini_cr.output import series
 from signorini_cr.output.tables import certified, legend, markdown_table, table_header, times
 from signorini_cr.output.units import Units
 
@@ -71,6 +72,7 @@ def test_units_stand_where_their_figures_are():
     assert {name for name in entries if entries[name].endswith(", in mm")} == {"h", "contact"}
     heads = [head.strip() for head in markdown_table([record], units).split("\n")[0].split("|")]
     assert {"h, mm", "contact, mm"} < set(heads)
+    assert series.legend(Units(time="h", x="m")) == "time in h, contact in m"
     assert Units.of({**units.record()}) == units and Units().record() == {}
 
 
