@@ -74,7 +74,7 @@ panels = None
 if comm.rank == 0:
     figure = canvas.new_figure(11.0, 7.0)
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1.0))
-plots.plot_solution(solution, ax=None if panels is None else panels[0])
+plots.plot_solution(solution, ax=None if panels is None else panels[0], units=case.units)
 if panels is not None:
     panels[0].set_title(
         f"Free of frost with {lower[-1]:.2f} to {upper[-1]:.2f} W a metre", fontsize=16

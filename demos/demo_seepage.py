@@ -107,7 +107,7 @@ panels = None
 if comm.rank == 0:
     figure = canvas.new_figure(13.0, 4.6)
     panels = figure.subplots(1, 2, sharey=True, width_ratios=(3.4, 1.0))
-plots.plot_solution(solution, ax=None if panels is None else panels[0])
+plots.plot_solution(solution, ax=None if panels is None else panels[0], units=case.units)
 if panels is not None:
     panels[0].set_title(
         f"{lower[-1]:.2f} to {upper[-1]:.2f} m³ a day leave each metre of the bank", fontsize=16

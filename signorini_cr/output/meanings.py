@@ -57,6 +57,8 @@ REPORT = {
     "versions.dolfinx": "DOLFINx's version.",
     "versions.petsc": "PETSc's version.",
     "versions.gmsh": "gmsh's version; null where it can't be told.",
+    "units": "Only where the file has [units]: what it says there.",
+    "names": "Only where the file has [names]: what it says there.",
     "complete": "Whether all that was asked for has been reached.",
     "force_bounds.lower": "The contact force ∫_Γ1 λ of u itself is not below it.",
     "force_bounds.upper": "The contact force of u itself is not above it.",

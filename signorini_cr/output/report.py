@@ -33,6 +33,7 @@ from .strip import Moment, plot_strip
 from .tables import contact_csv, levels_csv, markdown_table
 from .tables import table_header as table_header
 from .tables import table_row as table_row
+from .units import PLAIN, Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
@@ -150,6 +151,7 @@ def make_report(
     comm: MPI.Comm,
     records: Sequence[Record],
     complete: bool = True,
+    units: Units = PLAIN,
 ) -> Record:
     """The whole of report.json from the records of its levels.
 
@@ -159,6 +161,7 @@ def make_report(
         comm: The ranks that solved it.
         records: From `level_record`, coarsest level first.
         complete: Whether these are all the levels that were asked for.
+        units: What is told of u, lengths and the rest; also for tables and pictures.
     """
     versions = {
         "signorini_cr": __version__,
@@ -171,6 +174,7 @@ def make_report(
         "element": element,
         "ranks": comm.size,
         "versions": versions,
+        **units.record(),
         "complete": complete,
         "force_bounds": records[-1]["contact"]["force_bounds"],
         "levels": list(records),
@@ -252,17 +256,23 @@ def write_output(
         InputError: The folder can't be written to.
     """
     comm, title, records = solution.domain.mesh.comm, report["title"], report["levels"]
-    writers = _texts(report, solution)
+    units, writers = Units.of(report), _texts(report, solution)
     writers["solution.vtu"] = lambda path: write_solution(solution, path)
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
     if drawable and plots.can_draw(comm):
-        writers["mesh.png"] = lambda path: plots.plot_mesh(*_clear_mesh(solution, path, title))
-        writers["solution.png"] = lambda path: plots.plot_solution(solution, path, title)
+        writers["mesh.png"] = lambda path: plots.plot_mesh(
+            *_clear_mesh(solution, path, title), units=units
+        )
+        writers["solution.png"] = lambda path: plots.plot_solution(
+            solution, path, title, units=units
+        )
         if solution.contact.number:
-            writers["contact.png"] = lambda path: plots.plot_contact(solution, path, title)
+            writers["contact.png"] = lambda path: plots.plot_contact(
+                solution, path, title, units=units
+            )
         if plots.convergence_series(records):
             writers["convergence.png"] = lambda path: plots.drawn(
-                comm, lambda: plots.plot_convergence(records, path, title)
+                comm, lambda: plots.plot_convergence(records, path, title, units=units)
             )
         if moments:
             writers["strip.png"] = lambda path: plots.drawn(
@@ -295,7 +305,7 @@ def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
     return {
         "report.json": text(lambda: report_json(report)),
         "levels.csv": text(lambda: levels_csv(records)),
-        "levels.md": text(lambda: markdown_table(records)),
+        "levels.md": text(lambda: markdown_table(records, Units.of(report))),
         "contact.csv": text(lambda: contact_csv(table or {})),
     }
 

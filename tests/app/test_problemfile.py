@@ -168,6 +168,36 @@ def test_the_deck_is_in_balance() -> None:
     assert total > 200.0
 
 
+def test_arcs_and_round_holes(read) -> None:
+    """u = 1 + 2y, which CR has, on a half disk with a round hole, in contact on the floor."""
+    case = read("""
+        [domain]
+        vertices = [[-1, 0], [1, 0]]
+        boundary = ["floor", "roof"]
+        arcs = [{ edge = 1, through = [0, 1] }]
+        holes = [{ center = [0, 0.5], radius = 0.2, boundary = "duct" }]
+        size = 0.3
+        [boundary.floor]
+        type = "contact"
+        g = -3
+        obstacle = 1
+        [boundary.roof]
+        type = "dirichlet"
+        [boundary.duct]
+        type = "dirichlet"
+        [exact]
+        u = "1 + 2*y"
+        """)
+    domain = case.mesh()
+    assert case.check(domain) == []
+    *_, solution = solve_levels(case.problem, domain, 2)
+    assert max(solution.errors) < 1e-7
+    # λ = ∂u/∂n − g = −2 + 3 on all of the floor; 24 facets are a circle
+    assert solution.contact.force == pytest.approx(2.0, rel=1e-6)
+    ends = domain.mesh.comm.allreduce(len(domain.facets(domain.parts["duct"])))
+    assert ends == 24
+
+
 def test_no_dirichlet_part_where_something_else_holds_the_solution(read) -> None:
     """u = 2 on the strip for c u = f with c = 3 and f = 6; refused without c."""
     text = PARTS.split("[boundary.floor]")[0] + (
