@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .estimate.certificate import Certificate
     from .evolution import Solver, solve_in_time
     from .fem.conditions import Contact, Dirichlet, Neumann, Robin
-    from .fem.problem import Material, Problem
+    from .fem.problem import Form, Material, Problem
     from .levels import solve, solve_levels
     from .mesh.domain import Domain, Polygon, read_gmsh
     from .solution import Solution
@@ -51,6 +51,7 @@ _ROOMS = {
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
     "Material": "fem.problem",
+    "Form": "fem.problem",
     "Dirichlet": "fem.conditions",
     "Neumann": "fem.conditions",
     "Robin": "fem.conditions",
@@ -72,6 +73,7 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "read_gmsh",
     "Problem",
     "Material",
+    "Form",
     "Dirichlet",
     "Neumann",
     "Robin",

@@ -3,13 +3,23 @@
 A demo ends in assertions of its own, so that its exit status says whether its numbers are right.
 """
 
+import io
 import re
+from contextlib import redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_unit_square,
+    exterior_facet_indices,
+    meshtags,
+)
 from helpers import DEMOS, command, is_picture, script, start
 from mpi4py import MPI
 
+import signorini_cr
 from signorini_cr import InputError, exact, solve, solve_adaptive
 from signorini_cr.output.errorplot import plot_error
 
@@ -100,6 +110,37 @@ def test_the_script_of_the_documents_runs(shared_tmp_path, monkeypatch):
         force, bound = map(float, printed.split())
         assert 0 < force < 6 and 0 < bound < 0.5  # the load is 6
         assert is_picture(shared_tmp_path / "my.png")
+
+
+def test_robin_materials_and_two_contact_parts_take_ten_lines():
+    listing = in_the_how_to("python", '"shelf": scr.Contact')
+    assert len(listing.strip().splitlines()) <= 12  # ten of them code, but for brackets
+    mesh = create_unit_square(COMM, 8, 8)
+    mesh.topology.create_connectivity(1, 2)
+    facets = exterior_facet_indices(mesh.topology)
+    x = compute_midpoints(mesh, 1, facets)
+    sides = np.select([x[:, 1] < 1e-9, x[:, 0] < 1e-9, x[:, 0] > 1 - 1e-9], [1, 2, 3], 4)
+    cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
+    kinds = np.where(compute_midpoints(mesh, 2, cells)[:, 1] > 0.5, 7, 0)
+    names = {
+        "scr": signorini_cr,
+        "mesh": mesh,
+        "facet_tags": meshtags(mesh, 1, facets, sides.astype(np.int32)),
+        "cell_tags": meshtags(mesh, 2, cells, kinds.astype(np.int32)),
+    }
+    said = io.StringIO()
+    with redirect_stdout(said):
+        exec(listing, names)
+    force, bound = map(float, said.getvalue().split())
+    solution = names["solution"]
+    assert force == pytest.approx(solution.contact.force) and solution.contact.kkt.min_gap > -1e-9
+    table = solution.contact.table()
+    if table is not None:
+        on_bank = table["x"] < 1e-9
+        assert table["obstacle"] == pytest.approx(np.where(on_bank, -0.1 * table["y"], 0.0))
+        assert np.count_nonzero(on_bank) == 32 == len(on_bank) / 2
+        assert (table["upper"][on_bank] == 0.5).all() and np.isnan(table["upper"][~on_bank]).all()
+    assert 0 < bound < 0.5
 
 
 @pytest.mark.serial

@@ -13,16 +13,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.mesh import Mesh, compute_midpoints, entities_to_geometry
 from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
-from ..errors import InputError
+from ..errors import InputError, raise_together
 from ..fem.cells import Cells, Side, corner_points
 from ..fem.conditions import negative
 from ..fem.problem import Forms, number
-from ..fem.space import facet_entities
+from ..fem.space import facet_entities, function_space, ghosted_vector
+from ..garbage import release
 from ..mesh.domain import Domain
 from .pointwise import EPS, evaluate
 
@@ -66,10 +69,12 @@ def check_data(forms: Forms, domain: Domain) -> None:
         domain: Mesh and boundary parts; of a sequence, the coarsest.
 
     Raises:
-        InputError: κ is not symmetric and positive definite, u_D jumps, or α is above u_D where Γ0
-            meets Γ1. The message names the point and the values.
+        InputError: κ, or the user's form, is not symmetric and positive definite, u_D jumps, or α
+            is above u_D where Γ0 meets Γ1. The message names the point and the values.
     """
     comm = domain.mesh.comm
+    if forms.problem.form is not None:
+        raise_together(comm, _bad_form(forms, domain))
     _raise_first(comm, _bad_coefficient(forms, domain))
     _raise_first(comm, _negative(_Values(forms.reaction, domain), _middles(domain), REACTION))
     for condition in forms.conditions:
@@ -495,6 +500,30 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
             said = f"is [{rows}], with the eigenvalue {least[i]:.10g}; "
         said += "a symmetric positive definite tensor is needed"
     return [(where, f"data.coefficient: the value at {shown(where)} {said}")]
+
+
+def _bad_form(forms: Forms, domain: Domain) -> str | None:
+    """What is wrong with the matrix of the user's form, the same on all ranks; collective."""
+    V = function_space(domain.mesh, forms.element)
+    A = assemble_matrix(forms.a.on(domain, [V, V]))
+    A.assemble()
+    functions = fem.Function(V), fem.Function(V)
+    functions[0].interpolate(lambda x: np.sin(1.0 + 7.0 * x[0] + 11.0 * x[1]))
+    functions[1].interpolate(lambda x: np.cos(2.0 + 13.0 * x[0] - 5.0 * x[1]))
+    x, y, image = (*(ghosted_vector(V, each.x.array) for each in functions), A.createVecLeft())
+    A.mult(x, image)
+    there, energy = image.dot(y), image.dot(x)
+    A.mult(y, image)
+    skew, size = abs(there - image.dot(x)), A.norm() * x.norm() * y.norm()
+    least = A.getDiagonal().min()[1]
+    release(A, x, y, image)
+    if not np.isfinite(size):
+        return "form: a(u, v) is not finite at some point of the mesh"
+    if skew > TOLERANCE * size:
+        return "form: a(u, v) is not a(v, u); without symmetry this is no problem of least energy"
+    if least <= 0.0 or energy < -TOLERANCE * size:
+        return "form: a(u, u) is not above 0 for all u; without that there may be no solution"
+    return None
 
 
 def place(x: FloatArray, mesh: Mesh) -> tuple[float, ...]:

@@ -132,8 +132,12 @@ class DiffusionOnMesh:
     def chi(self) -> FloatArray:
         """χ (1.10) by dof, this rank's cells' share."""
         if self.forms.element == "CR" and (self.forms.loaded or self.source is not None):
-            return chi(self.load, self.edges, self.cells)
-        return self._assembled(self.forms.chi)
+            found = chi(self.load, self.edges, self.cells)
+        else:
+            found = self._assembled(self.forms.chi)
+        if self.forms.own_load is not None:
+            found += self._assembled(self.forms.own_load)
+        return found
 
     def of_constants(self) -> FloatArray | None:
         """a_h(1, ·) by dof, this rank's cells' share; None where it vanishes."""

@@ -11,7 +11,7 @@ have conditions of their own (see `conditions`).
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -21,6 +21,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import Mesh
+from ufl.algorithms import compute_form_data
+from ufl.algorithms.check_arities import ArityMismatch
 from ufl.core.expr import Expr
 
 from ..arrays import Int32Array
@@ -49,6 +51,27 @@ class Material:
 
 
 @dataclass(frozen=True)
+class Form:
+    """A symmetric, coercive a(u, v) of one's own in the place of ∫ κ∇u·∇v, and a load beside f.
+
+    Both are functions that return UFL forms, so that they serve on all meshes and in all spaces.
+    They get ``dx`` and ``ds``: ``ds("floor")`` is the measure of the boundary part of that name.
+    Beside the arguments they may hold expressions in ``ufl.SpatialCoordinate(mesh)``, Constants,
+    and Functions of degree 0 on the coarsest mesh. Where conditions speak of κ∂ₙu, a's conormal
+    derivative is meant.
+
+    There is no certificate, as the flux that goes with a is not known.
+
+    Attributes:
+        a: a(u, v, dx, ds), with cell and boundary integrals of u, v and their gradients.
+        load: L(v, dx, ds), or None.
+    """
+
+    a: Callable[[Expr, Expr, ufl.Measure, Callable[[str], ufl.Measure]], ufl.Form]
+    load: Callable[[Expr, ufl.Measure, Callable[[str], ufl.Measure]], ufl.Form] | None = None
+
+
+@dataclass(frozen=True)
 class Problem:
     """Data of the problem, free of any mesh.
 
@@ -59,6 +82,8 @@ class Problem:
         dirichlet: u_D, the value of u on Γ0.
         coefficient: κ, positive scalar (or symmetric positive definite tensor).
         reaction: c, not below 0.
+        form: What takes the place of ∫ κ∇u·∇v; there is no κ then, and nothing but u_D is derived
+            from ``exact``.
         conditions: What holds on parts of the boundary, by their names in the domain; g, obstacle
             and dirichlet are for the parts neumann, contact and dirichlet where they aren't here.
         materials: The data of materials, by their names in the domain; what is not said there, and
@@ -76,6 +101,7 @@ class Problem:
     dirichlet: Data | None = None
     coefficient: Data = 1.0
     reaction: Data = 0.0
+    form: Form | None = None
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     materials: Mapping[str, Material] = field(default_factory=dict)
     exact: Data | None = None
@@ -101,6 +127,9 @@ class Problem:
             degree = getattr(self, name)
             if not isinstance(degree, int | np.integer) or degree < 0:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
+        own = [m.coefficient for m in self.materials.values() if m.coefficient is not None]
+        if self.form is not None and (own or self.coefficient is not type(self).coefficient):
+            raise InputError("a form takes the coefficient's place; only one of them can be given")
 
 
 def as_expression(data: Data, x: Expr) -> Expr:
@@ -196,7 +225,7 @@ class Forms:
         parts: Mapping[str, int] = PARTS,
         materials: Materials | None = None,
     ):
-        self.problem, self.mesh, self.element = problem, mesh, element
+        self.problem, self.mesh, self.element, self._parts = problem, mesh, element, parts
         cell = mesh.ufl_domain()
         self.space = ufl.FunctionSpace(cell, ufl_element(mesh, element))
         self.w = ufl.Coefficient(self.space)
@@ -209,13 +238,14 @@ class Forms:
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
         # UFL can't differentiate a number
-        level = self.exact is None or number(self.exact) is not None
+        level = self.exact is None or number(self.exact) is not None or problem.form is not None
         flux = None if level else self.kappa * ufl.grad(self.exact)
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
         self.asked = None if flux is None else simplified(-ufl.div(flux))
         self.reaction = self._by_material("reaction", problem.reaction, materials)
-        if self.exact is not None and number(self.reaction) != 0.0:
+        derivable = self.exact is not None and problem.form is None
+        if derivable and number(self.reaction) != 0.0:
             gain = self.reaction * self.exact
             self.asked = gain if self.asked is None else simplified(self.asked + gain)
         derived = 0.0 if self.asked is None else self.asked
@@ -312,7 +342,9 @@ class Forms:
 
     @property
     def uncertified(self) -> str | None:
-        """Why there is no certificate, if the reaction or some condition has none."""
+        """Why there is no certificate, if the form, the reaction or some condition has none."""
+        if self.problem.form is not None:
+            return "the form is the user's own: the flux that goes with it is not known"
         if is_by_cells(self.reaction):
             return "the reaction differs from cell to cell, and has one number in the bounds"
         if number(self.reaction) is None:
@@ -348,7 +380,7 @@ class Forms:
     @property
     def steady(self) -> bool:
         """Whether κ is a number on each cell of the coarsest mesh."""
-        return self.uniform or is_by_cells(self.kappa)
+        return self.problem.form is None and (self.uniform or is_by_cells(self.kappa))
 
     @property
     def loaded(self) -> bool:
@@ -367,6 +399,14 @@ class Forms:
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
     @cached_property
+    def own_load(self) -> Kernel | None:
+        """The load of the user's own form, if it has one."""
+        own = self.problem.form
+        if own is None or own.load is None:
+            return None
+        return Kernel(self._own("load", 1, ufl.TestFunction(self.space)), self.mesh)
+
+    @cached_property
     def a_of_w(self) -> Kernel:
         """a_h(w, w)."""
         return Kernel(self._bilinear(self.w, self.w), self.mesh, [self.w])
@@ -381,11 +421,22 @@ class Forms:
     @cached_property
     def of_one(self) -> Kernel | None:
         """a_h(1, v), exactly 0 but for the terms without gradients; None if there are none."""
-        terms = self._without_gradients(ufl.as_ufl(1.0), ufl.TestFunction(self.space))
+        v = ufl.TestFunction(self.space)
+        terms = self._without_gradients(ufl.as_ufl(1.0), v)
+        if self.problem.form is not None:
+            # UFL can't differentiate a number
+            one = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name="1")
+            one.x.array[:] = 1.0
+            own = self.problem.form.a(one, v, *self._measures)
+            if not compute_form_data(own, complex_mode=False).preprocessed_form.empty():
+                terms.append(own)
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
         """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
+        if self.problem.form is not None:
+            arity = sum(isinstance(each, ufl.Argument) for each in (u, v))
+            return sum(self._without_gradients(u, v), self._own("a", arity, u, v))
         rule = {} if self.steady else {"quadrature_degree": self.problem.quadrature_degree}
         kappa = self._adjustable(self.kappa)
         form = ufl.inner(kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
@@ -401,6 +452,49 @@ class Forms:
             for b, measure in terms
             if number(b) != 0.0
         ]
+
+    @property
+    def _measures(self) -> tuple[ufl.Measure, Callable[[str], ufl.Measure]]:
+        """What the user's own forms are written with: dx, and ds by the names of parts."""
+
+        def ds(name: str) -> ufl.Measure:
+            if name not in self._parts:
+                raise InputError(
+                    f"form: no part of the boundary is called {name!r}; there are"
+                    f" {', '.join(self._parts)}"
+                )
+            return self.ds(self._parts[name])
+
+        return self.dx, ds
+
+    def _own(self, name: str, arity: int, *arguments: Expr) -> ufl.Form:
+        """A form of the user's own, of some arguments.
+
+        Raises:
+            InputError: It is none that the element can do with.
+        """
+        form = getattr(self.problem.form, name)(*arguments, *self._measures)
+        if not isinstance(form, ufl.Form):
+            raise InputError(f"form: {name} returns {form!r}; a UFL form is needed")
+        for integral in form.integrals():
+            if integral.integral_type() not in ("cell", "exterior_facet"):
+                raise InputError(
+                    f"form: {name} has an integral of the type {integral.integral_type()}; dx and"
+                    " ds(name) are what there is: functions of Crouzeix-Raviart jump across facets"
+                )
+            if _order(integral.integrand()) > 1:
+                raise InputError(
+                    f"form: {name} has derivatives of second order or more, which are 0 for"
+                    " functions that are linear on each cell"
+                )
+        try:
+            compute_form_data(form, complex_mode=False)
+        except ArityMismatch:
+            raise InputError(f"form: {name} is not linear in its arguments") from None
+        if len(form.arguments()) != arity:
+            needed = "u and v" if name == "a" else "v"
+            raise InputError(f"form: {name} must be linear in {needed}, and is not")
+        return form
 
     def _adjustable(self, data: Expr) -> Expr:
         """A Constant in the place of a number: one form is compiled for all numbers."""
@@ -437,6 +531,12 @@ class Forms:
         squares = np.asarray(fem.assemble_vector(form).array).reshape(-1, 2)
         h1, l2 = np.sqrt(domain.mesh.comm.allreduce(squares.sum(axis=0)))
         return float(h1), float(l2)
+
+
+def _order(expression: Expr) -> int:
+    """How often functions are differentiated in it."""
+    below = max(map(_order, expression.ufl_operands), default=0)
+    return below + isinstance(expression, ufl.differentiation.Derivative)
 
 
 def _check_materials(problem: Problem, materials: Materials) -> None:

@@ -1,0 +1,173 @@
+"""Forms of the user's own: solved as such, and refused in words where they make no sense."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Form,
+    InputError,
+    Material,
+    Neumann,
+    NotConverged,
+    Polygon,
+    Problem,
+    Robin,
+    norms,
+    solve,
+    solve_adaptive,
+    solve_levels,
+)
+
+EDGES = ["floor", "right", "top", "left"]
+SQUARE = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], EDGES, names=EDGES)
+WALLS = {"right": Dirichlet(0.0), "top": Dirichlet(0.0), "left": Dirichlet(0.0)}
+
+
+def laplace_density(u, v):
+    return ufl.inner(ufl.grad(u), ufl.grad(v))
+
+
+def laplace(u, v, dx, ds):
+    return laplace_density(u, v) * dx
+
+
+def tensor():
+    return ufl.as_matrix([[2.0, 0.5], [0.5, 1.0]])
+
+
+def anisotropic(u, v, dx, ds):
+    """A tensor, a weighted mass, and a mass on one wall."""
+    x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(v))
+    bulk = ufl.inner(tensor() * ufl.grad(u), ufl.grad(v)) + (2.0 + x[0]) * u * v
+    return bulk * dx(degree=4) + 3.0 * u * v * ds("right")
+
+
+@pytest.mark.parametrize(("element", "levels"), [("CR", 4), ("P1", 3)])
+def test_rates_with_contact_on_half_of_the_floor(element, levels):
+    """λ = max(x, 0)² and u − α = max(−x, 0)²: complementary, and u is any smooth function."""
+
+    def u(x):
+        return ufl.cos(x[0]) * (1.0 + x[1] ** 2 + x[0] * x[1])
+
+    def conormal(x, n):
+        return ufl.dot(tensor() * ufl.grad(u(x)), ufl.as_vector(n))
+
+    def floor(x):
+        return conormal(x, (0.0, -1.0)) - ufl.max_value(x[0], 0.0) ** 2
+
+    problem = Problem(
+        form=Form(anisotropic),
+        f=lambda x: -ufl.div(tensor() * ufl.grad(u(x))) + (2.0 + x[0]) * u(x),
+        exact=u,
+        conditions={
+            "floor": Contact(lambda x: u(x) - ufl.max_value(-x[0], 0.0) ** 2, g=floor),
+            "right": Neumann(lambda x: conormal(x, (1.0, 0.0)) + 3.0 * u(x)),
+            "top": Dirichlet(),
+            "left": Dirichlet(),
+        },
+    )
+    found = list(solve_levels(problem, SQUARE.mesh(0.25), levels, element))
+    h, h1, l2 = np.array([(s.h, *s.errors) for s in found]).T
+    assert norms.rates(h, h1)[-1] == pytest.approx(1.0, abs=0.05)
+    assert norms.rates(h, l2)[-1] == pytest.approx(2.0, abs=0.15)
+    assert found[-1].contact.force == pytest.approx(1.0 / 3.0, abs=0.02)
+    assert found[-1].contact.length == pytest.approx(1.0, abs=0.1)
+    assert found[-1].iterations.linear < 30
+    certificate = found[-1].certificate
+    assert certificate.bound_h1 is None
+    assert element == "P1" or "user's own" in certificate.reason
+
+
+def test_the_models_form_as_ones_own():
+    """κ = 3 in two ways, and a load of one's own for f and g."""
+    conditions = WALLS | {"floor": Contact(-0.01), "right": Neumann(0.4)}
+    given = Problem(coefficient=3.0, f=-1.0, reaction=2.0, conditions=conditions)
+    own = Problem(
+        form=Form(
+            lambda u, v, dx, ds: 3.0 * laplace(u, v, dx, ds),
+            lambda v, dx, ds: -1.0 * v * dx + 0.4 * v * ds("right"),
+        ),
+        reaction=2.0,
+        conditions=WALLS | {"floor": Contact(-0.01), "right": Neumann()},
+    )
+    domain = SQUARE.mesh(0.2)
+    for theirs, ours in zip(*(solve_levels(p, domain, 3) for p in (given, own)), strict=True):
+        assert ours.u.x.array == pytest.approx(theirs.u.x.array, abs=1e-9)
+        assert ours.contact.force == pytest.approx(theirs.contact.force, rel=1e-7)
+        assert ours.energy == pytest.approx(theirs.energy, rel=1e-9)
+
+
+def test_functions_of_degree_0_go_along():
+    domain = SQUARE.mesh(0.25)
+    k = fem.Function(fem.functionspace(domain.mesh, ("DG", 0)))
+    k.interpolate(lambda x: 1.0 + 9.0 * (x[0] > 0.0))
+    walls = WALLS | {"floor": Contact(-0.02)}
+    own = Form(lambda u, v, dx, ds: k * ufl.inner(ufl.grad(u), ufl.grad(v)) * dx)
+    *_, ours = solve_levels(Problem(form=own, f=-1.0, conditions=walls), domain, 3)
+    *_, theirs = solve_levels(Problem(coefficient=k, f=-1.0, conditions=walls), domain, 3)
+    assert ours.contact.force == pytest.approx(theirs.contact.force, rel=1e-7)
+
+
+def nowhere(u, v, dx, ds):
+    x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(v))
+    return ufl.ln(-1.0 - x[0] ** 2) * u * v * dx
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        (Form(lambda u, v, dx, ds: u.dx(0) * v * dx + laplace(u, v, dx, ds)), "not a\\(v, u\\)"),
+        (Form(lambda u, v, dx, ds: -1.0 * laplace(u, v, dx, ds)), "not above 0"),
+        (Form(nowhere), "not finite"),
+        (Form(lambda u, v, dx, ds: u**2 * v * dx), "not linear"),
+        (Form(lambda u, v, dx, ds: 3.0), "a UFL form is needed"),
+        (Form(lambda u, v, dx, ds: ufl.avg(u) * ufl.avg(v) * ufl.dS), "interior_facet"),
+        (Form(lambda u, v, dx, ds: u.dx(0).dx(0) * v.dx(1).dx(1) * dx), "second order"),
+        (Form(lambda u, v, dx, ds: u * v * ds("roof")), "called 'roof'"),
+        (Form(laplace, lambda v, dx, ds: v * v * dx), "linear"),
+        (Form(laplace, lambda v, dx, ds: 2.0), "load returns 2.0"),
+    ],
+)
+def test_what_can_not_work_is_refused(form, said):
+    problem = Problem(form=form, conditions=WALLS | {"floor": Contact(0.0)})
+    with pytest.raises(InputError, match=said):
+        solve(problem, SQUARE.mesh(0.5))
+
+
+def test_what_is_below_0_for_some_u_only_ends_in_words():
+    """∇u·∇v − 400 u v has a positive diagonal, and negative eigenvalues."""
+    form = Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) - 400.0 * u * v * dx)
+    problem = Problem(form=form, f=-1.0, conditions=WALLS | {"floor": Contact(0.0)})
+    with pytest.raises((InputError, NotConverged), match=r"not above 0|INDEFINITE"):
+        list(solve_levels(problem, SQUARE.mesh(0.25), 3))
+
+
+def test_a_function_on_another_mesh_is_refused():
+    other = SQUARE.mesh(0.5).mesh
+    k = fem.Function(fem.functionspace(other, ("DG", 0)))
+    form = Form(lambda u, v, dx, ds: k * laplace_density(u, v) * dx)
+    problem = Problem(form=form, conditions=WALLS | {"floor": Contact(0.0)})
+    with pytest.raises(InputError, match="mesh"):
+        solve(problem, SQUARE.mesh(0.3))
+
+
+def test_a_form_has_no_coefficient_and_no_bound_to_go_by():
+    for more in ({"coefficient": 2.0}, {"materials": {"steel": Material(coefficient=2.0)}}):
+        with pytest.raises(InputError, match="takes the coefficient's place"):
+            Problem(form=Form(laplace), **more)
+    problem = Problem(form=Form(laplace), f=-1.0, conditions=WALLS | {"floor": Contact(-0.1)})
+    with pytest.raises(InputError, match="user's own"):
+        list(solve_adaptive(problem, SQUARE.mesh(0.5), tolerance=0.1))
+
+
+def test_a_loss_of_heat_beside_ones_own_form():
+    """Robin and contact with a loss add to it what they add to any other."""
+    walls = {"right": Robin(1.0, coefficient=2.0), "top": Neumann(), "left": Neumann()}
+    conditions = walls | {"floor": Contact(0.0, coefficient=5.0, external=-1.0)}
+    ours = solve(Problem(form=Form(laplace), conditions=conditions), SQUARE.mesh(0.25))
+    theirs = solve(Problem(conditions=conditions), SQUARE.mesh(0.25))
+    assert ours.contact.force == pytest.approx(theirs.contact.force, rel=1e-9)
