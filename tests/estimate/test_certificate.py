@@ -38,6 +38,7 @@ from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.estimate.force import flux, force_bounds
 from signorini_cr.fem.cells import Cells
+from signorini_cr.means import mean
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
 
@@ -449,6 +450,29 @@ def test_what_flows_through_is_bracketed_in_one_dimension():
         widths.append([each.upper - each.lower for each in (pressed, inflow)])
     assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
     assert widths[-1][0] < 0.01 * 2 * force
+
+
+def test_means_are_bracketed_in_one_dimension():
+    """The same bar, its left half a material; u is the same in both."""
+    k = np.sqrt(1.5)
+    over, widths = np.tanh(k / 2) / k, []  # ∫ sinh k(1 − y)/sinh k
+    exact_means = {None: over, "half": over, "left": over, "floor": 1.0}
+    half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
+    sides = [Contact(1.0, coefficient=5.0, external=-4.0), Neumann(), Dirichlet(0.0), Neumann()]
+    conditions = dict(zip(STRIP_EDGES, sides, strict=True))
+    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
+    problem = Problem(coefficient=2.0, reaction=3.0, conditions=conditions)
+    for solution in solve_levels(problem, domain, 3):
+        found = {where: mean(solution, where) for where in exact_means}
+        for where, (value, lower, upper) in found.items():
+            assert lower <= exact_means[where] <= upper
+            assert value == pytest.approx(exact_means[where], rel=0.02)
+        widths.append([each.upper - each.lower for each in found.values()])
+    assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
+    with pytest.raises(InputError, match="u is set on 'top'"):
+        mean(solution, "top")
+    with pytest.raises(InputError, match=r"'air' is no part .* floor, right, left, half"):
+        mean(solution, "air")
 
 
 def test_held_by_contact_alone_there_is_a_force_and_no_interval():

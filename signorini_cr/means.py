@@ -1,0 +1,161 @@
+"""Guaranteed bounds of means of u: over a part of the boundary, a material, or all of Ω."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .arrays import FloatArray
+from .data.diffusion import diffusion
+from .diffusion import Diffusion
+from .errors import InputError, NotConverged
+from .estimate.certificate import Made
+from .estimate.force import Interval
+from .fem.cells import Cells, measures, sum_rows
+from .fem.conditions import Condition, Contact, Dirichlet, Robin
+from .fem.problem import Forms, Material, Problem
+from .levels import Start, solve_level
+from .mesh.domain import Domain
+from .multigrid.hierarchy import Hierarchy
+from .solution import Solution
+from .vi.level import Level
+
+NO_MEAN = "the mean has no bounds"
+ROUNDING = 1e-14
+"""What rounding may do to a mean, in parts of the mean of |u|."""
+
+
+def mean(solution: Solution, where: str | None = None) -> Interval:
+    """Bound the mean of u; collective.
+
+    It is the companion's, up to the energy norm of u less the companion times the norm of the mean
+    as a functional, which the energy's bound of a linear problem with the mean for its load gives:
+    that costs about as much as the solve.
+
+    Args:
+        solution: One with a certified bound.
+        where: Name of a part of the boundary on which u is not set, or else of a material; None for
+            all of the domain.
+
+    Raises:
+        InputError: There is no such place, or there is no bound; the message says why.
+    """
+    certificate, level = solution.certificate, solution.level
+    forms = diffusion(level.data).forms
+    _insist_on_place(forms, level.domain, where)
+    made, bound = certificate._made, certificate.bound_companion
+    if made is None or bound is None:
+        raise InputError(f"{NO_MEAN}: {certificate.reason}")
+    norm = _norm(_dual(forms, where), level)
+    cells = Cells(level.domain, level.V)
+    size, *integrals = cells.total(*_integrals(made, cells, solution.u.x.array, where))
+    if not size > 0.0:
+        raise InputError(f"{NO_MEAN}: {where!r} has no extent")
+    value, middle, lift, scale = (float(integral / size) for integral in integrals)
+    reach = float(norm * bound / size) + lift + ROUNDING * scale
+    return Interval(value, middle - reach, middle + reach)
+
+
+def _insist_on_place(forms: Forms, domain: Domain, where: str | None) -> None:
+    """Refuse what has no name here, and parts where u is a datum."""
+    loose = [c.part for c in forms.conditions if c.fixed is None]
+    if where is None or where in loose:
+        return
+    if where in domain.parts:
+        raise InputError(f"{NO_MEAN}: u is set on {where!r}, where its mean is that of a datum")
+    if where not in domain.materials.numbers:
+        there = ", ".join([*loose, *domain.materials.numbers])
+        raise InputError(f"{where!r} is no part of the boundary and no material; there are {there}")
+
+
+def _dual(forms: Forms, where: str | None) -> Problem:
+    """The problem whose solution z has a(z, e) = ∫ e over the place, for all e that vanish on Γ0.
+
+    On Γ1 e is free. As z ≥ 0 anyway, where f, g ≥ 0, an obstacle 0 there changes nothing, and is
+    what the solver is made for.
+    """
+    problem = forms.problem
+    conditions: dict[str, Condition] = {}
+    for each in forms.conditions:
+        g, b = float(each.part == where), 0.0 if each.loss is None else each.loss
+        if each.fixed is not None:
+            conditions[each.part] = Dirichlet(0.0)
+        elif each.bounds:
+            conditions[each.part] = Contact(0.0, coefficient=b, g=g)
+        else:
+            conditions[each.part] = Robin(g, coefficient=b)
+    materials = {name: replace(each, f=None) for name, each in problem.materials.items()}
+    if where is not None and where not in conditions:
+        materials[where] = replace(materials.get(where, Material()), f=1.0)
+    return Problem(
+        f=float(where is None),
+        coefficient=problem.coefficient,
+        reaction=problem.reaction,
+        conditions=conditions,
+        materials=materials,
+        quadrature_degree=problem.quadrature_degree,
+    )
+
+
+def _norm(dual: Problem, level: Level) -> float:
+    """Upper bound of the functional's norm: with the energy norm, that squared is −2 J(z)."""
+    coarsest = level.meshes[0].domain
+    physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
+    hierarchy = Hierarchy(physics, coarsest)
+    try:
+        for mesh in level.meshes[1:]:
+            assert mesh.parents is not None
+            hierarchy.add(mesh.domain, mesh.parents.cell, mesh.parents.exchange)
+        certificate = solve_level(
+            Level(hierarchy.meshes),
+            lambda system: hierarchy.multigrid(system.operator, system.owned_dirichlet),
+            Start(),
+            None,
+            {"mesh": 0.0},
+        ).certificate
+    except NotConverged as failure:
+        raise InputError(f"{NO_MEAN}: {failure}") from failure
+    finally:
+        hierarchy.free()
+    if certificate.energy is None:
+        raise InputError(f"{NO_MEAN}: {certificate.reason}")
+    return float(np.sqrt(max(-2.0 * certificate.energy[0], 0.0)))
+
+
+def _integrals(made: Made, cells: Cells, u: FloatArray, where: str | None) -> tuple[float, ...]:
+    """This rank's shares of the extent, and of the integrals of u_h, v, a bound of |ℓ|, and |v|.
+
+    Bumps have the means ⅓ on cells and ⅔ on facets, cubics 0; cusps vanish on the boundary, and ℓ
+    on facets of other parts than Γ0 and Γ1.
+    """
+    d, domain, (lifted, _, areas, edges) = cells.tdim, cells.domain, made.lift
+    bumps = made.bumps if d == 2 else np.zeros(len(u))
+    part = None if where is None else domain.parts.get(where)
+    if part is not None:
+        side = cells.sides[part]
+        extent = measures(cells, side)
+        at_ends = made.vertices[side.ends]
+        v = at_ends.mean(axis=0) + 2 / 3 * bumps[side.dofs]
+        scale = np.abs(at_ends).max(axis=0, initial=0.0) + np.abs(bumps[side.dofs])
+        own = np.zeros(len(u))
+        np.add.at(own, made.bounded, edges)
+        lift = np.sqrt(extent) @ own[side.dofs]
+        of_u = u[side.dofs]
+    else:
+        there = np.ones(cells.number) if where is None else domain.materials.where(where)
+        extent = cells.volume * there[: cells.number]
+        at_ends, height = made.vertices[cells.vertices], bumps[cells.facets]
+        v = at_ends.mean(axis=0) + sum_rows(height) / 3
+        if made.cusps is not None:
+            v[made.cusps.at] += made.cusps.means
+        scale = np.abs(at_ends).max(axis=0) + np.abs(height).max(axis=0)
+        lift = np.sqrt(extent[lifted]) @ areas
+        of_u = u[cells.facets].mean(axis=0)
+    return (
+        float(extent.sum()),
+        float(extent @ of_u),
+        float(extent @ v),
+        float(lift),
+        float(extent @ scale),
+    )
