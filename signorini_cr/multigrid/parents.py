@@ -112,7 +112,6 @@ class Parents:
     Attributes:
         cell: For each local fine cell the coarse cell that holds it: its local index, or, where
             fine cells have moved, its row among those fetched from other ranks.
-        exchange: What fetches them from other ranks, if fine cells have moved.
     """
 
     def __init__(
@@ -132,7 +131,7 @@ class Parents:
             exchange: What fetches them from other ranks, if fine cells have moved.
         """
         self.cell = cell
-        self._coarse, self._fine, self.exchange = coarse, fine, exchange
+        self._coarse, self._fine, self._exchange = coarse, fine, exchange
 
     def take(
         self, values: npt.NDArray, nodes: Int32Array, cells: Int32Array | slice = slice(None)
@@ -148,9 +147,9 @@ class Parents:
             For each of these what `values[nodes]` has for its parent.
         """
         parents = self.cell[cells]
-        if self.exchange is None:
+        if self._exchange is None:
             return values[nodes[parents]]
-        return self.exchange.fetch(values[nodes])[parents]
+        return self._exchange.fetch(values[nodes])[parents]
 
     def collected(self, values: FloatArray, ufunc: np.ufunc = np.add) -> FloatArray:
         """What the children of each coarse cell of this rank have, put together; collective.
@@ -168,17 +167,17 @@ class Parents:
         first = 0.0 if ufunc is np.add else np.inf
         topology = self._coarse.topology
         result = np.full(topology.index_map(topology.dim).size_local, first)
-        if self.exchange is None:
+        if self._exchange is None:
             ufunc.at(result, self.cell[: len(values)], values)
             return result
-        rows = np.full(self.exchange.count, first)
+        rows = np.full(self._exchange.count, first)
         ufunc.at(rows, self.cell[: len(values)], values)
-        ufunc.at(result, self.exchange.rows, self.exchange.give_back(rows))
+        ufunc.at(result, self._exchange.rows, self._exchange.give_back(rows))
         return result
 
     def layout(self, coarse: Layout) -> Layout:
         """The coarse dofs, with the cells that `cell` numbers; collective."""
-        if self.exchange is None:
+        if self._exchange is None:
             return coarse
         index_map = coarse.index_map
         first, end = index_map.local_range
@@ -186,7 +185,7 @@ class Parents:
         owner[index_map.size_local :] = index_map.owners
         nodes = coarse.cells.ravel()
         of_cells = np.column_stack([index_map.local_to_global(nodes), owner[nodes]])
-        told = self.exchange.fetch(of_cells.reshape(len(coarse.cells), -1)).reshape(-1, 2)
+        told = self._exchange.fetch(of_cells.reshape(len(coarse.cells), -1)).reshape(-1, 2)
         number, owner = told.T
         others = (number < first) | (number >= end)
         ghosts, at, place = np.unique(number[others], return_index=True, return_inverse=True)
@@ -199,7 +198,7 @@ class Parents:
     @cached_property
     def regular(self) -> bool:
         """Whether every coarse cell has its 2^d children in a row, on this rank."""
-        if self.exchange is not None:
+        if self._exchange is not None:
             return False
         topology = self._coarse.topology
         cells = topology.index_map(topology.dim).size_local
