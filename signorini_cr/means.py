@@ -11,12 +11,12 @@ from .arrays import FloatArray
 from .data.diffusion import diffusion
 from .diffusion import Diffusion
 from .errors import InputError
-from .estimate.certificate import Made
-from .estimate.force import Interval
+from .estimate.certificate import Certificate, Made, certify
+from .estimate.force import Interval, against, extended, square
 from .fem.cells import Cells, measures, sum_rows
-from .fem.conditions import Condition, Contact, Dirichlet, Robin
+from .fem.conditions import Condition, Contact, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Material, Problem
-from .fem.space import ghosted_vector
+from .fem.space import function_space, ghosted_vector, shared_sum
 from .garbage import release
 from .mesh.domain import Domain
 from .multigrid.hierarchy import NestedMesh
@@ -34,9 +34,9 @@ ROUNDING = 1e-14
 def mean(solution: Solution, where: str | None = None) -> Interval:
     """Bound the mean of u; collective.
 
-    It is the companion's, up to the energy norm of u less the companion times the norm of the mean
-    as a functional, which the energy's bound of a linear problem with the mean for its load gives:
-    that costs about as much as the solve.
+    It is that of the companion, corrected by what a linear problem with the mean for its load says
+    of the difference, up to products of two errors and to what Γ1 leaves unknown. That costs about
+    as much as the solve.
 
     Args:
         solution: One with a certified bound.
@@ -52,14 +52,22 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
-    norm = _norm(_dual(forms, where), level)
+    dual = _solved(_dual(forms, where), level)
     cells = Cells(level.domain, level.V)
-    size, *integrals = cells.total(*_integrals(made, cells, solution.u.x.array, where))
+    size, *integrals = map(float, cells.total(*_integrals(made, cells, solution.u.x.array, where)))
     if not size > 0.0:
         raise InputError(f"{NO_MEAN}: {where!r} has no extent")
-    value, middle, lift, scale = (float(integral / size) for integral in integrals)
-    reach = float(norm * bound / size) + lift + ROUNDING * scale
-    return Interval(value, middle - reach, middle + reach)
+    value, middle, lift, scale = (integral / size for integral in integrals)
+    assert dual.energy is not None
+    # with the energy norm, that of the functional is the dual solution's, its square −2 J(z)
+    norm = np.sqrt(max(-2.0 * dual.energy[0], 0.0))
+    known = [(0.0, float(norm * bound)), *_corrected(made, cells, bound, dual)]
+    loose = lift + ROUNDING * scale
+    return Interval(
+        value,
+        middle + max(shift - reach for shift, reach in known) / size - loose,
+        middle + min(shift + reach for shift, reach in known) / size + loose,
+    )
 
 
 def _insist_on_place(forms: Forms, domain: Domain, where: str | None) -> None:
@@ -103,10 +111,10 @@ def _dual(forms: Forms, where: str | None) -> Problem:
     )
 
 
-def _norm(dual: Problem, level: Level) -> float:
-    """Upper bound of the functional's norm: with the energy norm, that squared is −2 J(z).
+def _solved(dual: Problem, level: Level) -> Certificate:
+    """What is certain about z, with a companion in P1 where that will do.
 
-    The bound of J(z) is true for whatever comes of a linear solve, in which Γ1 counts for nothing.
+    It is true for whatever comes of a linear solve, in which Γ1 counts for nothing.
     """
     coarsest = level.meshes[0].domain
     physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
@@ -120,10 +128,47 @@ def _norm(dual: Problem, level: Level) -> float:
     system.residual(u, residual)
     release(load, found)
     contact = contact_facts(level.data, system, u, residual, Iterations(0, 0, ""))
-    certificate = Solution(level, u, residual, contact, 0.0, Iterations(0, 0, "")).certificate
+    z = Solution(level, u, residual, contact, 0.0, Iterations(0, 0, ""))
+    certificate = certify(z, sweeps=0)
+    level.tidy()
     if certificate.energy is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
-    return float(np.sqrt(max(-2.0 * certificate.energy[0], 0.0)))
+    return certificate
+
+
+def _corrected(
+    made: Made, cells: Cells, bound: float, dual: Certificate
+) -> list[tuple[float, float]]:
+    """∫ e over the place, and how far it may be from that, for e = u − v − ℓ; or nothing.
+
+    It is a(z₀, e) + a(φ, e) + a(z − z₀ − φ, e) with z₀ and φ in P1. z₀ vanishes on Γ1: a(z₀, u) is
+    known. φ takes z's companion's values on Γ1, and there is the ball that A e is in.
+    """
+    of_z = dual._made
+    assert of_z is not None and dual.bound_companion is not None
+    bent = cells.total(float(np.abs(of_z.bumps).sum()))[0] > 0.0 or of_z.thirds is not None
+    if cells.tdim != 2 or made.varies or made.beyond is not None or bent:
+        return []
+    domain, forms = cells.domain, diffusion(made.level.data).forms
+    V = function_space(domain.mesh, "P1")
+    z, marks = fem.Function(V), fem.Function(V)
+    dofs = V.dofmap.list[: cells.number]
+    z.x.array[dofs] = of_z.vertices[cells.vertices].T
+    z.x.scatter_forward()
+    facets = facets_of(domain, [*forms.fixed, *forms.bounded])
+    marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, facets)] = 1.0
+    seen = shared_sum(cells.comm, V.dofmap.index_map, marks.x.array)
+    phi = extended(z, np.flatnonzero(seen > 0).astype(np.int32), made)
+    with_phi = np.ascontiguousarray(phi.x.array[dofs].T)
+    inside = np.ascontiguousarray(z.x.array[dofs].T) - with_phi
+    work, other, size, of_phi = cells.total(
+        against(made, cells, inside)[0],
+        against(made, cells, with_phi)[0],
+        square(made, cells, inside),
+        square(made, cells, with_phi),
+    )
+    reach = made.loose * np.sqrt(size) + made.reach * np.sqrt(of_phi)
+    return [(float(-work - 0.5 * other), float(reach + dual.bound_companion * bound))]
 
 
 def _integrals(made: Made, cells: Cells, u: FloatArray, where: str | None) -> tuple[float, ...]:

@@ -145,7 +145,7 @@ class Made:
     of f and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces
     are this rank's shares of the contact forces in y, by the parts' numbers, missed that of what
     quadrature may have missed of f and g. reach is the radius of the ball around the middle of p
-    and b that A(u − u_h) is in, loose ends added. lift has bounds of ℓ, which v lacks, and bounded
+    and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds of ℓ, which v lacks, and bounded
     the facet dofs of Γ1 that its last row is about.
     """
 
@@ -168,6 +168,7 @@ class Made:
     forces: dict[int, float]
     missed: float
     reach: float
+    loose: float
     lift: Lifted
     bounded: IndexArray
 
@@ -413,6 +414,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             missed=float(segments.missed.sum())
             + (0.0 if certain.missed is None else float(certain.missed.sum())),
             reach=float(bound - near / 2 + loose + lift / 2),
+            loose=float(loose + lift),
             lift=v.lift,
             bounded=v.boundary.alpha.side.dofs,
         ),
