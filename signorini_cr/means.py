@@ -52,12 +52,12 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
-    dual = _solved(_dual(forms, where), level)
     cells = Cells(level.domain, level.V)
     size, *integrals = map(float, cells.total(*_integrals(made, cells, solution.u.x.array, where)))
     if not size > 0.0:
         raise InputError(f"{NO_MEAN}: {where!r} has no extent")
     value, middle, lift, scale = (integral / size for integral in integrals)
+    dual = _solved(_dual(forms, where), level)
     assert dual.energy is not None
     # with the energy norm, that of the functional is the dual solution's, its square −2 J(z)
     norm = np.sqrt(max(-2.0 * dual.energy[0], 0.0))

@@ -145,8 +145,8 @@ class Made:
     of f and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces
     are this rank's shares of the contact forces in y, by the parts' numbers, missed that of what
     quadrature may have missed of f and g. reach is the radius of the ball around the middle of p
-    and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds of ℓ, which v lacks, and bounded
-    the facet dofs of Γ1 that its last row is about.
+    and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds
+    of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last row is about.
     """
 
     level: Level
