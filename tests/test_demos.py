@@ -56,9 +56,12 @@ def test_the_first_demo_prints_a_row_a_level(studies):
             "demo_adaptive.py",
             {"adaptive-l-shape-error", "adaptive-hole-mesh", "adaptive-convergence"},
         ),
+        ("demo_frost.py", {"frost", "frost-night"}),
+        ("demo_seepage.py", {"seepage", "seepage-heads"}),
+        ("demo_wall.py", {"wall", "wall-strip"}),
     ],
 )
-def test_demos_of_the_certificate(demo, pictures, shared_tmp_path):
+def test_demos_on_their_own(demo, pictures, shared_tmp_path):
     assert script(DEMOS / demo, shared_tmp_path, SIGNORINI_DEMO_LEVELS="3")[0] == 0
     assert {path.stem for path in shared_tmp_path.glob("*.png") if is_picture(path)} >= pictures
 

@@ -33,6 +33,7 @@ from .screen import Screen, wrapped
 if TYPE_CHECKING:
     from ..errors import NotConverged
     from ..mesh.domain import Domain
+    from ..output.units import Units
     from ..restart import Restart
     from ..solution import Solution
     from .problemfile import ProblemFile
@@ -235,7 +236,9 @@ def _solve_levels(
             _ = solution.errors, solution.certificate  # the report reads what is there
             before = records[-1] if records else None
             record = output.level_record(solution, before, case.quantities)
-            report = output.make_report(case.title, element, comm, [*records, record], False)
+            report = output.make_report(
+                case.title, element, comm, [*records, record], False, case.units
+            )
             with _named("--out"):
                 restart = Restart.of(solution, restart, case.mode == "adaptive")
                 output.write_levels(folder, report, solution, restart, said)
@@ -250,16 +253,17 @@ def _solve_levels(
     failure = failure or _above_tolerance(case, records)
     if finest is not None:
         screen.progress("writing")
-        report = output.make_report(case.title, element, comm, records, failure is None)
+        complete = failure is None
+        report = output.make_report(case.title, element, comm, records, complete, case.units)
         with _named("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
             if args.html:
                 names += _write_page(args, comm, folder, problem, report)
         screen.line("")
-        screen.text(legend(records[0]))
+        screen.text(legend(records[0], case.units))
         screen.line("")
-        screen.text(_facts(records[-1]))
-        screen.text(certified(records[-1]))
+        screen.text(_facts(records[-1], case.units))
+        screen.text(certified(records[-1], case.units))
         screen.text(times(records))
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
@@ -277,7 +281,7 @@ def _solve_steps(
     """Solve a problem in time; each step is safe in the folder before the next begins."""
     from ..errors import InputError, NotConverged
     from ..output import report as output
-    from ..output import series
+    from ..output import series, strip
     from ..output.tables import certified
 
     for name, given in {
@@ -292,11 +296,15 @@ def _solve_steps(
     records: list[dict[str, Any]] = []
     failure: NotConverged | None = None
     solution: Solution | None = None
+    assert case.time is not None
+    chosen, moments = strip.chosen(case.time.steps), []
     screen.progress("step 1")
     try:
         for time, solution in case.steps(domain, case.levels):
             record = series.step_record(len(records) + 1, time, solution)
             records.append(record)
+            if record["step"] in chosen:
+                moments.append(strip.moment(time, solution))
             with _named("--out"):
                 series.write_step(folder, records, solution)
             if len(records) == 1:
@@ -307,13 +315,16 @@ def _solve_steps(
     if solution is not None:
         screen.progress("writing")
         last = output.level_record(solution, None, case.quantities)
-        report = output.make_report(case.title, "CR", comm, [last], failure is None)
+        complete = failure is None
+        report = output.make_report(case.title, "CR", comm, [last], complete, case.units)
         report["times"] = records
         with _named("--out"):
-            names = output.write_output(folder, report, solution, steps=True)
+            names = output.write_output(folder, report, solution, moments=moments)
         screen.line("")
-        screen.text(_facts(last))
-        screen.text(f"the last step's own problem, {certified(last)}")
+        if units := series.legend(case.units):
+            screen.text(f"{units}\n")
+        screen.text(_facts(last, case.units))
+        screen.text(f"the last step's own problem, {certified(last, case.units)}")
         screen.text(
             f"written to {folder}: {', '.join(names)}, times.csv, series.pvd and its fields"
         )
@@ -337,7 +348,7 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         return DONE
 
     def draw(path: Path) -> None:
-        plots.plot_mesh(domain, path, case.title)
+        plots.plot_mesh(domain, path, case.title, units=case.units)
 
     with _named("--out"):
         write_files(folder, {picture: draw}, comm=comm)
@@ -447,10 +458,11 @@ def _write_page(
     from ..errors import on_root
     from ..output.files import write_files, write_text
     from ..output.page import run_page
+    from ..output.units import Units
 
     def make() -> str:
         source = args.file.read_text(encoding="utf-8")
-        fact = _facts(report["levels"][-1])
+        fact = _facts(report["levels"][-1], Units.of(report))
         return run_page(folder, source, report, args.words, problem, fact)
 
     name = "report.html"
@@ -458,19 +470,20 @@ def _write_page(
     return [name]
 
 
-def _facts(record: dict[str, Any]) -> str:
+def _facts(record: dict[str, Any], units: Units) -> str:
     """What happens on Γ1, in a sentence."""
     contact = record["contact"]
     line = (
         f"contact on {contact['active']} of {contact['facets']} facets, length"
-        f" {contact['length']:.6g}, force {contact['force']:.6g}"
+        f" {contact['length']:.6g}{units.after('x')}, force {contact['force']:.6g}"
+        f"{units.after('force')}"
     )
     points = [
         "(" + ", ".join(f"{value:.6g}" for value in point) + ")" for point in contact["transitions"]
     ]
     if points:
         more = f" and {len(points) - 6} more" if len(points) > 6 else ""
-        line += f"; it begins or ends at {', '.join(points[:6])}{more}"
+        line += f"; it begins or ends at {', '.join(points[:6])}{more}{units.after('x')}"
     return line
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
-from ..mesh.polygon import check_loops, coordinates
+from ..mesh.polygon import check_loops, coordinates, cut
+from ..output.units import Units
 from ..solution import Solution
 from .datacheck import USED_ON, check_values
 from .expressions import Expression, check_name, parse
@@ -44,6 +46,7 @@ from .readers import (
     shown,
     string,
     whole,
+    word,
 )
 from .reference import ADAPTIVE, DOMAIN, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
 
@@ -51,6 +54,8 @@ KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
+TELLING = ("quantities", "units", "names")
+"""Sections that levels do not depend on."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
@@ -97,6 +102,7 @@ class ProblemFile:
         quantities: The kind of each quantity that is asked for, "force", "flux" or "mean", and its
             part of the boundary or its material, None for all of the domain, by name.
         time: What [time] says; None for a problem without time.
+        units: What [units] and [names] say.
         said: All that levels depend on, by key, as it was written.
     """
 
@@ -112,6 +118,7 @@ class ProblemFile:
     adaptive: Mapping[str, Any]
     quantities: Mapping[str, tuple[str, str | None]]
     time: Time | None
+    units: Units
     said: Mapping[str, Any]
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
@@ -234,11 +241,12 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         adaptive=adaptive,
         time=None if clock is None else _time(sections, expressions, mode, clock),
         quantities=_quantities(sections["quantities"], parts, materials),
+        units=Units(**_words(sections, "units"), names=_words(sections, "names")),
         said={
             f"{name}.{key}": value
             for name, section in sections.items()
             for key, value in section.items()
-            if f"{name}.{key}" not in ENDS and name != "quantities"
+            if f"{name}.{key}" not in ENDS and name not in TELLING
         },
     )
 
@@ -296,6 +304,11 @@ def _quantities(
     return found
 
 
+def _words(sections: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, str]:
+    """[units] or [names]: words by key."""
+    return {key: word(f"{name}.{key}", value) for key, value in sections[name].items()}
+
+
 _SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, the others are optional"
 
 
@@ -323,7 +336,7 @@ def _domain(
         materials: The sections of the materials.
     """
     if "mesh" in table:
-        others = [key for key in ("vertices", "boundary", "size", "holes") if key in table]
+        others = [key for key in allowed("domain") if key != "mesh" and key in table]
         if others:
             raise InputError(
                 f"domain: both mesh and {others[0]} are given; either a mesh file or a polygon"
@@ -341,7 +354,8 @@ def _domain(
             "domain: neither vertices nor mesh is given; a polygon (vertices, boundary, size) or"
             " a mesh file is needed"
         )
-    polygon = _polygon(table, "domain", names)
+    size = get(table, "domain", "size", positive, needed="a number above 0, the length of a facet,")
+    polygon = _polygon(table, "domain", names, size)
     holes, polygons = [], {}
     for name, material in materials.items():
         key, needed = f"material.{name}", "a list of points [x, y]"
@@ -352,14 +366,20 @@ def _domain(
         key = f"domain.holes[{i}]"
         if not isinstance(hole, dict):
             raise InputError(
-                f"{key}: {{ vertices = [...], boundary = [...] }} is needed, found {shown(hole)}"
+                f"{key}: {{ vertices = [...], boundary = [...] }} or {{ center = [...], radius ="
+                f" ..., boundary = ... }} is needed, found {shown(hole)}"
             )
-        insist_known(hole, key, ("vertices", "boundary"))
-        holes.append(_polygon(hole, key, names))
+        round_keys = ("center", "radius", "boundary")
+        insist_known(hole, key, ("vertices", "arcs", *round_keys))
+        if "center" in hole or "radius" in hole:
+            insist_known(hole, key, round_keys)
+            holes.append(_circle(hole, key, names, size))
+        else:
+            holes.append(_polygon(hole, key, names, size))
     if holes or polygons:
         apart = "holes must lie inside the polygon and apart from each other"
-        outline = (polygon.vertices, polygon.boundary)
-        polygon = named("domain.holes", Polygon, *outline, tuple(holes), names, rule=apart)
+        whole_polygon = partial(replace, polygon, holes=tuple(holes))
+        polygon = named("domain.holes", whole_polygon, rule=apart)
         polygon = replace(polygon, materials=polygons)
     named("domain.boundary", polygon.check_parts)
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
@@ -368,7 +388,6 @@ def _domain(
             near = difflib.get_close_matches(name, labels, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise InputError(f"boundary.{name}: no edge is labelled {name}{hint}")
-    size = get(table, "domain", "size", positive, needed="a number above 0, the length of a facet,")
     # From the longest edge on, facets grow inside only; none is longer than the diameter
     if size > polygon.diameter * (1 + 1e-9):
         raise InputError(
@@ -378,33 +397,72 @@ def _domain(
     return polygon, size
 
 
-def _polygon(table: Mapping[str, Any], section: str, names: tuple[str, ...]) -> Polygon:
+def _polygon(
+    table: Mapping[str, Any], section: str, names: tuple[str, ...], size: float
+) -> Polygon:
     key = f"{section}.vertices"
     vertices = get(table, section, "vertices", array, needed="a list of points [x, y]")
-    points = _points(key, vertices)
+    points = _points(key, vertices, 2 if table.get("arcs") else 3)
     boundary = get(table, section, "boundary", array, needed="a list of labels, one for each edge,")
     for i, label in enumerate(boundary):
-        one_of((*PARTS, *(name for name in names if name not in PARTS)))(
-            f"{section}.boundary[{i}]", label
-        )
+        _label(names)(f"{section}.boundary[{i}]", label)
     if len(boundary) != len(vertices):
         raise InputError(
             f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
             f" found {len(boundary)} labels"
         )
-    return named(key, Polygon, points, tuple(boundary), (), names, rule=SIMPLE)
+    arcs = _arcs(f"{section}.arcs", array(f"{section}.arcs", table.get("arcs", [])))
+    points, labels, edges = named(f"{section}.arcs", cut, points, boundary, arcs, size)
+    return named(key, partial(Polygon, edges=edges), points, labels, (), names, rule=SIMPLE)
 
 
-def _points(key: str, vertices: list[Any]) -> FloatArray:
+def _arcs(key: str, arcs: list[Any]) -> dict[int, list[float]]:
+    """The points that arcs pass through, by edge."""
+    found: dict[int, list[float]] = {}
+    for i, arc in enumerate(arcs):
+        where = f"{key}[{i}]"
+        if not isinstance(arc, dict) or {"edge", "through"} - arc.keys():
+            raise InputError(
+                f"{where}: {{ edge = i, through = [x, y] }} is needed, found {shown(arc)}"
+            )
+        insist_known(arc, where, ("edge", "through"))
+        edge = arc["edge"]
+        if isinstance(edge, bool) or not isinstance(edge, int) or edge in found:
+            raise InputError(
+                f"{where}.edge: the number of an edge, from 0, that is no arc yet is needed, found"
+                f" {shown(edge)}"
+            )
+        found[edge] = _pair(f"{where}.through", arc["through"])
+    return found
+
+
+def _circle(table: Mapping[str, Any], section: str, names: tuple[str, ...], size: float) -> Polygon:
+    """A round hole."""
+    center = get(table, section, "center", _pair, needed="a point [x, y]")
+    radius = get(table, section, "radius", positive, needed="a number above 0")
+    part = get(table, section, "boundary", _label(names), needed="one label")
+    return named(section, partial(Polygon.circle, names=names), center, radius, part, size)
+
+
+def _label(names: tuple[str, ...]) -> Callable[[str, Any], str]:
+    """A reader of labels of edges."""
+    return one_of((*PARTS, *(name for name in names if name not in PARTS)))
+
+
+def _points(key: str, vertices: list[Any], least: int = 3) -> FloatArray:
     """The vertices of a polygon, shape (n, 2)."""
     for i, vertex in enumerate(vertices):
-        if not isinstance(vertex, list) or len(vertex) != 2:
-            raise InputError(f"{key}[{i}]: a point [x, y] is needed, found {shown(vertex)}")
-        for j, coordinate in enumerate(vertex):
-            number(f"{key}[{i}][{j}]", coordinate)
-    if len(vertices) < 3:
-        raise InputError(f"{key}: at least 3 vertices are needed, found {len(vertices)}")
+        _pair(f"{key}[{i}]", vertex)
+    if len(vertices) < least:
+        raise InputError(f"{key}: at least {least} vertices are needed, found {len(vertices)}")
     return np.array(vertices, dtype=np.float64)
+
+
+def _pair(key: str, point: Any) -> list[float]:
+    """Insist on a point."""
+    if not isinstance(point, list) or len(point) != 2:
+        raise InputError(f"{key}: a point [x, y] is needed, found {shown(point)}")
+    return [number(f"{key}[{j}]", coordinate) for j, coordinate in enumerate(point)]
 
 
 def _few_enough(levels: int, cells: int, dim: int) -> None:

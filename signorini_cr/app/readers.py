@@ -13,6 +13,9 @@ from typing import Any
 
 from ..errors import InputError
 
+MOST_CHARACTERS = 40
+"""In a name or a unit."""
+
 
 def read_text(path: Path) -> str:
     """The text of a file in UTF-8."""
@@ -112,6 +115,15 @@ def string(key: str, value: Any) -> str:
     if not isinstance(value, str):
         raise InputError(f"{key}: a string is needed, found {shown(value)}")
     return value
+
+
+def word(key: str, value: Any) -> str:
+    """Insist on a few characters that fit on a line, of a table or beside an axis."""
+    if not string(key, value).strip() or len(value) > MOST_CHARACTERS or not value.isprintable():
+        raise InputError(
+            f"{key}: 1 to {MOST_CHARACTERS} characters on one line are needed, found {shown(value)}"
+        )
+    return value.strip()
 
 
 def array(key: str, value: Any) -> list[Any]:

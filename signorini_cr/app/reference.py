@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from .formula import CONSTANTS, FUNCTIONS, VARIABLES
-from .readers import not_negative, part, whole
+from .readers import MOST_CHARACTERS, not_negative, part, whole
 
 
 class Key(NamedTuple):
@@ -33,6 +33,7 @@ class Key(NamedTuple):
 
 
 EXPRESSION = "an expression or a number"
+WORD = f"a text of {MOST_CHARACTERS} characters at most"
 PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
 MATERIAL = "material.NAME"
@@ -66,10 +67,21 @@ KEYS = (
         'boundary = ["contact", "dirichlet", "neumann", "dirichlet"]'),
     Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh, no "
         "longer than the domain.", "size = 0.25"),
-    Key("domain", "holes", "a list of { vertices, boundary }", "no holes", "Polygons inside the "
-        "polygon and apart from one another, with labels of their own.",
+    Key("domain", "arcs", "a list of { edge, through }", "straight edges", "Edges that are "
+        "circular arcs: the number of the edge, and a point [x, y] between its ends that the arc "
+        "passes through. With an arc two vertices are enough. It is cut into equal straight "
+        "facets, no longer than `size` and 24 or more for a full circle, so that they are nowhere "
+        "further from the arc than a thirtieth of their length and 1 % of the radius. Solved, "
+        "refined and certified is the problem on this polygon: finer meshes do not come closer "
+        "to the arc, a smaller `size` does.",
+        "arcs = [{ edge = 2, through = [0, 1.2] }]"),
+    Key("domain", "holes", "a list of { vertices, boundary } or { center, radius, boundary }",
+        "no holes", "Polygons, which may have `arcs`, and circles, cut like them, inside the "
+        "polygon and apart from one another. A polygon has labels of its own; a circle has one, "
+        "which is no list.",
         'holes = [{ vertices = [[0.2, 0.4], [0.5, 0.4], [0.3, 0.7]], '
-        'boundary = ["neumann", "neumann", "neumann"] }]'),
+        'boundary = ["neumann", "neumann", "neumann"] }, '
+        '{ center = [-0.5, 0.5], radius = 0.2, boundary = "neumann" }]'),
     Key("domain", "mesh", "the path of a .msh file, relative to this one", "", "A gmsh file, 2.2 "
         "or 4.1, in the place of the polygon; physical curves named contact, dirichlet and "
         "neumann, or as sections [boundary.NAME] are, are the parts of its boundary.",
@@ -132,6 +144,18 @@ KEYS = (
         "backward difference of second order.", 'scheme = "bdf2"'),
     Key("time", "initial", EXPRESSION, "0", "u at the time 0.", 'initial = "8 - 2*y"'),
     Key("time", "capacity", "a number above 0", "1", "What multiplies ∂u/∂t.", "capacity = 2e6"),
+    Key("units", "x", WORD, "not told", "Of lengths, along both axes.", 'x = "m"'),
+    Key("units", "u", WORD, "not told", "Of u.", 'u = "°C"'),
+    Key("units", "time", WORD, "not told", "Of t.", 'time = "h"'),
+    Key("units", "flux", WORD, "not told", "Of κ∂ₙu, and so of the contact pressure.",
+        'flux = "W/m²"'),
+    Key("units", "force", WORD, "not told", "Of what flows through a whole part: of the contact "
+        "force, and of [quantities].", 'force = "W/m"'),
+    Key("names", "x", WORD, "not told", "Of the axis to the right.", 'x = "distance"'),
+    Key("names", "y", WORD, "not told", "Of the axis upwards.", 'y = "height"'),
+    Key("names", "u", WORD, "not told", "Of u.", 'u = "temperature"'),
+    Key("names", "flux", WORD, '"contact pressure"', "Of what u gets on contact parts.",
+        'flux = "heat"'),
 )  # fmt: skip
 
 ABOUT = {
@@ -150,6 +174,9 @@ ABOUT = {
     "time": "Optional: capacity ∂u/∂t − ∇·(κ∇u) + c u = f, step by step. `t` may then stand in "
     "every expression but those of κ, c and the coefficients of parts. The bound of a step is that "
     "of its own problem, in which the steps before are data.",
+    "units": "Optional. What is printed, written and drawn says them; nothing is converted, all "
+    "data are to be in these units.",
+    "names": "Optional. What stands in pictures beside x, y, u and the pressure.",
     "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
     "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
     "through a dirichlet part, both of which must not touch other dirichlet or contact parts; or "

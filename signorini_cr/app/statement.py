@@ -27,6 +27,7 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         domain: The coarsest mesh.
     """
     mesh, said = domain.mesh, case.said
+    unit = case.units.after("x")
     comm, tdim, gdim = mesh.comm, mesh.topology.dim, mesh.geometry.dim
     x = mesh.geometry.x[:, :gdim]
     low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
@@ -46,7 +47,7 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     usual = _short(said.get("data.coefficient", 1))
     equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {usual}"
     rows = {
-        "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}",
+        "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}{unit}",
         "equation": equation if kappa else f"−Δu{gain} = {data('f', 'that')}",
     }
     for name, material in materials.items():
@@ -68,9 +69,10 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         if number > 0:
             total = comm.allreduce(float(measures.sum()))
             what = "length" if gdim == 2 else "area"
-            rows[name] = f"{condition}; {number} facets, {what} {total:.6g}"
+            rows[name] = f"{condition}; {number} facets, {what} {total:.6g}{unit}"
     if case.time is not None:
-        words = f"t from 0 to {case.time.end:g} in {case.time.steps} steps of {case.time.scheme}"
+        words = f"t from 0 to {case.time.end:g}{case.units.after('time')} in {case.time.steps}"
+        words += f" steps of {case.time.scheme}"
         start = f"u = {_short(said.get('time.initial', 0))} at t = 0"
         rows["time"] = f"{words}; {case.time.capacity:g} ∂u/∂t on the left; {start}"
     if "exact.u" in said:

@@ -13,7 +13,7 @@ from dolfinx import fem
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import Cells, vertex_rows
-from ..fem.conditions import Condition
+from ..fem.conditions import Condition, may_change
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
@@ -49,16 +49,32 @@ class DiffusionOnMesh:
         return Cells(self.domain, self.V, fixed, self.forms.sinks)
 
     def renewed(self, source: FloatArray | None = None) -> DiffusionOnMesh:
-        """The same with data as they are now, which are sampled anew; a_h must be what it was.
+        """The same with data as they are now; a_h must be what it was.
+
+        Data that hold neither Constants nor Functions are what they were, and not sampled anew.
 
         Args:
             source: As above.
         """
         other = copy(self)
-        for name in ("of_f", "load", "edges", "u_D", "alpha"):
+        for name in ("load", *self._changing):
             other.__dict__.pop(name, None)
         other.source = source
         return other
+
+    @cached_property
+    def _changing(self) -> tuple[str, ...]:
+        """What is made from data that may change."""
+        forms = self.forms
+        made = {
+            ("of_f",): [forms.f],
+            ("edges",): [condition.flux for condition in forms.natural],
+            ("u_D", "fixed"): [condition.fixed for condition in forms.fixed],
+            ("alpha", "bounds"): [each for c in forms.bounded for _, each in c.bounds],
+        }
+        return tuple(
+            name for names, data in made.items() if any(map(may_change, data)) for name in names
+        )
 
     @cached_property
     def of_f(self) -> Load:
@@ -103,12 +119,12 @@ class DiffusionOnMesh:
         """a_h."""
         return self.forms.a.on(self.domain, [self.V, self.V])
 
-    @property
+    @cached_property
     def fixed(self) -> tuple[Imposed, ...]:
         """u_D on Γ0."""
         return tuple(on_facets.imposed for on_facets in self.u_D)
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Imposed, ...]:
         """α and −β on Γ1."""
         return tuple(on_facets.imposed for on_facets in self.alpha)

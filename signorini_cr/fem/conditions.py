@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 import ufl
+from ufl.algorithms.analysis import extract_coefficients, extract_constants
 from ufl.core.expr import Expr
 
 from ..arrays import Int32Array
@@ -27,6 +28,12 @@ def number(expression: Expr) -> float | None:
     if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
         return float(expression)
     return None
+
+
+def may_change(expression: Expr) -> bool:
+    """Whether an expression holds a Constant or a Function, which may get other values."""
+    found = extract_constants(expression) or extract_coefficients(expression)
+    return bool(found)
 
 
 def negative(expression: Expr) -> Expr:

@@ -387,7 +387,8 @@ class Forms:
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
         """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
         rule = {} if self.steady else {"quadrature_degree": self.problem.quadrature_degree}
-        form = ufl.inner(self.kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
+        kappa = self._adjustable(self.kappa)
+        form = ufl.inner(kappa * ufl.grad(u), ufl.grad(v)) * self.dx(metadata=rule)
         return sum(self._without_gradients(u, v), form)
 
     def _without_gradients(self, u: Expr, v: Expr) -> list[ufl.Form]:
@@ -395,7 +396,16 @@ class Forms:
         degree = {"quadrature_degree": self.problem.quadrature_degree}
         terms = [(self.reaction, self.dx)]
         terms += [(c.loss, self.ds(c.number)) for c in self.conditions if c.loss is not None]
-        return [b * u * v * measure(metadata=degree) for b, measure in terms if number(b) != 0.0]
+        return [
+            self._adjustable(b) * u * v * measure(metadata=degree)
+            for b, measure in terms
+            if number(b) != 0.0
+        ]
+
+    def _adjustable(self, data: Expr) -> Expr:
+        """A Constant in the place of a number: one form is compiled for all numbers."""
+        value = number(data)
+        return data if value is None else fem.Constant(self.mesh, value)
 
     @cached_property
     def _squared_errors(self) -> Kernel:

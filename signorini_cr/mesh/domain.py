@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import basix.ufl
 import numpy as np
+import numpy.typing as npt
 from dolfinx import fem, la
 from dolfinx.graph import adjacencylist
 from dolfinx.io.utils import distribute_entity_data
@@ -36,7 +38,7 @@ from .exchange import Exchange
 from .materials import Materials
 from .materials import numbered as numbered_materials
 from .partition import by_position
-from .polygon import check_labels, check_loops, coordinates
+from .polygon import check_labels, check_loops, circle, coordinates, cut
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
@@ -286,6 +288,7 @@ class Polygon:
         materials: What lies in a polygon, shape (n, 2), consists of a material, whose data are in
             `Problem.materials`. These polygons may share edges and reach beyond the domain, but not
             overlap; lines of the mesh follow their edges.
+        edges: What edge i is called in messages; by default i.
 
     Raises:
         InputError: An outline crosses itself or another one, or a label is not known.
@@ -296,6 +299,54 @@ class Polygon:
     holes: tuple[Polygon, ...] = ()
     names: tuple[str, ...] = ()
     materials: Mapping[str, FloatArray] = field(default_factory=dict)
+    edges: tuple[int, ...] = ()
+
+    @classmethod
+    def with_arcs(
+        cls,
+        vertices: npt.ArrayLike,
+        boundary: Sequence[str],
+        arcs: Mapping[int, Sequence[float]],
+        size: float,
+        **others: Any,
+    ) -> Polygon:
+        """Cut edges that are circular arcs into equal facets.
+
+        They are no longer than `size`, and 24 or more for a full circle, so that no point of them
+        is further from the arc than a thirtieth of their length. The domain is the polygon that
+        comes out: refinement does not move nodes onto the arc.
+
+        Args:
+            vertices: Shape (n, 2), two at least.
+            boundary: Part of each edge, and so of all its facets.
+            arcs: A point [x, y] between its ends that an arc passes through, by edge.
+            size: Facet length wanted, that of `mesh`.
+            **others: Further attributes by name.
+
+        Raises:
+            InputError: There is no such edge or no such arc; and what the class raises.
+        """
+        points, labels, edges = cut(vertices, boundary, arcs, size)
+        return cls(points, labels, edges=edges, **others)
+
+    @classmethod
+    def circle(
+        cls, center: Sequence[float], radius: float, part: str, size: float, **others: Any
+    ) -> Polygon:
+        """Cut a circle into facets as `with_arcs` does, all of one part: a round hole, say.
+
+        Args:
+            center: [x, y].
+            radius: Above 0.
+            part: Of all of it.
+            size: Facet length wanted, that of `mesh`.
+            **others: Further attributes by name.
+
+        Raises:
+            InputError: The radius is not positive; and what the class raises.
+        """
+        points = circle(center, radius, size)
+        return cls(points, (part,) * len(points), edges=(0,) * len(points), **others)
 
     def __post_init__(self) -> None:
         """Take lists as well as arrays and check everything that can be checked at once."""
@@ -304,7 +355,9 @@ class Polygon:
         object.__setattr__(self, "holes", tuple(self.holes))
         object.__setattr__(self, "names", tuple(self.names))
         check_labels(self.boundary, len(self.vertices), (*PARTS, *self.names))
-        check_loops([self.vertices, *(hole.vertices for hole in self.holes)])
+        object.__setattr__(self, "edges", tuple(self.edges) or tuple(range(len(self.vertices))))
+        loops = self, *self.holes
+        check_loops([each.vertices for each in loops], [each.edges for each in loops])
         polygons = {name: coordinates(polygon) for name, polygon in self.materials.items()}
         object.__setattr__(self, "materials", polygons)
         for name, polygon in polygons.items():

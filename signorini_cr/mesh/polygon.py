@@ -1,8 +1,9 @@
-"""Checks of a polygon's edges: closed loops that neither cross nor touch."""
+"""A polygon's edges: arcs cut into facets, closed loops that neither cross nor touch."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -12,18 +13,26 @@ from ..errors import InputError
 
 FARTHEST = 1e100
 """Largest coordinate: areas, and products of them, stay finite."""
+TURN = math.pi / 12
+"""Most that the boundary turns from one facet of an arc to the next: 24 are a circle.
+
+A facet of length l that turns by t is l tan(t/4)/2 away from its arc: here less than l/30, and than
+1 % of the radius.
+"""
+MOST_FACETS = 2000
+"""Of one arc."""
 
 
-def coordinates(vertices: npt.ArrayLike) -> FloatArray:
-    """Vertices as a read-only array, shape (n, 2), if they are that and finite."""
+def coordinates(vertices: npt.ArrayLike, least: int = 3) -> FloatArray:
+    """Vertices as a read-only array, shape (n, 2), if they are that, finite and enough."""
     try:
         points = np.array(vertices, dtype=np.float64)
     except (TypeError, ValueError):
         points = np.empty(0)
     if points.ndim != 2 or points.shape[1] != 2:
         raise InputError("vertices are not a list of [x, y] pairs of numbers")
-    if len(points) < 3:
-        raise InputError(f"{len(points)} vertices: a polygon has at least 3")
+    if len(points) < least:
+        raise InputError(f"{len(points)} vertices: a polygon has at least {least}")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
         raise InputError(f"vertex {bad[0]} is {_point(points[bad[0]])}: not a finite point")
@@ -41,6 +50,94 @@ def _point(x: FloatArray) -> str:
     return f"({x[0]:g}, {x[1]:g})"
 
 
+def cut(
+    vertices: npt.ArrayLike,
+    boundary: Sequence[str],
+    arcs: Mapping[int, Sequence[float]],
+    size: float,
+) -> tuple[FloatArray, tuple[str, ...], tuple[int, ...]]:
+    """Cut the edges that are circular arcs into straight facets with their ends on the arc.
+
+    The facets of an arc are equal, no longer than `size`, and turn by `TURN` at most.
+
+    Args:
+        vertices: Shape (n, 2), two at least.
+        boundary: A label for every edge.
+        arcs: A point between the ends that the arc of an edge passes through, by edge.
+        size: Facet length wanted.
+
+    Returns:
+        The vertices, labels of the edges, and the edge that each was cut from.
+
+    Raises:
+        InputError: There is no such edge, or no such arc, or it would have too many facets.
+    """
+    corners = coordinates(vertices, 2 if arcs else 3)
+    check_labels(boundary, len(corners), boundary)
+    for edge in arcs:
+        if edge not in range(len(corners)):
+            raise InputError(f"there is no edge {edge}: they are 0 to {len(corners) - 1}")
+    pieces = []
+    for edge, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+        piece = start[None]
+        if edge in arcs:
+            try:
+                piece = _arc(start, _one(arcs[edge]), end, size)
+            except InputError as error:
+                raise InputError(f"the arc of edge {edge}: {error}") from None
+        pieces.append(piece)
+    edges = [edge for edge, piece in enumerate(pieces) for _ in piece]
+    return np.concatenate(pieces), tuple(boundary[edge] for edge in edges), tuple(edges)
+
+
+def circle(center: Sequence[float], radius: float, size: float) -> FloatArray:
+    """Cut a circle into facets like those of `cut`; their ends, shape (n, 2)."""
+    if not (np.isfinite(radius) and radius > 0):
+        raise InputError(f"the radius is {radius}: a positive number is needed")
+    return _turned(_one(center), radius, 0.0, 2 * math.pi, size)
+
+
+def _one(point: Sequence[float]) -> FloatArray:
+    """A point, shape (2,)."""
+    x = np.array(point, dtype=np.float64)
+    if x.shape != (2,) or not np.abs(x).max() <= FARTHEST:
+        raise InputError(f"a point [x, y] of numbers up to {FARTHEST:g} is needed, found {point}")
+    return x
+
+
+def _arc(start: FloatArray, through: FloatArray, end: FloatArray, size: float) -> FloatArray:
+    """The ends of an arc's facets, its own end left out."""
+    d, e = through - start, end - start
+    d2, e2, area = d @ d, e @ e, d[0] * e[1] - d[1] * e[0]
+    if abs(area) <= 1e-9 * max(d2, e2):
+        raise InputError(
+            f"no circle passes through {_point(start)}, {_point(through)} and {_point(end)}; a"
+            " point between its ends and beside the straight line is needed"
+        )
+    offset = np.array([e[1] * d2 - d[1] * e2, d[0] * e2 - e[0] * d2]) / (2 * area)
+    first, last = (math.atan2(x[1], x[0]) for x in (-offset, e - offset))
+    turn = (last - first) % (2 * math.pi)
+    if area < 0:  # clockwise
+        turn -= 2 * math.pi
+    points = _turned(start + offset, float(np.hypot(*offset)), first, turn, size)
+    points[0] = start
+    return points
+
+
+def _turned(
+    center: FloatArray, radius: float, first: float, turn: float, size: float
+) -> FloatArray:
+    """Points at equal angles from `first` on, as many as there are to be facets."""
+    if not size > 0:
+        raise InputError(f"size is {size}: a positive number is needed")
+    number = abs(turn) * max(radius / size, 1 / TURN)
+    if number > MOST_FACETS:
+        raise InputError(f"at the size {size:g} it has more than {MOST_FACETS} facets")
+    number = max(math.ceil(number - 1e-9), 1)
+    angles = first + turn * np.arange(number) / number
+    return center + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
 def check_labels(labels: Sequence[str], edges: int, allowed: Sequence[str]) -> None:
     """Insist on one of the allowed labels for each edge."""
     if len(labels) != edges:
@@ -52,13 +149,14 @@ def check_labels(labels: Sequence[str], edges: int, allowed: Sequence[str]) -> N
             raise InputError(f"edge {i} is labelled {label!r}: allowed are {', '.join(allowed)}")
 
 
-def check_loops(loops: Sequence[FloatArray]) -> None:
+def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | None = None) -> None:
     """Insist on simple loops, apart from each other, the first around all the others.
 
     Edges touch if they come closer than 1e-12 of the polygon's extent.
 
     Args:
         loops: Vertices of the polygon and of each hole, shapes (n, 2).
+        edges: What edges are called in messages, where it is not by their places in the loops.
     """
     a = np.concatenate(loops)
     sizes = np.array([len(loop) for loop in loops])
@@ -67,13 +165,17 @@ def check_loops(loops: Sequence[FloatArray]) -> None:
     ring = np.repeat(np.arange(len(loops)), sizes)
     after = starts + (local + 1) % np.repeat(sizes, sizes)
     b = a[after]
+    called = local if edges is None else np.concatenate(list(map(np.asarray, edges)))
+    before = np.argsort(after)
     near = 1e-12 * np.ptp(loops[0], axis=0).max()
 
     def vertex(i: int) -> str:
-        return f"vertex {local[i]}{_where(ring[i])} at {_point(a[i])}"
+        on_arc = called[before[i]] == called[i]
+        kind = "the point of edge" if on_arc else "vertex"
+        return f"{kind} {called[i]}{_where(ring[i])} at {_point(a[i])}"
 
     def edge(i: int) -> str:
-        return f"edge {local[i]}{_where(ring[i])}"
+        return f"edge {called[i]}{_where(ring[i])}"
 
     for i in range(len(a)):  # the polygon's own vertices: few
         same = np.flatnonzero(np.abs(a[i + 1 :] - a[i]).max(axis=1) <= near)

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from .files import disk_errors
+from .units import PLAIN, Units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,7 +66,7 @@ def as_png(figure: Figure | SubFigure) -> bytes:
 
 
 def plane_axes(
-    points: FloatArray, room: float = 0.0, ax: Axes | None = None
+    points: FloatArray, room: float = 0.0, ax: Axes | None = None, units: Units = PLAIN
 ) -> tuple[Figure | SubFigure, Axes, float]:
     """Axes of equal scale for what lies in the box of `points`.
 
@@ -75,6 +76,7 @@ def plane_axes(
         points: Shape (n, 2).
         room: Inches left free beside the axes.
         ax: Axes to take in the place of new ones.
+        units: What the axes are called and measured in.
 
     Returns:
         The figure, the axes and their width in inches.
@@ -93,7 +95,7 @@ def plane_axes(
     axes.set_xlim(low[0] - margins[0], high[0] + margins[0])
     axes.set_ylim(low[1] - margins[1], high[1] + margins[1])
     labels = (
-        f"${name}$" if factor == 1.0 else f"${name}$ (stretched)"
+        f"{units.name(name)}${name}${units.within('x')}{'' if factor == 1.0 else ' (stretched)'}"
         for name, factor in zip("xy", stretch, strict=True)
     )
     axes.set_xlabel(next(labels), fontsize=13)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ..arrays import FloatArray
 from ..errors import InputError
 from .canvas import BLUE, RED, draw_lines, legend, new_figure
+from .units import PLAIN, Units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,7 +24,11 @@ MOST_PARTS = 6
 
 
 def contact_page(
-    table: Table, transitions: FloatArray, size: float, ax: Axes | None = None
+    table: Table,
+    transitions: FloatArray,
+    size: float,
+    ax: Axes | None = None,
+    units: Units = PLAIN,
 ) -> Figure | SubFigure:
     """Draw all of Γ1, each connected part in a column of its own.
 
@@ -32,6 +37,7 @@ def contact_page(
         transitions: Points where contact begins or ends, shape (m, 2 or 3).
         size: The largest |u_h| anywhere: far smaller values are drawn as the zeros they are.
         ax: Axes in a grid, whose place the panels take.
+        units: What is told of u, lengths and the pressure.
     """
     parts, lengths = _parts(table)
     shares = np.maximum(lengths / lengths.max(), 0.2)
@@ -50,12 +56,14 @@ def contact_page(
         lines.append(course)
     number = len(np.unique(table["part"]))
     longest = f"its {MOST_PARTS} longest parts of {number}:\n" if number > MOST_PARTS else ""
-    along = f"arc length along $\\Gamma_1$, {longest}" + ",\n".join(lines)
+    along = f"arc length along $\\Gamma_1${units.within('x')}, {longest}" + ",\n".join(lines)
     # Not the rounding errors of a function that is zero
     _enlarge(panels[0, 0], np.concatenate([table["u"], *_bounds(table)]), size)
     _enlarge(panels[1, 0], table["pressure"], size / lengths.sum())
-    panels[0, 0].set_ylabel(r"$u_h$ and $\alpha$, facet means", fontsize=13)
-    panels[1, 0].set_ylabel(r"contact pressure $\lambda_h$", fontsize=13)
+    mean = rf"$u_h$ and $\alpha${units.within('u')}, facet means"
+    panels[0, 0].set_ylabel("\n".join(filter(None, [units.name("u").strip(), mean])), fontsize=13)
+    pressure = units.name("flux", "contact pressure") + rf"$\lambda_h${units.within('flux')}"
+    panels[1, 0].set_ylabel(pressure, fontsize=13)
     entries: dict[str, Any] = {}
     for axes in panels.ravel():
         handles, labels = axes.get_legend_handles_labels()

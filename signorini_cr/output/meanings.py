@@ -57,6 +57,8 @@ REPORT = {
     "versions.dolfinx": "DOLFINx's version.",
     "versions.petsc": "PETSc's version.",
     "versions.gmsh": "gmsh's version; null where it can't be told.",
+    "units": "Only where the file has [units]: what it says there.",
+    "names": "Only where the file has [names]: what it says there.",
     "complete": "Whether all that was asked for has been reached.",
     "force_bounds.lower": "The contact force ∫_Γ1 λ of u itself is not below it.",
     "force_bounds.upper": "The contact force of u itself is not above it.",
@@ -86,8 +88,8 @@ LEVEL = {
     "contact.force_bounds.lower": "∫_Γ1 λ is not below it.",
     "contact.force_bounds.upper": "∫_Γ1 λ is not above it.",
     "contact.force_bounds.reason": "Why the force has no bounds; null where it has.",
-    "quantities": "What [quantities] asks for, by name: `value`, that of u_h, `lower` and `upper`, "
-    "between which that of u is, and `reason` where these are null.",
+    "quantities": "What [quantities] asks for, by name: its `kind`, `value`, that of u_h, `lower` "
+    "and `upper`, between which that of u is, and `reason` where these are null.",
     "error_h1": "‖∇_h(u − u_h)‖; null where u is not known.",
     "error_l2": "‖u − u_h‖; null where u is not known.",
     "rate_h1": "Of error_h1, against the level before. The printed column rate.",

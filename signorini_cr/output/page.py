@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .tables import certified, legend, table_rows, times
+from .units import Units
 
 PICTURES = {
     "mesh.png": "The mesh and the parts of its boundary",
@@ -46,12 +47,13 @@ def run_page(
         fact: What happens on Γ1, as on the screen.
     """
     title, levels = escape(report["title"] or "Signorini problem"), report["levels"]
-    head, *rows = table_rows(levels)
+    units = Units.of(report)
+    head, *rows = table_rows(levels, units)
     table = "".join(
         "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
         for kind, row in [("th", head), *(("td", row) for row in rows)]
     )
-    certain = certified(levels[-1])
+    certain = certified(levels[-1], units)
     versions = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     launch = ["mpirun", "-n", str(report["ranks"])] if report["ranks"] > 1 else []
     pictures = "".join(
@@ -67,7 +69,7 @@ def run_page(
         f"<title>{title}</title><style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n"
         f"<pre>{escape(problem)}</pre>\n<p>{escape(fact)}</p>\n<p>{escape(certain)}</p>\n"
         f'{pictures}\n<h2>Levels</h2>\n<div class="wide"><table>{table}</table></div>\n'
-        f"<p>{escape(legend(levels[0]))}</p>\n<p>{escape(times(levels))}</p>\n"
+        f"<p>{escape(legend(levels[0], units))}</p>\n<p>{escape(times(levels))}</p>\n"
         f"<h2>Problem file</h2>\n<pre>{escape(source)}</pre>\n"
         f"<h2>To do it again</h2>\n<pre>{escape(shlex.join([*launch, 'signorini-cr', *words]))}"
         f"</pre>\n<p>{escape(versions)}</p>\n</body></html>\n"

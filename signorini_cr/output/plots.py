@@ -43,6 +43,8 @@ from .canvas import (
 )
 from .contactpage import contact_page
 from .raster import raster
+from .units import PLAIN
+from .units import Units as Units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,7 +93,11 @@ def can_draw(comm: MPI.Comm) -> bool:
 
 
 def plot_mesh(
-    domain: Domain, path: Where | None = None, title: str = "", ax: Axes | None = None
+    domain: Domain,
+    path: Where | None = None,
+    title: str = "",
+    ax: Axes | None = None,
+    units: Units = PLAIN,
 ) -> Figure | SubFigure | None:
     """Draw the mesh with Γ0, Γ1 and Γg, and its materials.
 
@@ -100,6 +106,7 @@ def plot_mesh(
         path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
         ax: Axes to draw on, on rank 0.
+        units: What u and the axes are called and measured in.
 
     Raises:
         InputError: The domain is not plane, or the file can't be written.
@@ -110,7 +117,8 @@ def plot_mesh(
     triangles = {name: _triangles(domain, name) for name in domain.materials.numbers}
 
     def draw() -> Figure | SubFigure:
-        figure, axes, _ = plane_axes(np.concatenate(list(parts.values())).reshape(-1, 2), ax=ax)
+        points = np.concatenate(list(parts.values())).reshape(-1, 2)
+        figure, axes, _ = plane_axes(points, ax=ax, units=units)
         for (name, cells_of), tint in zip(triangles.items(), itertools.cycle(TINTS)):
             if len(cells_of):
                 draw_cells(axes, cells_of, color=tint, label=name.replace("$", r"\$"))
@@ -129,7 +137,11 @@ def plot_mesh(
 
 
 def plot_solution(
-    solution: Solution, path: Where | None = None, title: str = "", ax: Axes | None = None
+    solution: Solution,
+    path: Where | None = None,
+    title: str = "",
+    ax: Axes | None = None,
+    units: Units = PLAIN,
 ) -> Figure | SubFigure | None:
     """Draw u_h as it is, jumps across the edges included, and where it is in contact.
 
@@ -138,6 +150,7 @@ def plot_solution(
         path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
         ax: Axes to draw on, on rank 0.
+        units: What u and the axes are called and measured in.
 
     Raises:
         InputError: The domain is not plane, or the file can't be written.
@@ -153,7 +166,7 @@ def plot_solution(
         from matplotlib.patheffects import Normal, Stroke
         from matplotlib.ticker import MaxNLocator
 
-        figure, axes, width = plane_axes(box, room=1.5, ax=ax)
+        figure, axes, width = plane_axes(box, room=1.5, ax=ax, units=units)
         shown = axes.imshow(
             image,
             extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
@@ -189,7 +202,10 @@ def plot_solution(
         bar.set_ticks(list(inner) if len(inner) else list(limits))
         for height in inner:
             bar.ax.axhline(height, color="white", linewidth=0.8, alpha=0.7)
-        bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
+        if (label := f"{units.name('u')}$u_h${units.within('u')}") == "$u_h$":
+            bar.set_label(label, fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
+        else:  # too long to stand upright
+            bar.set_label(label, fontsize=13)
         bar.ax.tick_params(labelsize=11)
         bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
         legend(figure, ncols=3, ax=ax)
@@ -201,7 +217,11 @@ def plot_solution(
 
 
 def plot_contact(
-    solution: Solution, path: Where | None = None, title: str = "", ax: Axes | None = None
+    solution: Solution,
+    path: Where | None = None,
+    title: str = "",
+    ax: Axes | None = None,
+    units: Units = PLAIN,
 ) -> Figure | SubFigure | None:
     """Draw u_h with the obstacle, and the pressure λ_h below it, along Γ1.
 
@@ -210,6 +230,7 @@ def plot_contact(
         path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
         ax: Axes in a grid, on rank 0, whose place the panels take.
+        units: What u, lengths and the pressure are called and measured in.
 
     Raises:
         InputError: The domain is not plane or has no Γ1, or the file can't be written.
@@ -222,7 +243,7 @@ def plot_contact(
 
     def draw() -> Figure | SubFigure:
         assert table is not None
-        figure = contact_page(table, contact.transitions, size, ax)
+        figure = contact_page(table, contact.transitions, size, ax, units)
         count = f"{grouped(contact.number_active)} of {grouped(contact.number)} facets in contact"
         figure.suptitle(headline(title, count), fontsize=14)
         save(figure, path)
@@ -241,6 +262,7 @@ def plot_convergence(
     path: Where | None = None,
     title: str = "",
     ax: Axes | None = None,
+    units: Units = PLAIN,
 ) -> Figure | SubFigure:
     """Draw errors, and the certified bound, with the slopes of an undisturbed convergence.
 
@@ -252,6 +274,7 @@ def plot_convergence(
         path: The PNG to write, if any, by this rank.
         title: What the picture is of, say the problem's name.
         ax: Axes to draw on.
+        units: What lengths are measured in.
 
     Raises:
         InputError: There is nothing to draw, or the file can't be written.
@@ -291,7 +314,8 @@ def plot_convergence(
     if uniform and len(sizes) <= 8:
         axes.set_xticks(sizes, [f"{h:.2g}" for h in sizes])
         axes.set_xticks([], minor=True)
-    axes.set_xlabel("$h$" if uniform else "number $N$ of degrees of freedom", fontsize=14)
+    size = f"$h${units.within('x')}"
+    axes.set_xlabel(size if uniform else "number $N$ of degrees of freedom", fontsize=14)
     axes.set_ylabel("error", fontsize=13)
     axes.tick_params(labelsize=11)
     axes.grid(which="both", alpha=0.25)

@@ -30,9 +30,11 @@ from ..estimate.force import NO_BOUNDS, flux, force_bounds
 from ..means import NO_MEAN, mean
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
+from .strip import Moment, plot_strip
 from .tables import contact_csv, levels_csv, markdown_table
 from .tables import table_header as table_header
 from .tables import table_row as table_row
+from .units import PLAIN, Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
@@ -54,6 +56,7 @@ FILES = (
     "report.html",
     "times.csv",
     "series.pvd",
+    "strip.png",
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 
@@ -111,7 +114,10 @@ def level_record(
                 "transitions": contact.transitions[:, :gdim],
                 "force_bounds": _bounded(solution, None),
             },
-            "quantities": {name: _bounded(solution, what) for name, what in quantities.items()},
+            "quantities": {
+                name: {"kind": what[0], **_bounded(solution, what)}
+                for name, what in quantities.items()
+            },
             "error_h1": h1,
             "error_l2": l2,
             "rate_h1": _rate("error_h1", h1, solution, previous),
@@ -150,6 +156,7 @@ def make_report(
     comm: MPI.Comm,
     records: Sequence[Record],
     complete: bool = True,
+    units: Units = PLAIN,
 ) -> Record:
     """The whole of report.json from the records of its levels.
 
@@ -159,6 +166,7 @@ def make_report(
         comm: The ranks that solved it.
         records: From `level_record`, coarsest level first.
         complete: Whether these are all the levels that were asked for.
+        units: What is told of u, lengths and the rest; also for tables and pictures.
     """
     versions = {
         "signorini_cr": __version__,
@@ -171,6 +179,7 @@ def make_report(
         "element": element,
         "ranks": comm.size,
         "versions": versions,
+        **units.record(),
         "complete": complete,
         "force_bounds": records[-1]["contact"]["force_bounds"],
         "levels": list(records),
@@ -230,7 +239,7 @@ def write_output(
     solution: Solution,
     pictures: bool = True,
     resumable: bool = False,
-    steps: bool = False,
+    moments: Sequence[Moment] = (),
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
 
@@ -243,7 +252,7 @@ def write_output(
         pictures: Whether to draw. There are none of three-dimensional domains, and none where
             Matplotlib is not installed.
         resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
-        steps: Whether what `series.write_step` has left is of this one.
+        moments: Of a run in time, for the strip; what `series.write_step` has left is of this one.
 
     Returns:
         The names of the files written.
@@ -252,19 +261,29 @@ def write_output(
         InputError: The folder can't be written to.
     """
     comm, title, records = solution.domain.mesh.comm, report["title"], report["levels"]
-    writers = _texts(report, solution)
+    units, writers = Units.of(report), _texts(report, solution)
     writers["solution.vtu"] = lambda path: write_solution(solution, path)
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
     if drawable and plots.can_draw(comm):
-        writers["mesh.png"] = lambda path: plots.plot_mesh(*_clear_mesh(solution, path, title))
-        writers["solution.png"] = lambda path: plots.plot_solution(solution, path, title)
+        writers["mesh.png"] = lambda path: plots.plot_mesh(
+            *_clear_mesh(solution, path, title), units=units
+        )
+        writers["solution.png"] = lambda path: plots.plot_solution(
+            solution, path, title, units=units
+        )
         if solution.contact.number:
-            writers["contact.png"] = lambda path: plots.plot_contact(solution, path, title)
+            writers["contact.png"] = lambda path: plots.plot_contact(
+                solution, path, title, units=units
+            )
         if plots.convergence_series(records):
             writers["convergence.png"] = lambda path: plots.drawn(
-                comm, lambda: plots.plot_convergence(records, path, title)
+                comm, lambda: plots.plot_convergence(records, path, title, units=units)
             )
-    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if steps else set()
+        if moments:
+            writers["strip.png"] = lambda path: plots.drawn(
+                comm, lambda: plot_strip(moments, path, title)
+            )
+    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if moments else set()
     removed = set(FILES) - kept
     write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)
@@ -291,7 +310,7 @@ def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
     return {
         "report.json": text(lambda: report_json(report)),
         "levels.csv": text(lambda: levels_csv(records)),
-        "levels.md": text(lambda: markdown_table(records)),
+        "levels.md": text(lambda: markdown_table(records, Units.of(report))),
         "contact.csv": text(lambda: contact_csv(table or {})),
     }
 

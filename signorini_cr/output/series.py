@@ -10,6 +10,7 @@ from ..errors import on_root
 from .files import Writer, write_files, write_text
 from .report import FILES, plain
 from .tables import levels_csv
+from .units import Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
@@ -65,6 +66,13 @@ def row(record: Mapping[str, Any]) -> str:
         "none" if bound is None else f"{bound:.3g}",
     )
     return " ".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS.values(), strict=True))
+
+
+def legend(units: Units) -> str:
+    """What the printed columns are measured in, as far as that is told."""
+    columns = {"time": "time", "contact": "x", "force": "force"}
+    measured = {name: units.after(key) for name, key in columns.items()}
+    return ", ".join(f"{name} in{unit}" for name, unit in measured.items() if unit)
 
 
 def write_step(folder: Path, records: Sequence[Mapping[str, Any]], solution: Solution) -> None:

@@ -14,8 +14,12 @@ from typing import Any
 import numpy.typing as npt
 
 from .meanings import PRINTED
+from .units import PLAIN, Units
 
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
+
+MEASURED = {"h": "x", "contact": "x"}
+"""The printed columns whose unit may be told."""
 
 
 def table_header(first: Mapping[str, Any]) -> str:
@@ -23,17 +27,21 @@ def table_header(first: Mapping[str, Any]) -> str:
     return " ".join(f"{name:>{width}}" for name, width, _ in _columns(first))
 
 
-def legend(first: Mapping[str, Any]) -> str:
-    """What the printed columns mean."""
+def legend(first: Mapping[str, Any], units: Units = PLAIN) -> str:
+    """What the printed columns mean, and what they are measured in."""
     words = {name: PRINTED[name][0] for name, *_ in _columns(first)}
+    for name in MEASURED.keys() & words:
+        if unit := units.after(MEASURED[name]):
+            words[name] += f", in{unit}"
     return "; ".join(f"{name}: {short}" for name, short in words.items() if short)
 
 
-def certified(record: Mapping[str, Any]) -> str:
+def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     """What is certain about a level, rounded so that it stays certain.
 
     Args:
         record: The last level's.
+        units: What forces and u are measured in.
     """
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
@@ -44,22 +52,23 @@ def certified(record: Mapping[str, Any]) -> str:
     wanted = {"the contact force": record["contact"]["force_bounds"], **record["quantities"]}
     for name, found in wanted.items():
         if found["reason"] is None:
-            facts.append(f"{name} is in {_interval(found['lower'], found['upper'])}")
+            unit = units.after("u" if found.get("kind") == "mean" else "force")
+            facts.append(f"{name} is in {_interval(found['lower'], found['upper'], unit)}")
         else:
             facts.append(f"{name} has no bounds: {found['reason']}")
     return "; ".join(facts)
 
 
-def _interval(lower: float, upper: float) -> str:
-    """An interval that holds [lower, upper], with two digits of its width."""
+def _interval(lower: float, upper: float, measured: str = "") -> str:
+    """An interval that holds [lower, upper], with two digits of its width, and its unit."""
     width, size = upper - lower, max(abs(lower), abs(upper))
     if not (0.0 < width < math.inf):
-        return f"[{lower!r}, {upper!r}]"
+        return f"[{lower!r}, {upper!r}]{measured}"
     unit = 10.0 ** (math.floor(math.log10(max(width, 1e-15 * size))) - 1)
     digits = max(math.ceil(math.log10(size / unit)), 1) + 1
     low, high = math.floor(lower / unit) * unit, math.ceil(upper / unit) * unit
     share = f"{_rounded_up(100 * width / size, 2):.2g} % wide"
-    return f"[{low:.{digits}g}, {high:.{digits}g}], {share}"
+    return f"[{low:.{digits}g}, {high:.{digits}g}]{measured}, {share}"
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:
@@ -86,10 +95,10 @@ def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None)
     return " ".join(f"{cell(record):>{width}}" for _, width, cell in _columns(first or record))
 
 
-def markdown_table(records: Sequence[Mapping[str, Any]]) -> str:
-    """The printed table in Markdown."""
+def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> str:
+    """The printed table in Markdown, units in its head."""
     columns = _columns(records[0]) if records else []
-    rows = [[name for name, _, _ in columns], [(w - 1) * "-" + ":" for _, w, _ in columns]]
+    rows = [_heads(columns, units), [(w - 1) * "-" + ":" for _, w, _ in columns]]
     rows += [[cell(record) for _, _, cell in columns] for record in records]
     lines = (
         " | ".join(f"{text:>{width}}" for text, (_, width, _) in zip(row, columns, strict=True))
@@ -98,13 +107,19 @@ def markdown_table(records: Sequence[Mapping[str, Any]]) -> str:
     return "".join(f"| {line} |\n" for line in lines)
 
 
-def table_rows(records: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """The cells of the printed table, its head first."""
+def table_rows(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> list[list[str]]:
+    """The cells of the printed table, its head first, which has the units."""
     columns = _columns(records[0])
     return [
-        [name for name, _, _ in columns],
+        _heads(columns, units),
         *([cell(record) for _, _, cell in columns] for record in records),
     ]
+
+
+def _heads(columns: Sequence[Column], units: Units) -> list[str]:
+    measured = {name: units.after(key) for name, key in MEASURED.items()}
+    return [f"{name}, {unit}" if (unit := measured.get(name, "").strip()) else name
+            for name, _, _ in columns]  # fmt: skip
 
 
 def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:

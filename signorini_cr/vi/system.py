@@ -82,18 +82,10 @@ class System:
         """
         self._data, V = data, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
-        on_dirichlet, self.u_D = _imposed(data.fixed, V)
-        floors, ceilings = ([b for b in data.bounds if b.sign == sign] for sign in (1, -1))
-        has_floor, floor = _imposed(floors, V)
-        has_ceiling, ceiling = _imposed(ceilings, V)
-        self._read_contact(data.bounds)
-        # Where the two parts meet in a P1 vertex the Dirichlet value holds
-        bounded = (has_floor | has_ceiling) & ~on_dirichlet
-        self.lower = np.where(has_floor & bounded, floor.x.array, PETSc.NINFINITY)
-        self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
-        self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
-        self.bounded = np.flatnonzero(bounded[: layout.size[0]]).astype(np.int32)
-        self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
+        if like is not None and data.fixed is like._data.fixed and data.bounds is like._data.bounds:
+            self._take_boundary(like)
+        else:
+            self._read_boundary(layout.size[0])
         bc, a = self._bc(self.u_D), data.a
         if like is None:
             self.A = _assembled(a, bc, layout)
@@ -109,14 +101,40 @@ class System:
             layout.shared_sum(vector.x.array)
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
-        self.residual_scale = self._scale(bounded)
+        self.residual_scale = self._scale()
 
-    def _scale(self, bounded: BoolArray) -> float:
-        """Measure the trivial start's residual.
+    def _read_boundary(self, owned: int) -> None:
+        """Take values and bounds from the data; collective.
 
         Args:
-            bounded: Whether the dofs have a bound, for all local ones.
+            owned: Number of owned dofs.
         """
+        data, V = self._data, self._data.V
+        on_dirichlet, self.u_D = _imposed(data.fixed, V)
+        floors, ceilings = ([b for b in data.bounds if b.sign == sign] for sign in (1, -1))
+        has_floor, floor = _imposed(floors, V)
+        has_ceiling, ceiling = _imposed(ceilings, V)
+        self._read_contact(data.bounds)
+        # Where the two parts meet in a P1 vertex the Dirichlet value holds
+        bounded = (has_floor | has_ceiling) & ~on_dirichlet
+        self.lower = np.where(has_floor & bounded, floor.x.array, PETSc.NINFINITY)
+        self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
+        self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
+        self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
+        self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
+
+    def _take_boundary(self, like: System) -> None:
+        """Take values and bounds from a system of the same data."""
+        self.u_D, self.dirichlet = like.u_D, like.dirichlet
+        self.lower, self.upper = like.lower, like.upper
+        self.bounded, self.bounds = like.bounded, like.bounds
+        self.bounded_facets: Int32Array = like.bounded_facets
+        self.contact_dofs: Int32Array = like.contact_dofs
+        self.obstacles_at_vertices: FloatArray = like.obstacles_at_vertices
+
+    def _scale(self) -> float:
+        """Measure the trivial start's residual; collective."""
+        bounded = (self.lower > PETSc.NINFINITY) | (self.upper < PETSc.INFINITY)
         comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
         top = comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
         bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)

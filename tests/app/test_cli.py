@@ -103,6 +103,13 @@ BAD: dict[str, tuple[str, list[str]]] = {
         with_("levels = 2", "levels = 99"),
         ["refine.levels (or --levels): 99", "at most 13"],
     ),
+    "unit of what is none": (CASE + '[units]\ny = "m"', ["units.y: there is no such key; it belo"]),
+    "unit that is a number": (CASE + "[units]\nx = 3", ["units.x: a string is needed, found 3"]),
+    "unit of two lines": (
+        CASE + '[units]\nx = "m\\nm"',
+        ["units.x: 1 to 40 characters on one line are needed"],
+    ),
+    "empty name": (CASE + '[names]\nu = " "', ["names.u: 1 to 40 characters on one line"]),
     "tolerance negative": (
         with_("tolerance = 0", "tolerance = -1e-3"),
         ["refine.tolerance: 0 or more is needed, found -0.001"],
@@ -268,6 +275,46 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["domain.boundary:", "'dirichlet'"],
     ),
     "no contact": (with_('"contact"', '"neumann"'), ["domain.boundary:", "'contact'"]),
+    "arc without a point": (
+        with_("size", "arcs = [{ edge = 2 }]\nsize"),
+        ["domain.arcs[0]: { edge = i, through = [x, y] } is needed, found a table"],
+    ),
+    "arc of no edge": (
+        with_("size", "arcs = [{ edge = 7, through = [0, 3] }]\nsize"),
+        ["domain.arcs: there is no edge 7: they are 0 to 3"],
+    ),
+    "arc of an edge twice": (
+        with_("size", f"arcs = [{', '.join(2 * ['{ edge = 2, through = [0, 3] }'])}]\nsize"),
+        ["domain.arcs[1].edge: the number of an edge, from 0, that is no arc yet", "found 2"],
+    ),
+    "arc through half a point": (
+        with_("size", "arcs = [{ edge = 2, through = [0] }]\nsize"),
+        ["domain.arcs[0].through: a point [x, y] is needed, found a list of 1"],
+    ),
+    "straight arc": (
+        with_("size", "arcs = [{ edge = 2, through = [0, 1] }]\nsize"),
+        ["domain.arcs: the arc of edge 2: no circle passes through (1, 1), (0, 1) and (-1, 1)"],
+    ),
+    "arc across an edge": (
+        with_("size", "arcs = [{ edge = 2, through = [0, -0.1] }]\nsize"),
+        ["domain.vertices: edge 0 crosses edge 2; the polygon must be simple"],
+    ),
+    "round hole with corners": (
+        with_("size", 'holes = [{ center = [0, 0.5], vertices = [], boundary = "neumann" }]\nsize'),
+        ["domain.holes[0].vertices: there is no such key; allowed are center, radius, boundary"],
+    ),
+    "round hole without a radius": (
+        with_("size", 'holes = [{ center = [0, 0.5], boundary = "neumann" }]\nsize'),
+        ["domain.holes[0].radius: this key is missing"],
+    ),
+    "round hole of many parts": (
+        with_("size", f"holes = [{{ center = [0, 1], radius = 1, boundary = {NEUMANN} }}]\nsize"),
+        ["domain.holes[0].boundary: a string is needed, found a list of 3"],
+    ),
+    "round hole too large": (
+        with_("size", 'holes = [{ center = [0, 1], radius = 1, boundary = "neumann" }]\nsize'),
+        ["domain.holes: ", " hole 0", "holes must lie inside"],
+    ),
     "hole outside": (with_("size", HOLE + "\nsize"), ["domain.holes:", "hole 0", "outside"]),
     "hole of two": (
         with_("size", FLAT_HOLE + "\nsize"),
@@ -592,17 +639,29 @@ def test_check(write) -> None:
 
 
 def test_the_deck(shared_tmp_path: Path) -> None:
-    """Four parts with names of their own, through the command."""
+    """Two materials, two ducts: heat is needed, but not above them."""
     out = shared_tmp_path / "out"
     status, text, err = run("solve", helpers.MESHES / "deck.toml", "--out", out, "--levels", "2")
     assert (status, err) == (0, "")
     if COMM.rank > 0:
         return
-    assert "surface    u ≥ 0, κ∂ₙu + 20 (u − (-10)) ≥ 0" in text
+    assert "surface    u ≥ 0, κ∂ₙu + 20 (u − (-5)) ≥ 0" in text
     level = json.loads((out / "report.json").read_text())["levels"][-1]
-    assert level["bound_h1"] is not None and level["contact"]["active"] == 80
-    # u = 0 on the deck: 20 · 10 · 4 is lost there
-    assert 0 < level["contact"]["force"] < 800
+    assert level["bound_h1"] is not None
+    a, b, c, d = sorted(x for x, _ in level["contact"]["transitions"])
+    assert [(a + b) / 2, (c + d) / 2] == pytest.approx([0.9, 2.6], abs=0.06)
+    # without the ducts u = 0 on the deck, and what is lost goes through layers one after the other
+    without = 4 * (20 * 5 + 5 / (1 / 8 + 0.24 / 1.6 + 0.06 / 0.75))
+    heat = level["quantities"]["heat"]
+    assert 0 < heat["lower"] < heat["value"] < min(heat["upper"], without)
+    force, length = level["contact"]["force"], level["contact"]["length"]
+    said = " ".join(text.split())
+    assert f"length {length:.6g} m, force {force:.6g} W/m" in said and "] W/m, " in said
+    assert "h: largest diameter of a cell, in m;" in said
+    assert " h, m |" in (out / "levels.md").read_text().split("\n")[0]
+    report = json.loads((out / "report.json").read_text())
+    assert report["units"] == {"x": "m", "u": "°C", "flux": "W/m²", "force": "W/m"}
+    assert report["names"] == {"u": "temperature", "flux": "heat"}
 
 
 def test_data_need_to_make_sense_only_where_they_are_used(write) -> None:

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from helpers import is_picture
 from mpi4py import MPI
 
 from signorini_cr.app.cli import main
@@ -109,6 +110,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
     assert [float(t) for t, _ in named] == pytest.approx(np.arange(1, 7) * 0.25)
     assert sorted(path.name for path in out.glob("step_*.vtu")) == [name for _, name in named]
     assert not (out / "convergence.png").exists() and (out / "mine.txt").exists()
+    assert is_picture(out / "strip.png")
     (level,) = report["levels"]
     assert level["contact"]["force"] == report["times"][-1]["force"]
     for found in level["quantities"].values():

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
+from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.mesh import (
     compute_midpoints,
     create_unit_square,
@@ -29,6 +31,7 @@ from signorini_cr import (
 )
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.conditions import Condition
+from signorini_cr.fem.problem import Forms
 from signorini_cr.fem.space import ghosted_vector
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
@@ -231,3 +234,25 @@ def test_boundary_data_are_sampled_once_a_mesh(monkeypatch):
         assert solution.certificate.bound_h1 is not None
         assert len(seen) == len(set(seen)) > 1
         seen.clear()
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_one_form_is_compiled_for_all_numbers(element):
+    """The bilinear form of other numbers is the same library, and each matrix has its own."""
+    edges = ["floor", "right", "top", "left"]
+    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=edges).mesh(0.5)
+    walls = {name: Dirichlet(0.0) for name in edges[:-1]}
+    walls["floor"] = Contact(0.0)
+    found, norms = set(), []
+    for factor in (1.0, 3.0):
+        conditions = walls | {"left": Robin(0.0, coefficient=0.7 * factor)}
+        problem = Problem(coefficient=1.1 * factor, reaction=0.3 * factor, conditions=conditions)
+        forms = Forms(problem, domain.mesh, element, domain.parts)
+        found.add(forms.a._compiled.module.__name__)
+        V = fem.functionspace(domain.mesh, (element if element == "CR" else "P", 1))
+        matrix = assemble_matrix(forms.a.on(domain, [V, V]))
+        matrix.assemble()
+        norms.append(matrix.norm())
+        matrix.destroy()
+    assert len(found) == 1
+    assert norms[1] == pytest.approx(3.0 * norms[0], rel=1e-12)

@@ -112,6 +112,60 @@ def test_every_exterior_facet_has_one_part():
     assert domain.mesh.topology.index_map(2).num_ghosts == 0
 
 
+@pytest.mark.parametrize("size", [0.25, 2.0])
+@pytest.mark.parametrize("turn", [1, -1])
+def test_arcs_are_cut_into_equal_facets(size: float, turn: int):
+    """A half disk in n facets has the area (n/2) sin(π/n); they stay as near as is promised."""
+    ends = [[-1, 0], [1, 0]][::turn]
+    polygon = Polygon.with_arcs(ends, ["contact", "dirichlet"], {1: [0, 1]}, size)
+    n = len(polygon.vertices) - 1
+    assert n == (13 if size == 0.25 else 12)
+    assert polygon.boundary == ("contact", *["dirichlet"] * n)
+    assert polygon.vertices[:2].tolist() == ends
+    facet, far = 2 * np.sin(np.pi / 2 / n), 1 - np.cos(np.pi / 2 / n)
+    assert facet <= size and far <= facet / 30 and far <= 0.01
+    domain = polygon.mesh(size)
+    assert area(domain) == pytest.approx(n / 2 * np.sin(np.pi / n), rel=1e-12)
+    assert lengths(domain) == pytest.approx([2, n * facet, 0], rel=1e-12)
+
+
+def test_an_arc_may_be_more_than_half_a_circle_and_hollow():
+    """The unit disk without its part above y = 0.6, and that part as a bay of a rectangle."""
+    ends, labels = [[-0.8, 0.6], [0.8, 0.6]], ["contact", "dirichlet"]
+    disk = Polygon.with_arcs(ends, labels, {1: [0, -1]}, 0.01)
+    area = np.pi - np.arccos(0.6) + 0.6 * 0.8
+    x, y = disk.vertices.T
+    assert 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) == pytest.approx(area, 1e-4)
+    assert np.hypot(x, y) == pytest.approx(1, abs=1e-14)
+    bay = Polygon.with_arcs([*ends, [0.8, 2], [-0.8, 2]], LABELS, {0: [0, 1]}, 0.1)
+    assert bay.vertices[:, 1].max() == 2 and np.hypot(*bay.vertices[1:-3].T) == pytest.approx(1)
+
+
+def test_a_round_hole():
+    hole = Polygon.circle([0.3, 0.5], 0.2, "neumann", 0.5)
+    domain = Polygon(RECTANGLE, LABELS, holes=(hole,)).mesh(0.5)
+    assert area(domain) == pytest.approx(2 - 12 * 0.04 * np.sin(np.pi / 12), rel=1e-12)
+    assert lengths(domain)[2] == pytest.approx(2 + 48 * 0.2 * np.sin(np.pi / 24), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "arcs, size, message",
+    [
+        ({2: [0, 1]}, 0.5, r"arc of edge 2: no circle passes through \(1, 1\), \(0, 1\) and"),
+        ({2: [1, 1]}, 0.5, "arc of edge 2: no circle"),
+        ({4: [0, 2]}, 0.5, "there is no edge 4: they are 0 to 3"),
+        ({2: [0, -0.1]}, 0.5, "edge 0 crosses edge 2$"),
+        ({2: [0, 0.5], 0: [0, 0.5]}, 2.0, "the point of edge 0 at .* same point as the point of"),
+        ({2: [0, 2]}, 1e-5, "at the size 1e-05 it has more than 2000 facets"),
+        ({2: [0, np.inf]}, 0.5, "arc of edge 2: a point"),
+        ({2: [0, 2]}, 0.0, "size is 0.0: a positive number"),
+    ],
+)
+def test_bad_arcs(arcs, size, message):
+    with pytest.raises(InputError, match=message):
+        Polygon.with_arcs(RECTANGLE, LABELS, arcs, size)
+
+
 def test_holes_are_cut_out():
     hole = Polygon(SQUARE, ["neumann", "contact", "neumann", "neumann"])
     domain = Polygon(RECTANGLE, LABELS, (hole,)).mesh(0.2)

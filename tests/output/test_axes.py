@@ -71,6 +71,25 @@ def test_axes_show_what_the_solution_says(solution):
     assert [[len(line) for line in part] for part in parts] == [[33], [17]]
 
 
+def test_names_and_units_stand_beside_the_axes(solution):
+    names = {"x": "distance", "u": "price", "flux": "heat"}
+    units = plots.Units(x="km", u="$", flux="W/m²", names=names)
+    figures = [plot(solution, units=units) for plot in (plots.plot_solution, plots.plot_contact)]
+    if WORLD.rank > 0:
+        return
+    (plane,) = figures[0].axes
+    (bar,) = plane.child_axes
+    assert plane.get_xlabel() == "distance $x$ in km" and plane.get_ylabel() == "$y$ in km"
+    assert bar.get_ylabel() == r"price $u_h$ in \$"
+    upper, lower = figures[1].axes
+    assert upper.get_ylabel().startswith("price\n$u_h$ and") and r"in \$," in upper.get_ylabel()
+    assert lower.get_ylabel() == r"heat $\lambda_h$ in W/m²"
+    assert "$\\Gamma_1$ in km, from" in figures[1].legends[0].get_title().get_text()
+    for figure in figures:
+        assert figure._repr_png_()
+    assert plots.plot_convergence(records(), units=units).axes[0].get_xlabel() == "$h$ in km"
+
+
 def test_contact_takes_the_place_of_axes(solution):
     figure, axes = grid(2, 2) if WORLD.rank == 0 else (None, np.full((2, 2), None))
     plots.plot_contact(solution, ax=axes[0, 1])

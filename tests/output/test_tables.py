@@ -4,7 +4,9 @@ import re
 
 import pytest
 
-from signorini_cr.output.tables import certified, legend, table_header, times
+from signorini_cr.output import series
+from signorini_cr.output.tables import certified, legend, markdown_table, table_header, times
+from signorini_cr.output.units import Units
 
 RECORD = {
     "level": 0, "cells": 8, "dofs": 16, "h": 0.5, "newton_iterations": 1, "linear_iterations": 3,
@@ -58,6 +60,20 @@ def test_no_force_but_a_reason():
 def test_every_printed_column_has_its_word():
     told = {entry.split(":")[0] for entry in legend(RECORD).split("; ")}
     assert set(table_header(RECORD).split()) - {"level", "cells"} == told
+
+
+def test_units_stand_where_their_figures_are():
+    units = Units(x="mm", force="N/mm")
+    bounds = {"lower": 0.9, "upper": 1.1, "reason": None}
+    record = RECORD | {"contact": {"active": 2, "length": 1.0, "force_bounds": bounds}}
+    plain, told = certified(record), certified(record, units)
+    assert told == plain.replace("1.1],", "1.1] N/mm,") != plain
+    entries = dict(entry.split(": ") for entry in legend(record, units).split("; "))
+    assert {name for name in entries if entries[name].endswith(", in mm")} == {"h", "contact"}
+    heads = [head.strip() for head in markdown_table([record], units).split("\n")[0].split("|")]
+    assert {"h, mm", "contact, mm"} < set(heads)
+    assert series.legend(Units(time="h", x="m")) == "time in h, contact in m"
+    assert Units.of({**units.record()}) == units and Units().record() == {}
 
 
 def test_times_add_up():

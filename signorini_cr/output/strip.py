@@ -1,0 +1,130 @@
+"""The picture strip of a run in time: u_h at some moments, in one scale of colours."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import InputError
+from ..fem.space import facet_measures
+from .canvas import RED, chains, draw_lines, headline, legend, new_figure, plane_axes, save
+from .raster import raster
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..solution import Solution
+
+MOST = 6
+"""Moments in a strip."""
+
+PIXELS = 600
+"""Along the longer side of the domain."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a strip shows of one step.
+
+    Attributes:
+        time: Its end.
+        image: u_h on rank 0, from `raster`.
+        box: Lowest and highest corner of the domain, shape (2, 2).
+        limits: The least and the greatest value of u_h.
+        boundary: Ends of all boundary facets on rank 0, shape (n, 2, 2); none on the others.
+        touching: Of those in contact.
+        free: Of those of Γ1 that are not.
+    """
+
+    time: float
+    image: FloatArray
+    box: FloatArray
+    limits: tuple[float, float]
+    boundary: FloatArray
+    touching: FloatArray
+    free: FloatArray
+
+
+def chosen(steps: int) -> set[int]:
+    """The steps of so many that a strip shows, evenly apart, first and last among them."""
+    return set(np.rint(np.linspace(1, steps, min(MOST, steps))).astype(int).tolist())
+
+
+def moment(time: float, solution: Solution) -> Moment:
+    """Keep what a strip shows of a step on a plane domain; collective."""
+    domain, contact = solution.domain, solution.contact
+    ends = [facet_measures(domain.mesh, domain.facets(i))[0] for i in domain.parts.values()]
+    lines = (
+        np.concatenate(ends),
+        contact.vertices[contact.active],
+        contact.vertices[~contact.active],
+    )
+    pieces = domain.mesh.comm.gather([each[..., :2] for each in lines], root=0)
+    if pieces is None:
+        gathered = [np.zeros((0, 2, 2)) for _ in lines]
+    else:
+        gathered = [np.concatenate(each) for each in zip(*pieces, strict=True)]
+    return Moment(time, *raster(solution.u, PIXELS), *gathered)
+
+
+def plot_strip(
+    moments: Sequence[Moment], path: str | os.PathLike[str] | None = None, title: str = ""
+) -> Figure:
+    """Draw u_h at some moments, and where it is in contact then.
+
+    To be called on rank 0 alone; domains that are wide are drawn below one another.
+
+    Args:
+        moments: One at least, of one domain, from `moment`.
+        path: The PNG to write, if any.
+        title: What the picture is of, say the problem's name.
+
+    Raises:
+        InputError: There are no moments, or the file can't be written.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patheffects import Normal, Stroke
+
+    if not moments:
+        raise InputError("a strip of pictures needs one moment at least")
+    box = moments[0].box
+    wide = np.divide(*(box[1] - box[0]))
+    columns = min(len(moments), 1 if wide > 2.5 else 2 if wide > 1.4 else 3)
+    rows = -(-len(moments) // columns)
+    width = 9.0 if columns == 1 else 11.0 / columns
+    figure = new_figure(width * columns + 1.3, rows * (max((width - 1.0) / wide, 0.9) + 0.75) + 1.2)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    marks: dict[str, Line2D] = {}
+    low, high = (pick(each.limits[i] for each in moments) for i, pick in enumerate((min, max)))
+    for each, axes in zip(moments, panels.flat, strict=False):
+        plane_axes(box, ax=axes)
+        axes.label_outer()
+        shown = axes.imshow(
+            each.image,
+            extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
+            origin="lower",
+            aspect=1.0 if axes.get_aspect() == 1.0 else "auto",  # stretched, it may fill its place
+            vmin=low,
+            vmax=high,
+        )
+        draw_lines(axes, chains(each.boundary), color="black", linewidth=1.0, joinstyle="round")
+        for lines, color in ((each.free, "white"), (each.touching, RED)):
+            outlined = [Stroke(linewidth=4.5, foreground="black"), Normal()]
+            style: dict[str, Any] = {"color": color, "linewidth": 3.0, "path_effects": outlined}
+            draw_lines(axes, chains(lines), zorder=3, **style)
+            marks["contact" if color == RED else "no contact"] = Line2D([], [], **style)
+        axes.set_title(f"$t$ = {each.time:.4g}", fontsize=12)
+    for axes in panels.flat[len(moments) :]:
+        axes.remove()
+    bar = figure.colorbar(shown, ax=panels, aspect=30)
+    bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
+    bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+    legend(figure, list(marks.values()), list(marks), ncols=2)
+    figure.suptitle(headline(title, "$u_h$ in time"), fontsize=14)
+    save(figure, path)
+    return figure

@@ -1,0 +1,61 @@
+"""What u, the axes and the rest are called and measured in, for pictures, tables and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Units:
+    """Names and units; what is left out is not told. Nothing is converted.
+
+    Attributes:
+        x: The unit of lengths.
+        u: The unit of u.
+        time: The unit of times.
+        flux: The unit of κ∂ₙu and of the contact pressure.
+        force: The unit of their integrals over parts of the boundary.
+        names: What x, y, u and flux are called, "temperature" for u, say.
+    """
+
+    x: str = ""
+    u: str = ""
+    time: str = ""
+    flux: str = ""
+    force: str = ""
+    names: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> Units:
+        """Those of a report, from `record`."""
+        return cls(**report.get("units", {}), names=report.get("names", {}))
+
+    def record(self) -> dict[str, dict[str, str]]:
+        """Everything that is told, as it stands in report.json; empty if there is nothing."""
+        units = {
+            each.name: getattr(self, each.name)
+            for each in fields(self)
+            if each.name != "names" and getattr(self, each.name)
+        }
+        told = {"units": units, "names": dict(self.names)}
+        return {key: words for key, words in told.items() if words}
+
+    def after(self, key: str) -> str:
+        """The unit as it follows a number, with a space before it."""
+        unit = getattr(self, key)
+        return f" {unit}" if unit else ""
+
+    def within(self, key: str) -> str:
+        """The unit as it follows a name in a picture, " in m" for one."""
+        return " in" + self.after(key).replace("$", r"\$") if self.after(key) else ""
+
+    def name(self, key: str, usual: str = "") -> str:
+        """The name as it precedes a symbol in a picture, with a space behind it."""
+        name = self.names.get(key, usual).replace("$", r"\$")
+        return f"{name} " if name else ""
+
+
+PLAIN = Units()
+"""Neither names nor units."""
