@@ -445,6 +445,6 @@ def terms(seed: int, quick: bool) -> Group:
             told(_drawn(seed, 4 if quick else 500)),
             told(_smooth(1 if quick else 4)),
             told(_fluxes(seed, 2 if quick else 100)),
-            told(_means(seed, 2 if quick else 100)),
+            told(_means(seed, 1 if quick else 50)),
         ],
     )
