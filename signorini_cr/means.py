@@ -35,8 +35,8 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     """Bound the mean of u; collective.
 
     It is that of the companion, corrected by what a linear problem with the mean for its load says
-    of the difference, up to products of two errors and to what Γ1 leaves unknown. That costs about
-    as much as the solve.
+    of the difference, up to products of two errors and to what Γ1 leaves unknown. That takes
+    up to twice as long as mesh and solve have taken.
 
     Args:
         solution: One with a certified bound.

@@ -79,7 +79,7 @@ def level_record(
         previous: The record of the level before, for the rates.
         quantities: The kind, "force", "flux" or "mean", and the part of the boundary or material,
             None for all of the domain, of what is wanted in an interval, by name. Each takes about
-            as long as a linear solve.
+            as long as the solve, or twice as long for a mean.
 
     Returns:
         Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
