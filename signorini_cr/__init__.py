@@ -66,6 +66,7 @@ _MODULES = {
     "plots": "output.plots",
     "notebook": "output.notebook",
     "force": "estimate.force",
+    "means": "means",
 }
 __all__ = [  # noqa: RUF022, in the order in which one meets them
     "Domain",

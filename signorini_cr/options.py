@@ -85,6 +85,9 @@ COMPANION: dict[str, object] = {
 WEIGHT: dict[str, object] = {"ksp_type": PETSc.KSP.Type.CG, "ksp_rtol": 1e-3, "pc_type": AMG}
 """The harmonic weight of the contact force's bounds."""
 
+MEAN: dict[str, object] = {**WEIGHT, "ksp_rtol": 1e-8}
+"""The linear problem that bounds a mean."""
+
 LARGE_FACTORS: dict[str, object] = {
     "pc_factor_mat_solver_type": "mumps",
     # minimum degree takes least time for matrices of plane meshes, on two ranks as well

@@ -16,7 +16,7 @@ FLOORS = (
     ("multigrid",),
     ("vi",),
     ("estimate",),
-    ("solution", "diffusion", "limits", "restart", "levels", "adaptive", "evolution"),
+    ("solution", "diffusion", "limits", "restart", "levels", "means", "adaptive", "evolution"),
     ("verification",),
     ("output",),
     ("app",),

@@ -32,6 +32,7 @@ from signorini_cr import (
     Solution,
     families,
     force,
+    means,
     solve_adaptive,
     solve_levels,
 )
@@ -381,6 +382,41 @@ def _fluxes(seed: int, number: int) -> Row:
     )
 
 
+def exact_mean(case: Case, i: int | None) -> float:
+    """The mean of u over an edge, or over the square."""
+    t, weights = _gauss(np.linspace(0.0, 1.0, 9))
+    if i is None:
+        return float(weights @ case.u(*np.meshgrid(t, t)) @ weights)
+    ends = [np.zeros_like(t), np.ones_like(t)]
+    return float(weights @ case.u(*((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]))
+
+
+def _means(seed: int, number: int) -> Row:
+    count, none, misses = 0, 0, []
+    for k in range(number):
+        rng = np.random.default_rng((seed, k, 79))
+        case = Case(rng)
+        places = [None, *(i for i, side in enumerate(case.sides) if side.kind != "dirichlet")]
+        try:
+            solution = solved(case, rng)
+            found = {i: means.mean(solution, None if i is None else SIDES[i]) for i in places}
+        except (InputError, NotConverged):  # the same on all ranks
+            none += 1
+            continue
+        for i, interval in found.items():
+            count += 1
+            exact = exact_mean(case, i)
+            slack = NEARLY * max(abs(exact), abs(interval.value))
+            if not interval.lower - slack <= exact <= interval.upper + slack:
+                misses.append(f"case {k} of seed {seed}: {exact:g} is not in {interval}")
+        if k % 10 == 9:
+            gc.collect()
+    if none > MISSING * number:
+        misses.append(f"{none} cases have no intervals")
+    measured = f"{len(misses)} intervals that miss; {none} of {number} cases without any"
+    return Row("Means of parts and of the domain", count, measured, REFERENCE, misses)
+
+
 def _smooth(levels: int) -> Row:
     tally, most = Tally(), 0.0
     for c, b in [(c, 0.0) for c in (0.0, 1.0, 1e4, 1e8)] + [(0.0, b) for b in (1.0, 1e4, 1e8)]:
@@ -409,5 +445,6 @@ def terms(seed: int, quick: bool) -> Group:
             told(_drawn(seed, 4 if quick else 500)),
             told(_smooth(1 if quick else 4)),
             told(_fluxes(seed, 2 if quick else 100)),
+            told(_means(seed, 1 if quick else 50)),
         ],
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -48,7 +48,7 @@ from .readers import (
     whole,
     word,
 )
-from .reference import ADAPTIVE, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
+from .reference import ADAPTIVE, DOMAIN, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -99,8 +99,8 @@ class ProblemFile:
         mode: "uniform" or "adaptive".
         levels: Number of meshes, the coarsest included.
         adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
-        quantities: The kind of each quantity that is asked for, "force" or "flux", and its part of
-            the boundary, by name.
+        quantities: The kind of each quantity that is asked for, "force", "flux" or "mean", and its
+            part of the boundary or its material, None for all of the domain, by name.
         time: What [time] says; None for a problem without time.
         units: What [units] and [names] say.
         said: All that levels depend on, by key, as it was written.
@@ -116,7 +116,7 @@ class ProblemFile:
     mode: str
     levels: int
     adaptive: Mapping[str, Any]
-    quantities: Mapping[str, tuple[str, str]]
+    quantities: Mapping[str, tuple[str, str | None]]
     time: Time | None
     units: Units
     said: Mapping[str, Any]
@@ -240,7 +240,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         adaptive=adaptive,
         time=None if clock is None else _time(sections, expressions, mode, clock),
-        quantities=_quantities(sections["quantities"], parts),
+        quantities=_quantities(sections["quantities"], parts, materials),
         units=Units(**_words(sections, "units"), names=_words(sections, "names")),
         said={
             f"{name}.{key}": value
@@ -281,22 +281,26 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _quantities(
-    table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]]
-) -> dict[str, tuple[str, str]]:
-    """[quantities]: each a kind and a part of the boundary of the type that goes with it."""
+    table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], materials: Iterable[str]
+) -> dict[str, tuple[str, str | None]]:
+    """[quantities]: each a kind and a place of a type that goes with it."""
     types = {name: name for name in PARTS} | {name: part["type"] for name, part in parts.items()}
-    found = {}
+    found: dict[str, tuple[str, str | None]] = {}
     for name, value in table.items():
         key = f"quantities.{name}"
         if not isinstance(value, dict) or len(value) != 1:
             raise InputError(
-                f'{key}: {{ force = "PART" }} or {{ flux = "PART" }} is needed, found'
-                f" {shown(value)}"
+                f'{key}: {{ force = "PART" }}, {{ flux = "PART" }} or {{ mean = "PLACE" }} is'
+                f" needed, found {shown(value)}"
             )
         insist_known(value, key, tuple(QUANTITIES))
-        ((kind, part),) = value.items()
-        own = [each for each, what in types.items() if what == QUANTITIES[kind]]
-        found[name] = kind, one_of(own)(f"{key}.{kind}", part)
+        ((kind, place),) = value.items()
+        own = [each for each, what in types.items() if what in QUANTITIES[kind]]
+        if kind == "mean":
+            own += [*materials, DOMAIN]
+        read = one_of(own)(f"{key}.{kind}", place)
+        # own ends with all of the domain, unless something else is called so
+        found[name] = kind, None if kind == "mean" and own.index(read) == len(own) - 1 else read
     return found
 
 

@@ -46,8 +46,14 @@ TYPES = {
 }
 """The keys that go with each type of a part."""
 
-QUANTITIES = {"force": "contact", "flux": "dirichlet"}
-"""Kinds of quantities, and the type of the part that each is of."""
+QUANTITIES = {
+    "force": ("contact",),
+    "flux": ("dirichlet",),
+    "mean": ("contact", "neumann", "robin"),
+}
+"""Kinds of quantities, and the types of the parts that each is of; means are of materials, too."""
+DOMAIN = "domain"
+"""All of the domain, where a quantity is of that."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
@@ -173,7 +179,8 @@ ABOUT = {
     "names": "Optional. What stands in pictures beside x, y, u and the pressure.",
     "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
     "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
-    "through a dirichlet part. The part must not touch other dirichlet or contact parts.",
+    "through a dirichlet part, both of which must not touch other dirichlet or contact parts; or "
+    f"the mean of u on another part, in a material, or with `{DOMAIN}` on all of the domain.",
 }
 """The sections, and what is said of each."""
 
@@ -206,7 +213,11 @@ def page() -> str:
             lines += ["```toml", *example, "```", ""]
             continue
         if section == "quantities":
-            example = ['push = { force = "contact" }', 'inflow = { flux = "dirichlet" }']
+            example = [
+                'push = { force = "contact" }',
+                'inflow = { flux = "dirichlet" }',
+                'mean_air = { mean = "air" }',
+            ]
             lines += ["```toml", "[quantities]", *example, "```", ""]
             continue
         lines += ["| key | value | if left out | |", "|---|---|---|---|"]

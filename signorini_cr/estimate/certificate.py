@@ -17,14 +17,14 @@ import ufl
 from dolfinx import fem
 
 from .. import compat
-from ..arrays import FloatArray
+from ..arrays import FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import Certain, Known, Load, Segments, mean_to_norm
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from .beyond import Beyond
-from .companion import Companion, Masses, companion, on_facet
+from .companion import Companion, Lifted, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
@@ -145,7 +145,8 @@ class Made:
     of f and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces
     are this rank's shares of the contact forces in y, by the parts' numbers, missed that of what
     quadrature may have missed of f and g. reach is the radius of the ball around the middle of p
-    and b that A(u − u_h) is in, loose ends added.
+    and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds
+    of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last row is about.
     """
 
     level: Level
@@ -167,6 +168,9 @@ class Made:
     forces: dict[int, float]
     missed: float
     reach: float
+    loose: float
+    lift: Lifted
+    bounded: IndexArray
 
     def through(self, cells: Cells) -> FloatArray:
         """Fluxes of y out of the cells, shape (d + 1, cells)."""
@@ -410,6 +414,9 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             missed=float(segments.missed.sum())
             + (0.0 if certain.missed is None else float(certain.missed.sum())),
             reach=float(bound - near / 2 + loose + lift / 2),
+            loose=float(loose + lift),
+            lift=v.lift,
+            bounded=v.boundary.alpha.side.dofs,
         ),
     )
 

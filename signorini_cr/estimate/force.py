@@ -11,7 +11,7 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, Int32Array
 from ..data.diffusion import diffusion
 from ..data.loads import trace_of
 from ..errors import InputError
@@ -116,6 +116,43 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     cells = Cells(level.domain, level.V)
     phi = _weight(solution, conditions)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
+    work, slack = against(made, cells, at)
+    force = 0.0
+    for condition in conditions:
+        if condition.number in made.forces:
+            force += made.forces[condition.number]
+        else:
+            side = cells.sides[condition.number]
+            force += float(np.sum(made.through(cells)[side.local, side.cells]))
+    at_fixed = any(condition.fixed is not None for condition in conditions)
+    value, middle, energy, unsure = cells.total(
+        force,
+        force + 0.5 * work,
+        square(made, cells, at),
+        # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
+        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if at_fixed else 0.0,
+    )
+    reach = made.reach * np.sqrt(energy) + unsure
+    # a force off one bound only has its sign
+    signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
+    lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
+    lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
+    return Interval(float(value), lower, upper)
+
+
+def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray]:
+    """(A v − p', Aφ), this rank's share, p' = p + A u_h, for d = 2 and κ constant on each cell.
+
+    Args:
+        made: v, p and u_h.
+        cells: The mesh.
+        at: φ of P1 at the cells' vertices, shape (3, cells).
+
+    Returns:
+        The product, and |∫_T (f + div y)| times φ's mean where c has not taken that up, shape
+        (cells,).
+    """
+    d = cells.tdim
     everywhere = slice(0, cells.number)
     w, P, total = made.w, made.excess, sum_rows(at)
     # (A v − p', Aφ) with p' = p + A u_h, cell by cell: first gradients, then c, then b
@@ -150,37 +187,17 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     if made.shed is not None:
         share = edge.measure / measures(cells, edge.facets)[edge.place]
         of_edge = of_edge + made.shed[edge.place] * share * (edge.weights @ on_edge)
-    force = 0.0
-    for condition in conditions:
-        if condition.number in made.forces:
-            force += made.forces[condition.number]
-        else:
-            side = cells.sides[condition.number]
-            force += float(np.sum(made.through(cells)[side.local, side.cells]))
-    at_fixed = any(condition.fixed is not None for condition in conditions)
-    value, middle, energy, unsure = cells.total(
-        force,
-        force + 0.5 * (np.sum(work) - np.sum(of_edge)),
-        _square(made, cells, at),
-        # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
-        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if at_fixed else 0.0,
-    )
-    reach = made.reach * np.sqrt(energy) + unsure
-    # a force off one bound only has its sign
-    signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
-    lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
-    lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
-    return Interval(float(value), lower, upper)
+    return float(np.sum(work) - np.sum(of_edge)), slack
 
 
-def _square(made: Made, cells: Cells, at: FloatArray) -> float:
+def square(made: Made, cells: Cells, at: FloatArray) -> float:
     """‖Aφ‖², this rank's share, from φ at the cells' vertices."""
     total, edge = sum_rows(at), made.segments
     slopes = cells.apply(at, slice(0, cells.number))
-    square = float(np.sum(made.kappa * dot_rows(at, slopes)))
-    square += made.reaction / 12.0 * float(cells.volume @ (total**2 + dot_rows(at, at)))
+    found = float(np.sum(made.kappa * dot_rows(at, slopes)))
+    found += made.reaction / 12.0 * float(cells.volume @ (total**2 + dot_rows(at, at)))
     (a, b), measure = trace_of(cells, edge.facets, at), measures(cells, edge.facets)
-    return square + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
+    return found + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
 
 
 def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
@@ -222,20 +239,30 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
     if zeros == 0 and forms.of_one is None:
         phi.x.array[:] = 1.0
         return phi
-    known = np.concatenate(parts)
     marks.x.array[:] = 0.0
     marks.x.array[chosen] = 1.0
-    bc, form = fem.dirichletbc(marks, known), _form(V, _certified(solution))
+    return extended(marks, np.concatenate(parts), _certified(solution))
+
+
+def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Function:
+    """A P1 function φ with given values at some dofs and nearly the least ‖Aφ‖; collective.
+
+    Args:
+        values: A P1 function.
+        known: Local dofs at which φ is the same, ghosts included.
+        made: What A is made of.
+    """
+    V = values.function_space
+    bc, form, phi = fem.dirichletbc(values, known), _form(V, made), fem.Function(V)
     A, b = assemble_matrix(form, [bc]), fem.Function(V)
     A.assemble()
     fem.apply_lifting(b.x.array, [form], [[bc]])
     b.x.scatter_reverse(InsertMode.add)
-    b.x.array[known] = marks.x.array[known]
+    b.x.array[known] = values.x.array[known]
     load, found = (ghosted_vector(V, function.x.array) for function in (b, phi))
     solve_once(A, load, found, WEIGHT, ESTIMATE_PREFIX)
     release(A, load, found)
     # Exactly so, whatever the solver did
-    phi.x.array[chosen] = 1.0
-    phi.x.array[rest] = 0.0
+    phi.x.array[known] = values.x.array[known]
     phi.x.scatter_forward()
     return phi

@@ -88,8 +88,8 @@ LEVEL = {
     "contact.force_bounds.lower": "∫_Γ1 λ is not below it.",
     "contact.force_bounds.upper": "∫_Γ1 λ is not above it.",
     "contact.force_bounds.reason": "Why the force has no bounds; null where it has.",
-    "quantities": "What [quantities] asks for, by name: `value`, that of u_h, `lower` and `upper`, "
-    "between which that of u is, and `reason` where these are null.",
+    "quantities": "What [quantities] asks for, by name: its `kind`, `value`, that of u_h, `lower` "
+    "and `upper`, between which that of u is, and `reason` where these are null.",
     "error_h1": "‖∇_h(u − u_h)‖; null where u is not known.",
     "error_l2": "‖u − u_h‖; null where u is not known.",
     "rate_h1": "Of error_h1, against the level before. The printed column rate.",

@@ -27,6 +27,7 @@ from .. import __version__
 from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
 from ..estimate.force import NO_BOUNDS, flux, force_bounds
+from ..means import NO_MEAN, mean
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .strip import Moment, plot_strip
@@ -69,15 +70,16 @@ Record = dict[str, Any]
 def level_record(
     solution: Solution,
     previous: Mapping[str, Any] | None = None,
-    quantities: Mapping[str, tuple[str, str]] = MappingProxyType({}),
+    quantities: Mapping[str, tuple[str, str | None]] = MappingProxyType({}),
 ) -> Record:
     """The numbers of one level, as they stand in report.json.
 
     Args:
         solution: What was found on this mesh.
         previous: The record of the level before, for the rates.
-        quantities: The kind, "force" or "flux", and the part of the boundary of what is wanted in
-            an interval, by name. Each takes about as long as a linear solve.
+        quantities: The kind, "force", "flux" or "mean", and the part of the boundary or material,
+            None for all of the domain, of what is wanted in an interval, by name. Each takes about
+            as long as the solve, or twice as long for a mean.
 
     Returns:
         Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
@@ -113,7 +115,8 @@ def level_record(
                 "force_bounds": _bounded(solution, None),
             },
             "quantities": {
-                name: _bounded(solution, [part]) for name, (_, part) in quantities.items()
+                name: {"kind": what[0], **_bounded(solution, what)}
+                for name, what in quantities.items()
             },
             "error_h1": h1,
             "error_l2": l2,
@@ -132,16 +135,18 @@ def level_record(
     )
 
 
-def _bounded(solution: Solution, parts: Sequence[str] | None) -> Record:
-    """What flows through parts, None for all of Γ1, or nothing, and why; collective."""
+def _bounded(solution: Solution, what: tuple[str, str | None] | None) -> Record:
+    """A quantity, None for the contact force, or nothing, and why; collective."""
     try:
-        if parts is not None:
-            return {**flux(solution, *parts)._asdict(), "reason": None}
+        if what is not None:
+            kind, place = what
+            known = mean(solution, place) if kind == "mean" else flux(solution, str(place))
+            return {**known._asdict(), "reason": None}
         lower, upper = force_bounds(solution)
         return {"lower": lower, "upper": upper, "reason": None}
     except InputError as error:
-        value = {} if parts is None else {"value": None}
-        reason = str(error).removeprefix(f"{NO_BOUNDS}: ")
+        value = {} if what is None else {"value": None}
+        reason = str(error).removeprefix(f"{NO_BOUNDS}: ").removeprefix(f"{NO_MEAN}: ")
         return {**value, "lower": None, "upper": None, "reason": reason}
 
 

@@ -41,7 +41,7 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
 
     Args:
         record: The last level's.
-        units: What forces are measured in.
+        units: What forces and u are measured in.
     """
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
@@ -52,8 +52,8 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     wanted = {"the contact force": record["contact"]["force_bounds"], **record["quantities"]}
     for name, found in wanted.items():
         if found["reason"] is None:
-            force = _interval(found["lower"], found["upper"], units.after("force"))
-            facts.append(f"{name} is in {force}")
+            unit = units.after("u" if found.get("kind") == "mean" else "force")
+            facts.append(f"{name} is in {_interval(found['lower'], found['upper'], unit)}")
         else:
             facts.append(f"{name} has no bounds: {found['reason']}")
     return "; ".join(facts)

@@ -227,6 +227,10 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["refine.mode:", '"unifrom"', "did you mean uniform? Allowed are uniform, adaptive"],
     ),
     "max_dofs": (with_("levels = 2", "max_dofs = 0"), ["refine.max_dofs: 1 or more"]),
+    "mean where u is set": (
+        CASE + '[quantities]\nedge = { mean = "dirichlet" }\n',
+        ["quantities.edge.mean", "allowed are contact, neumann, domain"],
+    ),
     "title a number": (with_('"S1"', "1"), ["title: a string is needed, found 1"]),
     "size zero": (with_("size = 0.5", "size = 0"), ["domain.size: a number above 0", "found 0"]),
     "size negative": (with_("size = 0.5", "size = -0.5"), ["domain.size:", "found -0.5"]),

@@ -1,5 +1,6 @@
 """Problem files: what they say is what one gets, and what they leave out has its default."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,9 @@ from signorini_cr.app.problemfile import ProblemFile, load
 from signorini_cr.errors import InputError
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
+from signorini_cr.output.report import level_record
+from signorini_cr.output.tables import certified
+from signorini_cr.output.units import Units
 
 SQUARE = """
 [domain]
@@ -312,3 +316,37 @@ def test_too_many_levels_are_told_before_anything_is_solved(read) -> None:
     domain = case.mesh()
     with pytest.raises(InputError, match=r"refine.levels .* 40 meshes"):
         case.check(domain)
+
+
+def test_means_are_of_parts_of_materials_or_of_all(read) -> None:
+    """u = −1, far above the obstacle."""
+    text = (
+        SQUARE
+        + """
+[data]
+dirichlet = -1
+obstacle = -9
+[material.low]
+polygon = [[0, 0], [1, 0], [1, 0.5], [0, 0.5]]
+[quantities]
+side = { mean = "neumann" }
+low = { mean = "low" }
+all = { mean = "domain" }
+"""
+    )
+    case = read(text)
+    asked = {"side": ("mean", "neumann"), "low": ("mean", "low"), "all": ("mean", None)}
+    assert case.quantities == asked
+    *_, solution = solve_levels(case.problem, case.mesh(), 1)
+    solution_record = level_record(solution, None, case.quantities)
+    found = solution_record["quantities"]
+    for each in found.values():
+        assert each["lower"] <= -1 <= each["upper"] and each["reason"] is None
+        assert each["upper"] - each["lower"] < 1e-9
+    measured = Units(u="K", force="W")
+    wanted = {"heat": {**found["low"], "kind": "flux"}, "low": found["low"]}
+    bounds = {"contact": {"force_bounds": {"reason": "x"}}, "quantities": wanted}
+    told = certified(solution_record | bounds, measured)
+    assert re.search(r"heat is in \[[^]]*\] W, .*; low is in \[[^]]*\] K, ", told)
+    named = read(text.replace("[material.low]", "[material.domain]").replace('"low"', '"domain"'))
+    assert named.quantities == {**asked, "low": ("mean", "domain"), "all": ("mean", "domain")}

@@ -38,6 +38,7 @@ from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.estimate.force import flux, force_bounds
 from signorini_cr.fem.cells import Cells
+from signorini_cr.means import mean
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
 
@@ -449,6 +450,59 @@ def test_what_flows_through_is_bracketed_in_one_dimension():
         widths.append([each.upper - each.lower for each in (pressed, inflow)])
     assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
     assert widths[-1][0] < 0.01 * 2 * force
+
+
+def test_means_are_bracketed_in_one_dimension():
+    """The same bar, its left half a material; u is the same in both."""
+    k = np.sqrt(1.5)
+    over, widths = np.tanh(k / 2) / k, []  # ∫ sinh k(1 − y)/sinh k
+    exact_means = {None: over, "half": over, "left": over, "floor": 1.0}
+    half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
+    sides = [Contact(1.0, coefficient=5.0, external=-4.0), Neumann(), Dirichlet(0.0), Neumann()]
+    conditions = dict(zip(STRIP_EDGES, sides, strict=True))
+    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
+    problem = Problem(coefficient=2.0, reaction=3.0, conditions=conditions)
+    for solution in solve_levels(problem, domain, 3):
+        found = {where: mean(solution, where) for where in exact_means}
+        for where, (value, lower, upper) in found.items():
+            assert lower <= exact_means[where] <= upper
+            assert value == pytest.approx(exact_means[where], rel=0.02)
+        widths.append([each.upper - each.lower for each in found.values()])
+    assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
+    with pytest.raises(InputError, match="'neumann' has no extent"):
+        mean(solution, "neumann")
+    with pytest.raises(InputError, match="u is set on 'top'"):
+        mean(solution, "top")
+    with pytest.raises(InputError, match=r"'air' is no part .* floor, right, left, half"):
+        mean(solution, "air")
+
+
+@pytest.mark.parametrize("pressure", [1.0, 0.0])
+def test_means_where_data_are_curved(pressure):
+    """u = exp(ky) cos(kx), on the obstacle all along the floor or above it."""
+    k, away = 1.3, 1.0 - pressure
+    over = [(np.exp(k) - 1) / k, np.sin(k) / k, np.sin(2 * k) / k / 2]
+    exact_means = {None: over[0] * over[2], "floor": over[2], "left": over[0]}
+    exact_means |= {"half": over[0] * over[1], "right": over[0] * np.cos(2 * k)}
+    sides = [
+        Contact(
+            lambda x: ufl.cos(k * x[0]) - away * (1 + x[0]),
+            g=lambda x: -k * ufl.cos(k * x[0]) - pressure,
+        ),
+        Neumann(lambda x: -k * ufl.exp(k * x[1]) * ufl.sin(k * x[0])),
+        Dirichlet(lambda x: ufl.exp(k * x[1]) * ufl.cos(k * x[0])),
+        Neumann(),
+    ]
+    half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
+    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
+    problem = Problem(conditions=dict(zip(STRIP_EDGES, sides, strict=True)))
+    off = []
+    for solution in solve_levels(problem, domain, 3):
+        found = {where: mean(solution, where) for where in exact_means}
+        for where, (_, lower, upper) in found.items():
+            assert lower <= exact_means[where] <= upper
+            off.append(abs((lower + upper) / 2 - exact_means[where]) / (upper - lower))
+    assert max(off) < 0.02  # what is added to the companion's means is right
 
 
 def test_held_by_contact_alone_there_is_a_force_and_no_interval():
