@@ -104,7 +104,9 @@ for time, solution in night.steps(night.mesh(), levels_wanted(3)):
     steps.append((time, solution.contact.force, solution.contact.length))
     if len(steps) in chosen(night.time.steps):
         moments.append(moment(time, solution))
-plots.drawn(comm, lambda: plot_strip(moments, study.folder / "frost-night.png", night.title))
+plots.drawn(
+    comm, lambda: plot_strip(moments, study.folder / "frost-night.png", night.title, night.units)
+)
 study.show("frost-night.png", "Through a night: where heat is needed, and when.")
 times, heats, lengths = map(np.array, zip(*steps, strict=True))
 energy = np.trapezoid(heats, times) / 1000

@@ -85,7 +85,9 @@ for time, solution in case.steps(case.mesh(), levels):
     if len(rows) in chosen(case.time.steps):
         moments.append(moment(time, solution))
 times, inflow, volume, leak = np.array(rows).T
-plots.drawn(comm, lambda: plot_strip(moments, study.folder / "wall-strip.png", case.title))
+plots.drawn(
+    comm, lambda: plot_strip(moments, study.folder / "wall-strip.png", case.title, case.units)
+)
 study.show("wall-strip.png", "The level in the ground; the wall is open where it is in contact.")
 
 

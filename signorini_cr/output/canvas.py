@@ -24,6 +24,7 @@ from .units import PLAIN, Units
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import YAxis
+    from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure, SubFigure
 
 Where = str | os.PathLike[str]
@@ -63,6 +64,14 @@ def as_png(figure: Figure | SubFigure) -> bytes:
     # whatever the layout has left no room for, a title of several lines for one, is on it
     figure.canvas.print_figure(file, format="png", bbox_inches="tight", pad_inches=0.1)
     return file.getvalue()
+
+
+def label_bar(bar: Colorbar, units: Units) -> None:
+    """Say what the colours are those of."""
+    if (label := f"{units.name('u')}$u_h${units.within('u')}") == "$u_h$":
+        bar.set_label(label, fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
+    else:  # too long to stand upright
+        bar.set_label(label, fontsize=13)
 
 
 def plane_axes(

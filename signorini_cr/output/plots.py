@@ -34,6 +34,7 @@ from .canvas import (
     draw_lines,
     grouped,
     headline,
+    label_bar,
     label_ends,
     legend,
     log_ticks,
@@ -202,10 +203,7 @@ def plot_solution(
         bar.set_ticks(list(inner) if len(inner) else list(limits))
         for height in inner:
             bar.ax.axhline(height, color="white", linewidth=0.8, alpha=0.7)
-        if (label := f"{units.name('u')}$u_h${units.within('u')}") == "$u_h$":
-            bar.set_label(label, fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
-        else:  # too long to stand upright
-            bar.set_label(label, fontsize=13)
+        label_bar(bar, units)
         bar.ax.tick_params(labelsize=11)
         bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
         legend(figure, ncols=3, ax=ax)

@@ -281,7 +281,7 @@ def write_output(
             )
         if moments:
             writers["strip.png"] = lambda path: plots.drawn(
-                comm, lambda: plot_strip(moments, path, title)
+                comm, lambda: plot_strip(moments, path, title, units)
             )
     kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if moments else set()
     removed = set(FILES) - kept

@@ -12,8 +12,19 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import InputError
 from ..fem.space import facet_measures
-from .canvas import RED, chains, draw_lines, headline, legend, new_figure, plane_axes, save
+from .canvas import (
+    RED,
+    chains,
+    draw_lines,
+    headline,
+    label_bar,
+    legend,
+    new_figure,
+    plane_axes,
+    save,
+)
 from .raster import raster
+from .units import PLAIN, Units
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +84,10 @@ def moment(time: float, solution: Solution) -> Moment:
 
 
 def plot_strip(
-    moments: Sequence[Moment], path: str | os.PathLike[str] | None = None, title: str = ""
+    moments: Sequence[Moment],
+    path: str | os.PathLike[str] | None = None,
+    title: str = "",
+    units: Units = PLAIN,
 ) -> Figure:
     """Draw u_h at some moments, and where it is in contact then.
 
@@ -83,6 +97,7 @@ def plot_strip(
         moments: One at least, of one domain, from `moment`.
         path: The PNG to write, if any.
         title: What the picture is of, say the problem's name.
+        units: What u, the axes and time are called and measured in.
 
     Raises:
         InputError: There are no moments, or the file can't be written.
@@ -100,9 +115,10 @@ def plot_strip(
     figure = new_figure(width * columns + 1.3, rows * (max((width - 1.0) / wide, 0.9) + 0.75) + 1.2)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     marks: dict[str, Line2D] = {}
+    time = units.after("time").replace("$", r"\$")
     low, high = (pick(each.limits[i] for each in moments) for i, pick in enumerate((min, max)))
     for each, axes in zip(moments, panels.flat, strict=False):
-        plane_axes(box, ax=axes)
+        plane_axes(box, ax=axes, units=units)
         axes.label_outer()
         shown = axes.imshow(
             each.image,
@@ -118,11 +134,14 @@ def plot_strip(
             style: dict[str, Any] = {"color": color, "linewidth": 3.0, "path_effects": outlined}
             draw_lines(axes, chains(lines), zorder=3, **style)
             marks["contact" if color == RED else "no contact"] = Line2D([], [], **style)
-        axes.set_title(f"$t$ = {each.time:.4g}", fontsize=12)
+        axes.set_title(f"$t$ = {each.time:.4g}{time}", fontsize=12)
+    figure.supylabel(panels[0, 0].get_ylabel(), fontsize=12)  # on low panels they would overlap
+    for axes in panels.flat:
+        axes.set_ylabel("")
     for axes in panels.flat[len(moments) :]:
         axes.remove()
     bar = figure.colorbar(shown, ax=panels, aspect=30)
-    bar.set_label("$u_h$", fontsize=15, rotation=0, labelpad=8, ha="left", va="center")
+    label_bar(bar, units)
     bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
     legend(figure, list(marks.values()), list(marks), ncols=2)
     figure.suptitle(headline(title, "$u_h$ in time"), fontsize=14)
