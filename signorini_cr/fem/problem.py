@@ -127,9 +127,6 @@ class Problem:
             degree = getattr(self, name)
             if not isinstance(degree, int | np.integer) or degree < 0:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
-        own = [m.coefficient for m in self.materials.values() if m.coefficient is not None]
-        if self.form is not None and (own or self.coefficient is not type(self).coefficient):
-            raise InputError("a form takes the coefficient's place; only one of them can be given")
 
 
 def as_expression(data: Data, x: Expr) -> Expr:
@@ -233,6 +230,11 @@ class Forms:
         self.x = ufl.SpatialCoordinate(cell)
         materials = materials or Materials()
         _check_materials(problem, materials)
+        own = [each.coefficient for each in problem.materials.values()]
+        if problem.form is not None and (
+            any(each is not None for each in own) or problem.coefficient is not Problem.coefficient
+        ):
+            raise InputError("a form takes the coefficient's place; only one of them can be given")
         self.kappa = self._by_material("coefficient", problem.coefficient, materials)
         if self.uniform and not float(self.kappa) > 0.0:
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")

@@ -156,10 +156,13 @@ def test_a_function_on_another_mesh_is_refused():
 
 
 def test_a_form_has_no_coefficient_and_no_bound_to_go_by():
+    floor = WALLS | {"floor": Contact(-0.1)}
+    steel = {"steel": [[-1, 0], [0, 0], [0, 1], [-1, 1]]}
+    domain = Polygon(SQUARE.vertices, EDGES, names=EDGES, materials=steel).mesh(0.5)
     for more in ({"coefficient": 2.0}, {"materials": {"steel": Material(coefficient=2.0)}}):
         with pytest.raises(InputError, match="takes the coefficient's place"):
-            Problem(form=Form(laplace), **more)
-    problem = Problem(form=Form(laplace), f=-1.0, conditions=WALLS | {"floor": Contact(-0.1)})
+            solve(Problem(form=Form(laplace), conditions=floor, **more), domain)
+    problem = Problem(form=Form(laplace), f=-1.0, conditions=floor)
     with pytest.raises(InputError, match="user's own"):
         list(solve_adaptive(problem, SQUARE.mesh(0.5), tolerance=0.1))
 
