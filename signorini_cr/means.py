@@ -52,7 +52,7 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
-    cells = Cells(level.domain, level.V)
+    cells = made.cells()
     size, *integrals = map(float, cells.total(*_integrals(made, cells, solution.u.x.array, where)))
     if not size > 0.0:
         raise InputError(f"{NO_MEAN}: {where!r} has no extent")

@@ -19,7 +19,7 @@ from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
 from ..mesh.domain import Domain
 from .loads import Edge, Load, chi
-from .moments import Compiled, OnFacets
+from .moments import Compiled, OnFacets, Tensor
 
 
 class DiffusionOnMesh:
@@ -46,7 +46,11 @@ class DiffusionOnMesh:
     def cells(self) -> Cells:
         """The mesh as arrays, for the Crouzeix-Raviart element."""
         fixed = [condition.number for condition in self.forms.fixed]
-        return Cells(self.domain, self.V, fixed, self.forms.sinks)
+        return Cells(self.domain, self.V, fixed, self.forms.sinks, self._stretch())
+
+    def _stretch(self) -> FloatArray | None:
+        kappa = self.compiled.kappa
+        return kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
 
     def renewed(self, source: FloatArray | None = None) -> DiffusionOnMesh:
         """The same with data as they are now; a_h must be what it was.

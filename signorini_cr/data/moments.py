@@ -17,6 +17,8 @@ import numpy as np
 import ufl
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.expand_indices import expand_indices
 from ufl.core.expr import Expr
 
 from .. import compat
@@ -29,6 +31,11 @@ from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
 from .jets import Boxes, Enclosure, values
 from .ranges import Cut, Deviation, Range, cut, range_of
+
+NO_RANGE = "the coefficient has no computable upper and lower bound"
+
+STEADY = 1e-13
+"""Part of κ by which its bounds on a cell may differ where it is a constant, rounded."""
 
 LOAD_DEGREE, KAPPA_DEGREE = 4, 8
 """What the certificate's rules integrate exactly: two quadratics, and for q and s quadratic, y and
@@ -103,13 +110,57 @@ class Volume:
         return {}
 
 
+class Tensor:
+    """A coefficient that is a symmetric tensor.
+
+    Args:
+        expression: A tensor.
+        mesh: The mesh that it was written for.
+        rule: Where to evaluate.
+
+    Attributes:
+        entries: The d² scalars, row by row.
+    """
+
+    def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
+        """Compile its entries."""
+        self._d, self.rule = mesh.geometry.dim, rule
+        pairs = product(range(self._d), repeat=2)
+        lowered = apply_algebra_lowering
+        self.entries = [expand_indices(lowered(expression[i, j])) for i, j in pairs]
+        self._values = compat.compile_expression(ufl.as_vector(self.entries), rule.points, mesh)
+
+    def means(self, domain: Domain) -> FloatArray:
+        """Means over owned cells, shape (cells, d, d)."""
+        mesh = domain.mesh
+        which = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
+        values = compat.bound(self._values, domain.own).eval(mesh, which)
+        shape = len(which), len(self.rule.weights), self._d, self._d
+        found = np.einsum("nqij,q->nij", values.reshape(shape), self.rule.weights)
+        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+
+    def stretch(self, domain: Domain) -> FloatArray:
+        """(κ_T/k)^{-1/2}, κ_T the mean over a cell and k^d its determinant, shape (cells, d, d).
+
+        With these for `Cells.stretch` k is a scalar coefficient.
+        """
+        eigenvalues, vectors = np.linalg.eigh(self.means(domain))
+        mean = np.exp(np.log(eigenvalues).mean(axis=1, keepdims=True))
+        scaled: FloatArray = vectors * np.sqrt(mean / eigenvalues)[:, None]
+        return scaled @ vectors.transpose(0, 2, 1)
+
+
 class Coefficient:
-    """κ on each cell.
+    """κ on each cell; of a tensor what it is where lengths are measured by `Tensor.stretch`.
 
     Attributes:
         mean: κ_T, shape (cells,), or () where κ is a number.
         low: Lower bound of κ, same shape.
         high: Upper bound of κ, same shape.
+        least: Lower bound of κ's eigenvalues with lengths as they are, same shape.
+        most: Upper bound of these.
+        spread: Of a tensor that varies within cells: θ, (1 − θ) κ_T ≤ κ ≤ (1 + θ) κ_T, shape
+            (cells,); else None.
         values: κ at the points of a rule that is exact for degree 8, shape (q, cells); None where
             κ is constant on each cell of all ranks.
         rule: That rule.
@@ -122,12 +173,65 @@ class Coefficient:
     cut: Cut | None = None
     inside: FloatArray
 
-    def __init__(self, kappa: Volume, cells: Cells):
+    spread: FloatArray | None = None
+
+    def __init__(self, kappa: Volume | Tensor, cells: Cells):
         """Evaluate κ; collective."""
+        self.reason: str | None = None
+        self.values: FloatArray | None = None
+        if isinstance(kappa, Tensor):
+            self._of_tensor(kappa, cells)
+        else:
+            self._of_scalar(kappa, cells)
+            self.least, self.most = self.low, self.high
+        # The same way on all ranks
+        smallest = float(self.least.min(initial=np.inf)) if self.least.ndim else float(self.least)
+        self.smallest = min(cells.comm.allgather(smallest))
+        reasons = [reason for reason in cells.comm.allgather(self.reason) if reason]
+        self.reason = reasons[0] if reasons else None
+        if self.reason is None and not self.smallest > 0:
+            self.reason = "the coefficient's computable lower bound is not positive"
+
+    @property
+    def varies(self) -> bool:
+        """Whether κ varies within cells, on some rank."""
+        return self.values is not None or self.spread is not None
+
+    def _of_tensor(self, kappa: Tensor, cells: Cells) -> None:
+        means = kappa.means(cells.domain)
+        eigenvalues = np.linalg.eigvalsh(means)
+        self.mean = np.exp(np.log(eigenvalues).mean(axis=1))
+        off = np.zeros_like(means)
+        for entry, mean, row in zip(
+            kappa.entries,
+            means.reshape(len(means), -1).T,
+            off.reshape(len(means), -1).T,
+            strict=True,
+        ):
+            found = range_of(entry, cells)
+            if found is None:
+                self.reason = NO_RANGE
+            else:
+                row[:] = np.maximum(found[1] - mean, mean - found[0])
+        # |κ_T^{-1/2} (κ − κ_T) κ_T^{-1/2}|, entry by entry, is at most this
+        assert cells.stretch is not None
+        size = np.abs(cells.stretch) @ np.maximum(off, 0.0) @ np.abs(cells.stretch)
+        theta = np.linalg.norm(size, axis=(1, 2)) / self.mean
+        if not cells.comm.allreduce(float(theta.max(initial=0.0)), op=MPI.MAX) > STEADY:
+            theta[:] = 0.0
+        else:
+            self.spread = theta
+        if (theta >= 1.0).any():
+            self.reason = "the coefficient is a tensor that varies too much within a cell"
+        self.low, self.high = (1.0 - theta) * self.mean, (1.0 + theta) * self.mean
+        self.least, self.most = (
+            (1.0 - theta) * eigenvalues[:, 0],
+            (1.0 + theta) * eigenvalues[:, -1],
+        )
+
+    def _of_scalar(self, kappa: Volume, cells: Cells) -> None:
         fine = kappa.exact_for(KAPPA_DEGREE)
         self.rule = fine.rule
-        self.values: FloatArray | None = None
-        self.reason: str | None = None
         if kappa.number is not None:
             self.mean = self.low = self.high = np.array(kappa.number)
         else:
@@ -136,21 +240,14 @@ class Coefficient:
             values = kappa.at(cells)
             self.mean = values @ kappa.rule.weights
             if found is None:
-                self.reason = "the coefficient has no computable upper and lower bound"
+                self.reason = NO_RANGE
                 self.low = self.high = self.mean
             else:
                 self.low, self.high = (np.broadcast_to(x, self.mean.shape) for x in found)
-            varies = bool((self.high - self.low > 1e-13 * np.abs(self.mean)).any())
+            varies = bool((self.high - self.low > STEADY * np.abs(self.mean)).any())
             if cells.comm.allreduce(varies, op=MPI.LOR):  # or the bound would depend on the ranks
                 values = values if fine is kappa else fine.at(cells)
                 self.values = np.ascontiguousarray(values.T)
-        # The same way on all ranks
-        smallest = float(self.low.min(initial=np.inf)) if self.low.ndim else float(self.low)
-        self.smallest = min(cells.comm.allgather(smallest))
-        reasons = [reason for reason in cells.comm.allgather(self.reason) if reason]
-        self.reason = reasons[0] if reasons else None
-        if self.reason is None and not self.smallest > 0:
-            self.reason = "the coefficient's computable lower bound is not positive"
 
     def enclose(self, cells: Cells, steepness: FloatArray, excess: FloatArray, size: float) -> None:
         """Enclose a κ that varies within cells; collective.
@@ -435,10 +532,10 @@ class Compiled:
         return Volume(self.forms.f, self.forms.mesh, self._rule)
 
     @cached_property
-    def kappa(self) -> Volume | None:
-        """Coefficient; None if it isn't a scalar; collective."""
+    def kappa(self) -> Volume | Tensor:
+        """Coefficient; collective."""
         kappa = self.forms.kappa
-        return None if ufl.shape(kappa) else Volume(kappa, self.forms.mesh, self._rule)
+        return (Tensor if ufl.shape(kappa) else Volume)(kappa, self.forms.mesh, self._rule)
 
     def trace(self, expression: Expr) -> Trace:
         """Values of a condition's datum on facets; collective."""

@@ -86,7 +86,7 @@ class Certificate:
         if self._made is None:
             return None
         made = self._made
-        cells = Cells(made.level.domain, made.level.V)
+        cells = made.cells()
         mesh, d = cells.domain.mesh, cells.tdim
         fluxes = made.through(cells)
         # y = slope x + shift on each cell
@@ -124,7 +124,7 @@ class Certificate:
         if self._made is None:
             return None
         made = self._made
-        cells = Cells(made.level.domain, made.level.V)
+        cells = made.cells()
         degree = 2 if cells.tdim == 2 else 1
         v = fem.Function(fem.functionspace(cells.domain.mesh, ("Lagrange", degree)))
         dofs = v.function_space.dofmap.list[: cells.number]
@@ -141,17 +141,19 @@ class Certificate:
 class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
-    κ is given by its means; whether it varies within cells is told. hats and segments are moments
-    of f and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces
-    are this rank's shares of the contact forces in y, by the parts' numbers, missed that of what
-    quadrature may have missed of f and g. reach is the radius of the ball around the middle of p
-    and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds
-    of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last row is about.
+    κ is given by its means, as `Coefficient` has them; whether it varies within cells is told. hats
+    and segments are moments of f and g, left is ∫_T (f + div y), in s where c has taken it up, and
+    shed what b has. forces are this rank's shares of the contact forces in y, by the parts'
+    numbers, missed that of what quadrature may have missed of f and g. reach is the radius of the
+    ball around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and
+    ‖Aℓ‖ alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last
+    row is about.
     """
 
     level: Level
     w: FloatArray
     kappa: FloatArray
+    stretch: FloatArray | None
     excess: FloatArray
     vertices: FloatArray
     bumps: FloatArray
@@ -172,6 +174,10 @@ class Made:
     lift: Lifted
     bounded: IndexArray
 
+    def cells(self) -> Cells:
+        """The mesh's geometry."""
+        return Cells(self.level.domain, self.level.V, stretch=self.stretch)
+
     def through(self, cells: Cells) -> FloatArray:
         """Fluxes of y out of the cells, shape (d + 1, cells)."""
         own = cells.apply(self.w, slice(0, cells.number))
@@ -185,7 +191,6 @@ LIFT_SHARE = 1e-2
 """What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
-TENSOR = "the coefficient is not a scalar"
 ADRIFT = "part of the domain has no way to Γ0"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
@@ -261,8 +266,6 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
         raise _NoBound(NO_FLUX)
     data = diffusion(level.data)
     _insist(data.forms.uncertified)
-    if data.compiled.kappa is None:
-        raise _NoBound(TENSOR)
     cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
     kappa, reaction = Coefficient(data.compiled.kappa, cells), data.forms.reaction_number
     _insist(kappa.reason)
@@ -288,10 +291,10 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     np.add.at(flux.left, edge.side.cells, change)
     left = carried = 0.0
     if not flux.taken_up:
-        left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
+        left = unbalanced(level, cells, flux.left, kappa.least, size, reaction)
         carried = balance(cells, flux, kappa.low, size, left)
         if carried:
-            left = unbalanced(level, cells, flux.left, kappa.low, size, reaction)
+            left = unbalanced(level, cells, flux.left, kappa.least, size, reaction)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
@@ -313,7 +316,7 @@ def _companion(
     u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
     plain = data.forms.of_one is None
     steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
-    highest = max(cells.comm.allgather(kappa.high.max(initial=1e-300)))
+    highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     u = base.u.x.array
     segments = known.segments
@@ -359,7 +362,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
         np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, lift_far, lift_near
     )
     of_gradients, steep = cells.total(
-        np.sum(np.maximum(sums.middle, 0.0) / kappa.low), np.sum(np.maximum(sums.steepness, 0.0))
+        np.sum(np.maximum(sums.middle, 0.0) / kappa.least), np.sum(np.maximum(sums.steepness, 0.0))
     )
 
     # ‖p + κ^{-1/2}σ ∓ b‖ and the ball around (y + κ∇v)/2 that has κ∇u in it
@@ -397,9 +400,10 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             level=known.level,
             w=w,
             kappa=kappa.mean,
+            stretch=cells.stretch,
             hats=certain.load.hats,
             segments=segments,
-            varies=kappa.values is not None,
+            varies=kappa.varies,
             excess=flux.excess,
             beyond=flux.beyond,
             vertices=v.vertices,
@@ -482,6 +486,8 @@ def _rounding(
         square += reaction * cells.volume[part] * values**2
         if largest is not None:
             square += trace * largest[part] ** 2 / low
+        if cells.stretch is not None:  # it is as good as κ's eigenvalues are near to one another
+            square *= (kappa.most[part] / kappa.least[part]) ** 2
         total += float(np.sum(square))
     return float(ROUNDING * np.sqrt(cells.total(total)[0]))
 
@@ -520,7 +526,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     change += segments.change(v.vertices, v.bumps)
     square, on_edge, change = cells.total(square, on_edge**2, change)
     loose = np.sqrt(square) + np.sqrt(on_edge)
-    missed_in_all = unbalanced(level, cells, missed, kappa.low, size, known.reaction)
+    missed_in_all = unbalanced(level, cells, missed, kappa.least, size, known.reaction)
     return loose + missed_in_all, float(change)
 
 
@@ -536,7 +542,7 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
         return 0.0, 0.0, 0.0, 0.0
     cells, kappa, certain, reaction = known.cells, known.kappa, known.certain, known.reaction
     which, place = np.unique(at, return_inverse=True)
-    high = kappa.high[which] if kappa.high.ndim else kappa.high
+    high = kappa.most[which] if kappa.most.ndim else kappa.most
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
     load = certain.load
     f = np.abs(load.mean[which])

@@ -233,7 +233,7 @@ def unbalanced(
         level: The mesh and the coarser ones below it.
         cells: The same mesh.
         left: Integrals over the cells, shape (cells,).
-        kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
+        kappa_min: Lower bound of κ's eigenvalues on each cell, shape (cells,) or ().
         size: Of the bound, to which what is carried may be small.
         reaction: c: ‖c^{1/2} e‖ bounds it, too.
     """
@@ -255,7 +255,7 @@ def unbalanced(
         bound += poincare(cells.tdim) * np.sqrt(cells.comm.allreduce(part))
     if len(meshes) > 1:
         cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
-    return min(taken_up, float(bound + _carried(cells, left, kappa_min, size)))
+    return min(taken_up, float(bound + _carried(cells.unstretched(), left, kappa_min, size)))
 
 
 def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:

@@ -110,10 +110,9 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     the figures deserve; that costs about as much as the solve.
     """
     made = _certified(solution)
-    level, d = made.level, made.level.domain.mesh.topology.dim
-    if made.varies or d != 2:
+    if made.varies or made.level.domain.mesh.topology.dim != 2:
         raise InputError(f"{NO_BOUNDS}: {VARIES if made.varies else SPATIAL}")
-    cells = Cells(level.domain, level.V)
+    cells = made.cells()
     phi = _weight(solution, conditions)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     work, slack = against(made, cells, at)
@@ -203,14 +202,15 @@ def square(made: Made, cells: Cells, at: FloatArray) -> float:
 def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
     """About a in P1, with data in functions: the same form for all problems, compiled once."""
     mesh, edge = V.mesh, made.segments
-    kappa, loss = (fem.Function(fem.functionspace(mesh, ("DG", 0))) for _ in range(2))
-    kappa.x.array[: len(made.left)] = made.kappa
+    kappa, loss = (
+        made.cells().coefficient(made.kappa),
+        fem.Function(fem.functionspace(mesh, ("DG", 0))),
+    )
     loss.x.array[edge.facets.cells] = edge.loss
-    for function in (kappa, loss):
-        function.x.scatter_forward()
+    loss.x.scatter_forward()
     reaction = fem.Constant(mesh, float(made.reaction))
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    inside = kappa * ufl.inner(ufl.grad(u), ufl.grad(w)) + reaction * u * w
+    inside = ufl.inner(kappa * ufl.grad(u), ufl.grad(w)) + reaction * u * w
     found: fem.Form = compiled(mesh.comm, fem.form, inside * ufl.dx + loss * u * w * ufl.ds)
     return found
 

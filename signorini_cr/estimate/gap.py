@@ -65,6 +65,14 @@ def integrate(
             sums.far += float(np.sum(far))
             sums.near += float(np.sum(near))
             sums.energy_slack += float(np.sum(of_energy))
+        if kappa.spread is not None:
+            steep = pick(kappa.mean, part) * flux.steepness[part]
+            far, near, of_energy = _spread(kappa.spread[part], pp, bb, pb, vv, steep)
+            around += near
+            beside += far
+            sums.far += float(np.sum(far))
+            sums.near += float(np.sum(near))
+            sums.energy_slack += float(np.sum(of_energy))
         volume, s = cells.volume[part], sum_rows(P)
         total = sum_rows(c) + sum_rows(W)
         fv = load.mean[part] * total / (d + 1)
@@ -109,7 +117,7 @@ def integrate(
                     against /= pick(kappa.mean, part)
                 else:
                     slack = np.sqrt(osc * pp)
-                if kappa.values is not None:
+                if kappa.varies:
                     # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
                     slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
                 work = volume * moment
@@ -243,6 +251,9 @@ def integrate_edge(
     s = sum_rows(P)
     a = P - s / (d + 1)
     apex, base = corner_points(cells, side)
+    if cells.stretch is not None:
+        stretch = cells.stretch[side.cells]
+        apex, base = (np.einsum("nij,...nj->...ni", stretch, x) for x in (apex, base))
     middle = (apex + base.sum(axis=0)) / (d + 1)
     pull = a[side.local, np.arange(len(s))][:, None] * (apex - middle)
     pull += np.einsum("in,ink->nk", a[ends[0], np.arange(len(s))], base - middle)
@@ -253,7 +264,7 @@ def integrate_edge(
     sums.load_flux += float(np.sum(weights * potential))
     np.add.at(sums.middle, side.cells, 2.0 * (weights * (potential + jump)).sum(axis=0))
     np.add.at(sums.across, side.cells, 2.0 * (weights * (potential - jump)).sum(axis=0))
-    if kappa.values is not None:
+    if kappa.varies:
         slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], w[:, at])
         sums.slack += float(np.sum(slack))
         for row in (sums.middle, sums.across):
@@ -398,6 +409,35 @@ def _by_quadrature(
         which, place = np.unique(pieces.parent - part.start, return_inverse=True)
         rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
     return tuple(rows)
+
+
+def _spread(
+    theta: FloatArray,
+    pp: FloatArray,
+    bb: FloatArray,
+    pb: FloatArray,
+    vv: FloatArray,
+    steep: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What |p − b|², |p + b|² and ½κ|∇v|² may have beyond κ_T's for a tensor within θ of κ_T.
+
+    ‖κ^{-1/2}(y − κ∇z)‖ ≤ (1 − θ)^{-1/2} (‖κ_T^{-1/2}(y − κ_T∇z)‖ + θ ‖κ_T^{1/2}∇z‖), z = v and
+    z = 2u_h − v.
+
+    Args:
+        theta: θ, shape (n,).
+        pp: ∫_T |p|², and so on, for κ_T.
+        bb: ∫_T |b|².
+        pb: ∫_T p·b.
+        vv: ∫_T κ_T|∇v|².
+        steep: ∫_T κ_T|∇u_h|².
+    """
+    slack = []
+    for sign, zz in ((-2.0, vv), (2.0, 2.0 * (steep + bb) - vv)):
+        square = np.maximum(pp + bb + sign * pb, 0.0)
+        norm = np.sqrt(square) + theta * np.sqrt(np.maximum(zz, 0.0))
+        slack.append(norm**2 / (1.0 - theta) - square)
+    return slack[0], slack[1], 0.5 * theta * vv
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:

@@ -91,10 +91,9 @@ def nearest(
     b.x.array[:] = np.bincount(dofs.ravel(), rows.ravel(), minlength=len(held))
     b.x.scatter_reverse(InsertMode.add)
     b.x.array[fixed] = 0.0
-    k = fem.Function(fem.functionspace(mesh, ("DG", 0)))
-    k.x.array[: cells.number] = kappa
+    k = cells.coefficient(kappa)
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    form = compiled(mesh.comm, fem.form, k * ufl.inner(ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    form = compiled(mesh.comm, fem.form, ufl.inner(k * ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
     A.assemble()
     load, found = (ghosted_vector(V, function.x.array) for function in (b, x))

@@ -116,6 +116,10 @@ class Cells:
         sides: The boundary facets by part.
         sinks: The parts that take up a flux, and their b.
         fixed: The parts that make Γ0, and these.
+        stretch: Symmetric matrices of determinant 1 by which lengths on each cell are measured,
+            shape (cells, d, d); None where they are what they are. X stands for stretch X then, and
+            ∇ for stretch⁻¹ ∇, in `lengths`, `stiffness` and all that is made of them. |T|, and what
+            flows through facets, do not change.
     """
 
     def __init__(
@@ -124,9 +128,11 @@ class Cells:
         V: fem.FunctionSpace,
         fixed: Sequence[int] = (DIRICHLET,),
         sinks: Mapping[int, float] = MappingProxyType({}),
+        stretch: FloatArray | None = None,
     ):
         """Read a domain's mesh; V is its Crouzeix-Raviart space."""
         mesh, self.fixed, self.sinks = domain.mesh, (*fixed, *sinks), sinks
+        self.stretch = stretch
         self.domain, self.V, self.comm = domain, V, mesh.comm
         d = self.tdim = mesh.topology.dim
         n = self.number = mesh.topology.index_map(d).size_local
@@ -142,12 +148,35 @@ class Cells:
         nodes = _rows(compat.cell_nodes(mesh)[:n])
         for part in blocks(n):
             corner = [[row.take(i) for row in x] for i in nodes[:, part]]
+            if stretch is not None:
+                corner = [list(np.einsum("nij,jn->in", stretch[part], c)) for c in corner]
             edges = [[p - q for p, q in zip(c, corner[0], strict=True)] for c in corner[1:]]
             for k, (i, j) in enumerate(self.pairs):
                 self.lengths[k, part] = sum(
                     (p - q) ** 2 for p, q in zip(corner[i], corner[j], strict=True)
                 )
             self.volume[part], self.stiffness[:, part] = _shape(edges, self.lengths[:, part])
+
+    def unstretched(self) -> Cells:
+        """The same with lengths as they are."""
+        return self if self.stretch is None else Cells(self.domain, self.V, self.fixed, self.sinks)
+
+    def coefficient(self, kappa: FloatArray) -> fem.Function:
+        """κ to write in forms: by cells, and with a stretch κ stretch⁻², a tensor; collective.
+
+        Args:
+            kappa: Shape (cells,) or ().
+        """
+        mesh, d = self.domain.mesh, self.domain.mesh.geometry.dim
+        shape: tuple[int, ...] = () if self.stretch is None else (d, d)
+        function = fem.Function(fem.functionspace(mesh, ("DG", 0, shape)))
+        values = np.broadcast_to(kappa, self.number)
+        if self.stretch is not None:
+            inverse = np.linalg.inv(self.stretch)
+            values = (values[:, None, None] * (inverse @ inverse)).ravel()
+        function.x.array[: len(values)] = values
+        function.x.scatter_forward()
+        return function
 
     @cached_property
     def diameter2(self) -> FloatArray:

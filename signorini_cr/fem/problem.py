@@ -282,7 +282,7 @@ class Forms:
                     f" {base.ufl_shape} elsewhere"
                 )
             there = self._on_cells(f"in {material}", [0.0, 1.0], materials, (material,))
-            found = ufl.conditional(ufl.gt(there, 0.5), datum, found)
+            found = _chosen(ufl.gt(there, 0.5), datum, found)
         return found
 
     def _on_cells(
@@ -539,6 +539,14 @@ def _order(expression: Expr) -> int:
     """How often functions are differentiated in it."""
     below = max(map(_order, expression.ufl_operands), default=0)
     return below + isinstance(expression, ufl.differentiation.Derivative)
+
+
+def _chosen(condition: Expr, first: Expr, second: Expr) -> Expr:
+    """The first where a condition holds, else the second, entry by entry."""
+    if not first.ufl_shape:
+        return ufl.conditional(condition, first, second)
+    rows = [_chosen(condition, first[i], second[i]) for i in range(first.ufl_shape[0])]
+    return ufl.as_tensor(rows)
 
 
 def _check_materials(problem: Problem, materials: Materials) -> None:
