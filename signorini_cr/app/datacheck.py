@@ -31,23 +31,30 @@ def _used_on(key: str, domain: Domain) -> int | None:
     section, name, *_ = key.split(".", 2)
     if section in ("material", "time"):
         return None
-    return domain.parts[name] if section == "boundary" else USED_ON[key]
+    return domain.parts[name] if section == "boundary" else USED_ON[bare(key)]
 
 
 def _used_in(key: str, expressions: Collection[str], domain: Domain) -> BoolArray:
     """The local cells in which a datum that is used on no part of the boundary is used."""
-    section, name, *_ = key.split(".", 2)
+    section, name, *_ = bare(key).split(".", 2)
+    bared = {bare(each) for each in expressions}
     tdim, materials = domain.mesh.topology.dim, domain.materials
     used = np.ones(domain.mesh.topology.index_map(tdim).size_local, dtype=bool)
     if section == "material":
         return materials.where(name)[: len(used)]
     for material in materials.numbers:
-        if section == "data" and f"material.{material}.{name}" in expressions:
+        if section == "data" and f"material.{material}.{name}" in bared:
             used &= ~materials.where(material)[: len(used)]
     return used
 
 
-def _is_kappa(key: str) -> bool:
+def bare(key: str) -> str:
+    """The key of a datum that one of its entries belongs to."""
+    return key.partition("[")[0]
+
+
+def is_kappa(key: str) -> bool:
+    """Whether a key is that of κ; an entry of a tensor is not."""
     return key.endswith(".coefficient") and not key.startswith("boundary.")
 
 
@@ -72,7 +79,7 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
         points = _points(domain, domain.mesh.topology.dim - (part is not None), which, digits)
         values = expression.numpy(points)
         wrong = ~np.isfinite(values)
-        if _is_kappa(key):
+        if is_kappa(key):
             wrong |= values <= 0
         elif key.endswith((".reaction", ".coefficient")):
             wrong |= values < 0
@@ -87,7 +94,7 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     key = list(expressions)[bad[0]]
     message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
-        what = "above 0" if _is_kappa(key) else "0 or more"
+        what = "above 0" if is_kappa(key) else "0 or more"
         there = "there" if key.startswith("material.") else "everywhere"
         raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} {there}")
     part, named = _used_on(key, domain), {value: name for name, value in domain.parts.items()}

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import ufl
 from mpi4py import MPI
 
 from ..adaptive import solve_adaptive
@@ -30,7 +31,7 @@ from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
 from ..solution import Solution
-from .datacheck import USED_ON, check_values
+from .datacheck import USED_ON, bare, check_values, is_kappa
 from .expressions import Expression, check_name, parse
 from .formula import Clock, Node
 from .readers import (
@@ -504,12 +505,28 @@ def _expressions(
     if "initial" in sections["time"]:
         given["time.initial"] = sections["time"]["initial"]
     result = {}
-    for key, value in given.items():
+    for key, value in _by_entries(given).items():
         expression = _expression(key, value, names, ())
         if expression.is_condition:
             raise InputError(f"{key}: a number is needed, but this is a condition")
         result[key] = expression
     return result
+
+
+def _by_entries(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with the entries of a tensor one by one, as ``data.coefficient[0][1]``."""
+    found: dict[str, Any] = {}
+    for key, value in given.items():
+        if not (isinstance(value, list) and is_kappa(key)):
+            found[key] = value
+            continue
+        if len(value) != 2 or not all(isinstance(row, list) and len(row) == 2 for row in value):
+            raise InputError(
+                f"{key}: an expression, or a tensor [[xx, xy], [xy, yy]] of expressions, is needed,"
+                f" found {shown(value)}"
+            )
+        found |= {f"{key}[{i}][{j}]": value[i][j] for i, j in ENTRIES}
+    return found
 
 
 def _time(
@@ -525,7 +542,7 @@ def _time(
     if "exact.u" in expressions:
         raise InputError("exact.u: a problem in time has none")
     for key, expression in expressions.items():
-        fixed = key.endswith((".coefficient", ".reaction")) or key == "time.initial"
+        fixed = bare(key).endswith((".coefficient", ".reaction")) or key == "time.initial"
         if fixed and expression.depends_on_time:
             raise InputError(f"{key}: this must not depend on t")
     initial = expressions.get("time.initial")
@@ -552,6 +569,19 @@ def _data(expression: Expression) -> Any:
     return expression.ufl if expression.constant is None else expression.constant
 
 
+ENTRIES = ((0, 0), (0, 1), (1, 0), (1, 1))
+
+
+def _tensor(entries: Sequence[Expression]) -> Any:
+    """Four expressions as `Problem` takes them."""
+
+    def tensor(x: Any) -> Any:
+        xx, xy, yx, yy = (entry.ufl(x) for entry in entries)
+        return ufl.as_matrix([[xx, xy], [yx, yy]])
+
+    return tensor
+
+
 def _expression(
     key: str, value: Any, names: Mapping[str, Expression], later: Collection[str]
 ) -> Expression:
@@ -573,6 +603,8 @@ def _problem(
     materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
     def data(key: str, default: Any) -> Any:
+        if f"{key}[0][0]" in expressions:
+            return _tensor([expressions[f"{key}[{i}][{j}]"] for i, j in ENTRIES])
         if key not in expressions:
             return default
         return _data(expressions[key])

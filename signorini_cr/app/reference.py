@@ -33,6 +33,7 @@ class Key(NamedTuple):
 
 
 EXPRESSION = "an expression or a number"
+TENSOR = "an expression or a number, or a tensor [[xx, xy], [xy, yy]] of these"
 WORD = f"a text of {MOST_CHARACTERS} characters at most"
 PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
@@ -94,7 +95,8 @@ KEYS = (
     Key("data", "dirichlet", EXPRESSION, "0, or derived from `exact.u`",
         "u_D: the value of u on dirichlet edges. It is to be continuous, and not below the "
         "obstacle where the two parts meet.", 'dirichlet = "0.2*y"'),
-    Key("data", "coefficient", EXPRESSION, "1", "κ, above 0 everywhere. It may jump.",
+    Key("data", "coefficient", TENSOR, "1", "κ, above 0 everywhere. It may jump. A tensor is "
+        "symmetric, with eigenvalues above 0: [[\"2\", \"0.5\"], [\"0.5\", \"1\"]].",
         'coefficient = "where(x < 0, 1, 100)"'),
     Key("data", "reaction", EXPRESSION, "0", "c of −∇·(κ∇u) + c u = f, nowhere below 0.",
         "reaction = 2"),
@@ -118,7 +120,8 @@ KEYS = (
         "share edges, and reach beyond the domain, but not overlap. Needed, unless there is a "
         "`domain.mesh`, which has physical surfaces of such names.",
         "polygon = [[0, 0], [1, 0], [1, 1], [0, 1]]"),
-    Key(MATERIAL, "coefficient", EXPRESSION, "that of [data]", "κ there.", "coefficient = 50"),
+    Key(MATERIAL, "coefficient", TENSOR, "that of [data]", "κ there: a number, or a tensor as that "
+        "of wood along its grain and across.", "coefficient = [[0.3, 0], [0, 0.12]]"),
     Key(MATERIAL, "f", EXPRESSION, "that of [data]", "The load there.", "f = -2"),
     Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there; a c that is not the same "
         "everywhere has no certificate.", "reaction = 2"),

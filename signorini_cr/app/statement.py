@@ -127,4 +127,6 @@ def _condition(part: Mapping[str, Any], kappa: str, known: bool) -> str:
 def _short(value: object) -> str:
     """What was written, on one line."""
     text = " ".join(str(value).split())
+    if isinstance(value, list):
+        text = text.replace("'", "")
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"

@@ -15,6 +15,7 @@ from math import factorial
 import basix
 import numpy as np
 import ufl
+from dolfinx import fem
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
@@ -30,7 +31,7 @@ from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
 from .jets import Boxes, Enclosure, values
-from .ranges import Cut, Deviation, Range, cut, range_of
+from .ranges import Cut, Deviation, Pieces, Range, cut, errors_on, range_of
 
 NO_RANGE = "the coefficient has no computable upper and lower bound"
 
@@ -120,24 +121,33 @@ class Tensor:
 
     Attributes:
         entries: The d² scalars, row by row.
+        rule: What the means are found by.
+        fine: What else is integrated by; exact for degree 8.
     """
 
     def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
-        """Compile its entries."""
-        self._d, self.rule = mesh.geometry.dim, rule
-        pairs = product(range(self._d), repeat=2)
-        lowered = apply_algebra_lowering
-        self.entries = [expand_indices(lowered(expression[i, j])) for i, j in pairs]
-        self._values = compat.compile_expression(ufl.as_vector(self.entries), rule.points, mesh)
+        """Take its entries apart."""
+        self._d, self._mesh, self.rule = mesh.geometry.dim, mesh, rule
+        pairs, lowered = product(range(self._d), repeat=2), apply_algebra_lowering(expression)
+        self.entries = [expand_indices(lowered[i, j]) for i, j in pairs]
+        self.fine = Rule(mesh, KAPPA_DEGREE)
+        self._compiled: dict[int, fem.Expression] = {}
+
+    def at(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
+        """Values at points of some owned cells, the symmetric part, shape (cells, q, d, d)."""
+        if rule.degree not in self._compiled:
+            rows = ufl.as_vector(self.entries)
+            self._compiled[rule.degree] = compat.compile_expression(rows, rule.points, self._mesh)
+        which = np.arange(part.start, part.stop, dtype=np.int32)
+        found = compat.bound(self._compiled[rule.degree], domain.own).eval(domain.mesh, which)
+        found = found.reshape(len(which), len(rule.weights), self._d, self._d)
+        return np.asarray(0.5 * (found + found.transpose(0, 1, 3, 2)))
 
     def means(self, domain: Domain) -> FloatArray:
         """Means over owned cells, shape (cells, d, d)."""
-        mesh = domain.mesh
-        which = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
-        values = compat.bound(self._values, domain.own).eval(mesh, which)
-        shape = len(which), len(self.rule.weights), self._d, self._d
-        found = np.einsum("nqij,q->nij", values.reshape(shape), self.rule.weights)
-        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+        number = domain.mesh.topology.index_map(domain.mesh.topology.dim).size_local
+        values = self.at(domain, self.rule, slice(0, number))
+        return np.asarray(np.einsum("nqij,q->nij", values, self.rule.weights))
 
     def stretch(self, domain: Domain) -> FloatArray:
         """(κ_T/k)^{-1/2}, κ_T the mean over a cell and k^d its determinant, shape (cells, d, d).
@@ -159,8 +169,9 @@ class Coefficient:
         high: Upper bound of κ, same shape.
         least: Lower bound of κ's eigenvalues with lengths as they are, same shape.
         most: Upper bound of these.
-        spread: Of a tensor that varies within cells: θ, (1 − θ) κ_T ≤ κ ≤ (1 + θ) κ_T, shape
-            (cells,); else None.
+        tensor: The same where it is a tensor that varies within cells; else None.
+        spread: θ, (1 − θ) κ_T ≤ κ ≤ (1 + θ) κ_T, for that tensor, shape (cells,).
+        rough: ϱ, where that tensor is within ϱ κ_T of a quadratic polynomial, shape (cells,).
         values: κ at the points of a rule that is exact for degree 8, shape (q, cells); None where
             κ is constant on each cell of all ranks.
         rule: That rule.
@@ -173,7 +184,9 @@ class Coefficient:
     cut: Cut | None = None
     inside: FloatArray
 
-    spread: FloatArray | None = None
+    tensor: Tensor | None = None
+    spread: FloatArray
+    rough: FloatArray
 
     def __init__(self, kappa: Volume | Tensor, cells: Cells):
         """Evaluate κ; collective."""
@@ -195,39 +208,54 @@ class Coefficient:
     @property
     def varies(self) -> bool:
         """Whether κ varies within cells, on some rank."""
-        return self.values is not None or self.spread is not None
+        return self.values is not None or self.tensor is not None
 
     def _of_tensor(self, kappa: Tensor, cells: Cells) -> None:
         means = kappa.means(cells.domain)
         eigenvalues = np.linalg.eigvalsh(means)
         self.mean = np.exp(np.log(eigenvalues).mean(axis=1))
-        off = np.zeros_like(means)
-        for entry, mean, row in zip(
-            kappa.entries,
-            means.reshape(len(means), -1).T,
-            off.reshape(len(means), -1).T,
-            strict=True,
+        off = np.zeros((means[0].size if len(means) else cells.tdim**2, len(means)))
+        for row, entry, mean in zip(
+            off, kappa.entries, means.reshape(len(means), -1).T, strict=True
         ):
             found = range_of(entry, cells)
             if found is None:
                 self.reason = NO_RANGE
-            else:
-                row[:] = np.maximum(found[1] - mean, mean - found[0])
-        # |κ_T^{-1/2} (κ − κ_T) κ_T^{-1/2}|, entry by entry, is at most this
-        assert cells.stretch is not None
-        size = np.abs(cells.stretch) @ np.maximum(off, 0.0) @ np.abs(cells.stretch)
-        theta = np.linalg.norm(size, axis=(1, 2)) / self.mean
-        if not cells.comm.allreduce(float(theta.max(initial=0.0)), op=MPI.MAX) > STEADY:
-            theta[:] = 0.0
+                return
+            row[:] = np.maximum(found[1] - mean, mean - found[0])
+        theta = self._by_mean(np.maximum(off, 0.0), cells)
+        varies = bool((off > STEADY * np.abs(means).max(axis=(1, 2), initial=0.0)).any())
+        if cells.comm.allreduce(varies, op=MPI.LOR):
+            self.tensor, self.rule, self.spread = kappa, kappa.fine, theta
+            deviations = [Deviation(entry) for entry in kappa.entries]
+
+            def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
+                at = Enclosure(boxes)
+                return np.stack([deviation(at, half)[0] for deviation in deviations])
+
+            rough = self._by_mean(errors_on(Pieces.of_cells(cells), errors, cells), cells)
+            self.rough = np.fmin(rough, theta)
         else:
-            self.spread = theta
+            theta = np.zeros_like(theta)
         if (theta >= 1.0).any():
             self.reason = "the coefficient is a tensor that varies too much within a cell"
         self.low, self.high = (1.0 - theta) * self.mean, (1.0 + theta) * self.mean
-        self.least, self.most = (
-            (1.0 - theta) * eigenvalues[:, 0],
-            (1.0 + theta) * eigenvalues[:, -1],
-        )
+        self.least = (1.0 - theta) * eigenvalues[:, 0]
+        self.most = (1.0 + theta) * eigenvalues[:, -1]
+
+    def _by_mean(self, sizes: FloatArray, cells: Cells) -> FloatArray:
+        """Bounds of |κ_T^{-1/2} E κ_T^{-1/2}|, E with entries of such sizes, shape (cells,)."""
+        d, stretch = cells.tdim, cells.stretch
+        assert stretch is not None
+        stretched = np.abs(stretch) @ sizes.T.reshape(-1, d, d) @ np.abs(stretch)
+        return np.asarray(np.linalg.norm(stretched, axis=(1, 2)) / self.mean)
+
+    def apart(self, cells: Cells, part: slice) -> FloatArray:
+        """κ − κ_T where lengths are stretched, at the rule's points, shape (q, cells, d, d)."""
+        assert self.tensor is not None and cells.stretch is not None
+        stretch = cells.stretch[part]
+        found = stretch[:, None] @ self.tensor.at(cells.domain, self.rule, part) @ stretch[:, None]
+        return found.transpose(1, 0, 2, 3) - self.mean[part, None, None] * np.eye(cells.tdim)
 
     def _of_scalar(self, kappa: Volume, cells: Cells) -> None:
         fine = kappa.exact_for(KAPPA_DEGREE)

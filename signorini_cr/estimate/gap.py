@@ -65,9 +65,9 @@ def integrate(
             sums.far += float(np.sum(far))
             sums.near += float(np.sum(near))
             sums.energy_slack += float(np.sum(of_energy))
-        if kappa.spread is not None:
-            steep = pick(kappa.mean, part) * flux.steepness[part]
-            far, near, of_energy = _spread(kappa.spread[part], pp, bb, pb, vv, steep)
+        if kappa.tensor is not None:
+            gap = pp + bb - 2.0 * pb, pp + bb + 2.0 * pb
+            vv, far, near, of_energy = _of_tensor(cells, kappa, part, flux, v, w, gap)
             around += near
             beside += far
             sums.far += float(np.sum(far))
@@ -411,33 +411,57 @@ def _by_quadrature(
     return tuple(rows)
 
 
-def _spread(
-    theta: FloatArray,
-    pp: FloatArray,
-    bb: FloatArray,
-    pb: FloatArray,
-    vv: FloatArray,
-    steep: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What |p − b|², |p + b|² and ½κ|∇v|² may have beyond κ_T's for a tensor within θ of κ_T.
+def _of_tensor(
+    cells: Cells,
+    kappa: Coefficient,
+    part: slice,
+    flux: Flux,
+    v: Companion,
+    w: FloatArray,
+    gap: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """What a tensor that varies within cells does to the gap.
 
-    ‖κ^{-1/2}(y − κ∇z)‖ ≤ (1 − θ)^{-1/2} (‖κ_T^{-1/2}(y − κ_T∇z)‖ + θ ‖κ_T^{1/2}∇z‖), z = v and
-    z = 2u_h − v.
+    For F = y − κ∇z, z = v or 2u_h − v, and with N the root of the rule's ∫ |·|² / k where lengths
+    are stretched, ‖κ^{-1/2}F‖ ≤ (1 − θ)^{-1/2} (N(F) + 2ϱ N(k∇z)): the rule is exact for the
+    polynomial within ϱ κ_T of κ.
 
     Args:
-        theta: θ, shape (n,).
-        pp: ∫_T |p|², and so on, for κ_T.
-        bb: ∫_T |b|².
-        pb: ∫_T p·b.
-        vv: ∫_T κ_T|∇v|².
-        steep: ∫_T κ_T|∇u_h|².
+        cells: The mesh.
+        kappa: The coefficient.
+        part: Which cells.
+        flux: y.
+        v: v.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        gap: ∫_T |p − b|² and ∫_T |p + b|² as they are for κ_T.
+
+    Returns:
+        ∫_T κ|∇v|² by the rule; what the gap has beyond that of κ_T; and what the rule may have
+        missed of ½∫_T κ|∇v|².
     """
-    slack = []
-    for sign, zz in ((-2.0, vv), (2.0, 2.0 * (steep + bb) - vv)):
-        square = np.maximum(pp + bb + sign * pb, 0.0)
-        norm = np.sqrt(square) + theta * np.sqrt(np.maximum(zz, 0.0))
-        slack.append(norm**2 / (1.0 - theta) - square)
-    return slack[0], slack[1], 0.5 * theta * vv
+    d, k, volume = cells.tdim, pick(kappa.mean, part)[:, None], cells.volume[part]
+    P, slopes, theta = flux.excess[:, part], v.slopes(cells, part), kappa.spread[part]
+    s, (corners, gradients) = sum_rows(P), cells.corners(part)
+    own = np.einsum("in,ink->nk", w[:, part], gradients)
+    off, rule = kappa.apart(cells, part), kappa.rule
+    squares, steep = np.zeros((2, 2, len(volume)))
+    vv = np.zeros(len(volume))
+    for tensor, weight, hat in zip(off, rule.weights, rule.hats.T[:, :, None], strict=True):
+        Q = hat * s - P
+        if flux.beyond is not None:
+            Q += flux.beyond.through(cells, part, hat)
+        y = np.einsum("in,ink->nk", Q, corners) / (d * volume)[:, None] + k * own
+        change = np.einsum("in,ink->nk", np.broadcast_to(slopes(hat), w[:, part].shape), gradients)
+        for i, slope in enumerate((own + change, own - change)):
+            flow = k * slope + np.einsum("nij,nj->ni", tensor, slope)
+            squares[i] += weight * ((y - flow) ** 2).sum(axis=1)
+            steep[i] += weight * (slope**2).sum(axis=1)
+            if i == 0:
+                vv += weight * (flow * slope).sum(axis=1)
+    rough, mean = kappa.rough[part], k[:, 0]
+    found = np.sqrt(volume / mean * squares) + 2.0 * rough * np.sqrt(volume * mean * steep)
+    far, near = found**2 / (1.0 - theta) - np.stack(gap)
+    return volume * vv, far, near, rough * mean * volume * steep[0]
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:

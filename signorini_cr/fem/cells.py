@@ -161,6 +161,16 @@ class Cells:
         """The same with lengths as they are."""
         return self if self.stretch is None else Cells(self.domain, self.V, self.fixed, self.sinks)
 
+    def corners(self, part: slice) -> tuple[FloatArray, FloatArray]:
+        """Vertices, stretched, and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""
+        mesh = self.domain.mesh
+        nodes = compat.cell_nodes(mesh)[: self.number][part]
+        x = mesh.geometry.x[nodes.T, : mesh.geometry.dim]
+        if self.stretch is not None:
+            x = np.einsum("nij,cnj->cni", self.stretch[part], x)
+        inverse = np.linalg.inv((x[1:] - x[0]).transpose(1, 0, 2)).transpose(2, 0, 1)
+        return x, np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])
+
     def coefficient(self, kappa: FloatArray) -> fem.Function:
         """κ to write in forms: by cells, and with a stretch κ stretch⁻², a tensor; collective.
 

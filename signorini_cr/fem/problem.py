@@ -269,6 +269,9 @@ class Forms:
             for material, data in self.problem.materials.items()
             if (datum := getattr(data, name)) is not None
         }
+        if any(each.ufl_shape for each in (base, *own.values())):
+            base, *others = map(self._as_tensor, (base, *own.values()))
+            own = dict(zip(own, others, strict=True))
         numbers = [number(each) for each in (base, *own.values())]
         if None not in numbers:
             if len(set(numbers)) == 1:
@@ -284,6 +287,10 @@ class Forms:
             there = self._on_cells(f"in {material}", [0.0, 1.0], materials, (material,))
             found = _chosen(ufl.gt(there, 0.5), datum, found)
         return found
+
+    def _as_tensor(self, datum: Expr) -> Expr:
+        """A scalar as the tensor that does the same."""
+        return datum if datum.ufl_shape else datum * ufl.Identity(self.mesh.geometry.dim)
 
     def _on_cells(
         self,
@@ -545,8 +552,10 @@ def _chosen(condition: Expr, first: Expr, second: Expr) -> Expr:
     """The first where a condition holds, else the second, entry by entry."""
     if not first.ufl_shape:
         return ufl.conditional(condition, first, second)
-    rows = [_chosen(condition, first[i], second[i]) for i in range(first.ufl_shape[0])]
-    return ufl.as_tensor(rows)
+    rows, columns = map(range, first.ufl_shape)
+    return ufl.as_matrix(
+        [[ufl.conditional(condition, first[i, j], second[i, j]) for j in columns] for i in rows]
+    )
 
 
 def _check_materials(problem: Problem, materials: Materials) -> None:

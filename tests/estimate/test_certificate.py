@@ -624,7 +624,6 @@ def test_refusals():
     domain = exact.S1.structured(8)
     cases = {
         "only a Crouzeix-Raviart": (Problem(f=1.0), "P1"),
-        "not a scalar": (Problem(f=1.0, coefficient=lambda x: ufl.Identity(2)), "CR"),
         # an operator that nothing is known of before solving
         "below α": (Problem(f=1.0, obstacle=lambda x: 1 + ufl.bessel_J(0, x[0]) ** 2), "CR"),
         "computable": (Problem(f=1.0, coefficient=lambda x: 1 + ufl.bessel_J(0, x[0]) ** 2), "CR"),
