@@ -495,6 +495,7 @@ def some_cells(seed):
         low=rng.uniform(0.5, 1, cells.number), high=rng.uniform(1, 3, cells.number)
     )
     kappa.mean = (kappa.low + kappa.high) / 2
+    kappa.least, kappa.most = kappa.low, kappa.high
     rows = dict(
         zip(
             ("indicators", "steepness", "middle", "across"),
@@ -632,7 +633,8 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     cells, (edge,) = data.cells, data.edges
     rng = np.random.default_rng(4)
     n, number = len(edge.measure), cells.number
-    kappa = SimpleNamespace(low=rng.uniform(0.5, 1, number))
+    low = rng.uniform(0.5, 1, number)
+    kappa = SimpleNamespace(low=low, least=low)
     segments = Segments.of(edge, cells, kappa.low, 1.0)
     missed, rough = (rng.uniform(size=n) * of_g for _ in range(2))
     segments = replace(segments, missed=missed, rough=rough)
@@ -1175,7 +1177,7 @@ def test_what_oscillates_on_thin_cells():
     """σ for f and for g is known by its norm alone: ‖a‖ + ‖σ‖ is what ‖a + σ‖ may be."""
     cells, rng, kappa, _ = some_cells(15)
     number = cells.number
-    kappa.values = kappa.cut = None
+    kappa.values = kappa.cut = kappa.tensor = None
     excess, w = rng.normal(size=(2, 3, number))
     v = companion.Companion(
         None, rng.normal(size=len(cells.exterior)), rng.normal(size=(3, number)),
