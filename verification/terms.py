@@ -24,6 +24,7 @@ from signorini_cr import (
     Contact,
     Dirichlet,
     InputError,
+    Material,
     Neumann,
     NotConverged,
     Polygon,
@@ -147,6 +148,10 @@ class Case:
         """κ for UFL."""
         return self.kappa
 
+    def mass(self, x: Any) -> Any:
+        """C."""
+        return self.c
+
     def through(self, i: int, x: Any, y: Any, sin: Any = np.sin, cos: Any = np.cos) -> Any:
         """κ∇u·n on an edge."""
         (p, q), (a, b), (xx, xy, yy) = NORMALS[i], self.slope(x, y, cos), self.tensor(x, y, sin)
@@ -206,7 +211,7 @@ class Case:
         x, y = np.meshgrid(t, t)
         a, b = self.slope(x, y)
         u = self.u(x, y)
-        inside = 0.5 * self.squares(a, b, x, y) + 0.5 * self.c * u**2 - self.f(x, y) * u
+        inside = 0.5 * self.squares(a, b, x, y) + 0.5 * self.mass(x) * u**2 - self.f(x, y) * u
         total = float(weights @ inside @ weights)
         for i, side in enumerate(self.sides):
             if side.kind == "dirichlet":
@@ -286,6 +291,70 @@ class Anisotropic(Case):
         return bend
 
 
+class Layered(Case):
+    """The same with κ and c of their own for x > ½; there u oscillates less where κ is larger.
+
+    u is a function of y and of (x − ½) times the smaller κ over κ: it and κ∂u/∂x have no jump.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        super().__init__(rng)
+        ratio = 10.0 ** float(rng.uniform(0, 4)) if rng.random() < 0.7 else 1.0
+        self.kappas = tuple(self.kappa * k for k in ((1.0, ratio), (ratio, 1.0))[rng.integers(2)])
+        self.masses = self.c, float(rng.choice([0.0, 1.0, 1e4, 1e8]))
+
+    def _here(self, x: Any, west: Any, east: Any) -> Any:
+        if isinstance(x, np.ndarray):
+            return np.where(x < 0.5, west, east)
+        return ufl.conditional(ufl.lt(x, 0.5), west, east)
+
+    def _place(self, x: Any) -> Any:
+        west, east = (self.kappa / k for k in self.kappas)
+        return 0.5 + self._here(x, west * (x - 0.5), east * (x - 0.5))
+
+    def u(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """U."""
+        return super().u(self._place(x), y, sin)
+
+    def slope(self, x: Any, y: Any, cos: Callable[[Any], Any] = np.cos) -> tuple[Any, Any]:
+        """∇u."""
+        a, b = super().slope(self._place(x), y, cos)
+        return a * self._here(x, *(self.kappa / k for k in self.kappas)), b
+
+    def tensor(self, x: Any, y: Any, sin: Any = np.sin) -> tuple[Any, Any, Any]:
+        """κ's entries."""
+        here = self._here(x, *self.kappas)
+        return here, 0.0, here
+
+    def mass(self, x: Any) -> Any:
+        """C."""
+        return self._here(x, *self.masses)
+
+    def f(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """−∇·(κ∇u) + c u."""
+        rows = zip(self.amplitudes, self.waves, self.phases, strict=True)
+        along, c = self._place(x), self.mass(x)
+        across, up = self._here(x, *(self.kappa**2 / k for k in self.kappas)), self.tensor(x, y)[2]
+        return sum(
+            (float(p * p) * across + float(q * q) * up + c)
+            * float(a)
+            * sin(float(p) * along + float(q) * y + float(s))
+            for a, (p, q), s in rows
+        )
+
+    def problem(self) -> Problem:
+        """All data, none derived from u."""
+        (west, east), (first, second) = self.kappas, self.masses
+        materials = {"east": Material(coefficient=east, reaction=second)}
+        return replace(super().problem(), coefficient=west, reaction=first, materials=materials)
+
+
+EAST = [[0.5, 0.0], [1.0, 0.0], [1.0, 1.0], [0.5, 1.0]]
+
+
 def _gauss(cuts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ten points between any two of the cuts."""
     x, w = np.polynomial.legendre.leggauss(10)
@@ -314,7 +383,7 @@ def distances(solution: Solution, case: Case) -> tuple[float, float]:
     a, b = (exact - own for exact, own in zip(case.slope(*here), slope.T[..., None], strict=True))
     off = (case.u(*here) - values @ hats) ** 2
     h1 = float(area @ ((a**2 + b**2) @ weights))
-    whole = float(area @ ((case.squares(a, b, *here) + case.c * off) @ weights))
+    whole = float(area @ ((case.squares(a, b, *here) + case.mass(here[0]) * off) @ weights))
     t, w = 0.5 * (x + 1.0), 0.5 * w
     for i, side in enumerate(case.sides):
         if side.b == 0.0:
@@ -348,8 +417,11 @@ def judge(solution: Solution, case: Case) -> Outcome:
 
 def solved(case: Case, rng: np.random.Generator) -> Solution:
     """On one of several kinds of meshes; collective."""
-    polygon = Polygon(CORNERS, SIDES, names=SIDES)
+    layered = isinstance(case, Layered)
+    polygon = Polygon(CORNERS, SIDES, names=SIDES, materials={"east": EAST} if layered else {})
     kind, levels = str(rng.choice(["structured", "gmsh", "adaptive"])), int(rng.integers(1, 4))
+    if kind == "structured" and layered:
+        kind = "gmsh"
     if kind == "structured":
         domain = families.structured(polygon, int(rng.integers(4, 12)), COMM)
     else:
@@ -409,6 +481,8 @@ REFERENCE = "u in closed form, written anew; Gauss's rules on triangles and edge
 
 DRAWN = "c and b up to 1e8, one to four contact parts, bounds on either side"
 TENSORS = "the same with κ a tensor, its eigenvalues up to 1 : 10⁴, in two fifths with waves"
+
+LAYERS = "the same with κ, up to 1 : 10⁴, and c, up to 1e8 or 0, of their own left and right"
 
 
 def _drawn(seed: int, number: int, kind: type[Case], name: str) -> Row:
@@ -519,6 +593,7 @@ def terms(seed: int, quick: bool) -> Group:
         [
             told(_drawn(seed, 4 if quick else 500, Case, DRAWN)),
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
+            told(_drawn(seed, 2 if quick else 150, Layered, LAYERS)),
             told(_smooth(1 if quick else 4)),
             told(_fluxes(seed, 2 if quick else 100)),
             told(_means(seed, 1 if quick else 50)),

@@ -123,8 +123,7 @@ KEYS = (
     Key(MATERIAL, "coefficient", TENSOR, "that of [data]", "κ there: a number, or a tensor as that "
         "of wood along its grain and across.", "coefficient = [[0.3, 0], [0, 0.12]]"),
     Key(MATERIAL, "f", EXPRESSION, "that of [data]", "The load there.", "f = -2"),
-    Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there; a c that is not the same "
-        "everywhere has no certificate.", "reaction = 2"),
+    Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there.", "reaction = 2"),
     Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "
         "are then computed, and f, g and dirichlet, where left out, are derived from it.",
         'u = "x**2 - y**2"'),

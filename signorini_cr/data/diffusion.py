@@ -13,11 +13,11 @@ from dolfinx import fem
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import Cells, vertex_rows
-from ..fem.conditions import Condition, may_change
+from ..fem.conditions import Condition, may_change, number
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
-from ..mesh.domain import Domain
+from ..mesh.domain import Domain, is_by_cells
 from .loads import Edge, Load, chi
 from .moments import Compiled, OnFacets, Tensor
 
@@ -89,6 +89,16 @@ class DiffusionOnMesh:
     def load(self) -> Load:
         """Moments of f and what it has beside."""
         return self.with_source(self.of_f)
+
+    @property
+    def reaction(self) -> FloatArray:
+        """C on owned cells, shape (cells,), or () where it is a number."""
+        c = self.forms.reaction
+        if not is_by_cells(c):
+            return np.array(number(c) or 0.0)
+        own = self.domain.own(c)
+        dofs = own.function_space.dofmap.list[: self.cells.number, 0]
+        return np.asarray(own.x.array[dofs], dtype=np.float64)
 
     def with_source(self, load: Load) -> Load:
         """Moments of f, as given, and what it has beside."""

@@ -17,6 +17,9 @@ from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
 from .ranges import Cut, Pieces, cut, errors_on, refine
 
+NOTHING = np.array(0.0)
+"""A reaction that is none."""
+
 
 class Load:
     """f as the certificate sees it: a few moments on each cell.
@@ -61,11 +64,11 @@ class Load:
         out *= cells.volume[part]
         return out
 
-    def less(self, c: float, w: FloatArray) -> Load:
+    def less(self, c: float | FloatArray, w: FloatArray) -> Load:
         """The same of f − c w, w affine on each cell.
 
         Args:
-            c: A number.
+            c: A number, or one for each cell, shape (cells,).
             w: Values at the cells' vertices, shape (d + 1, cells).
         """
         k = len(w)
@@ -155,7 +158,7 @@ class Certain:
         cells: Cells,
         low: FloatArray,
         size: float,
-        reaction: float = 0.0,
+        reaction: FloatArray = NOTHING,
     ) -> Certain:
         """Enclose f; collective.
 
@@ -165,7 +168,7 @@ class Certain:
             cells: The mesh.
             low: Lower bound of κ, shape (cells,) or ().
             size: Of the bound, to which what is missed should be small.
-            reaction: c.
+            reaction: c, shape (cells,) or ().
         """
         if f.number is not None:
             return cls(load)
@@ -182,7 +185,7 @@ class Certain:
         weights = np.empty((2, cells.number))
         np.multiply(2.0 / (np.sqrt(low) * goal), cells.volume, out=weights[0])
         # J(v) asks for the first of these, the bound for the second
-        norms = mean_to_norm(cells, low, 0.0) * mean_to_norm(cells, low, reaction)
+        norms = mean_to_norm(cells, low, NOTHING) * mean_to_norm(cells, low, reaction)
         np.multiply((2.0 / goal) ** 2 * cells.volume, norms, out=weights[1])
         try:
             found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
@@ -196,19 +199,28 @@ class Certain:
 
 
 def mean_to_norm(
-    cells: Cells, low: FloatArray, reaction: float, part: slice | None = None
+    cells: Cells, low: FloatArray, reaction: FloatArray, part: slice | None = None
 ) -> FloatArray:
     """C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the part,).
 
     Args:
         cells: The mesh.
         low: Lower bound of κ, shape (cells,) or ().
-        reaction: c.
+        reaction: c, shape (cells,) or ().
         part: Which cells; None for all.
     """
     part = slice(0, cells.number) if part is None else part
     by_slope = poincare(cells.tdim) * np.sqrt(cells.diameter2[part] / pick(low, part))
-    return np.minimum(by_slope, reaction**-0.5) if reaction else by_slope
+    if not reacts(reaction):
+        return by_slope
+    c = pick(reaction, part)
+    inverse = np.divide(1.0, c, out=np.full_like(by_slope, np.inf), where=c > 0.0)
+    return np.minimum(by_slope, np.sqrt(inverse))
+
+
+def reacts(reaction: FloatArray) -> bool:
+    """Whether there is a reaction; the same on all ranks."""
+    return reaction.ndim > 0 or bool(reaction > 0.0)
 
 
 SHARE = 4e-3

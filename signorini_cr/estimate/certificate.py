@@ -17,9 +17,9 @@ import ufl
 from dolfinx import fem
 
 from .. import compat
-from ..arrays import FloatArray, IndexArray
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
-from ..data.loads import Certain, Known, Load, Segments, mean_to_norm
+from ..data.loads import NOTHING, Certain, Known, Load, Segments, mean_to_norm, reacts
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
@@ -163,9 +163,9 @@ class Made:
     thirds: FloatArray | None
     cusps: Cusps | None
     varies: bool
-    reaction: float
+    reaction: FloatArray
     left: FloatArray
-    taken_up: bool
+    taken_up: BoolArray | None
     shed: FloatArray | None
     forces: dict[int, float]
     missed: float
@@ -232,7 +232,7 @@ class _Known:
         level: The mesh, with those below it.
         cells: What the certificate needs to know of it.
         kappa: The coefficient.
-        reaction: c.
+        reaction: c, shape (cells,) or ().
         certain: f − c u_h.
         segments: g − b u_h.
         flux: y.
@@ -245,7 +245,7 @@ class _Known:
     level: Level
     cells: Cells
     kappa: Coefficient
-    reaction: float
+    reaction: FloatArray
     certain: Certain
     segments: Segments
     flux: Flux
@@ -267,11 +267,11 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     data = diffusion(level.data)
     _insist(data.forms.uncertified)
     cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
-    kappa, reaction = Coefficient(data.compiled.kappa, cells), data.forms.reaction_number
+    kappa, reaction = Coefficient(data.compiled.kappa, cells), data.reaction
     _insist(kappa.reason)
     w = vertex_rows(u, cells)
     load, edge = data.load, Known.of(data.edges, cells, w)
-    of_u = load if reaction == 0.0 else load.less(reaction, w)
+    of_u = load.less(reaction, w) if reacts(reaction) else load
     contact, signs = alpha.side, alpha.signs
     gap = signs * u[contact.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, of_u, edge, contact, signs, gap)
@@ -284,17 +284,17 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     _insist(segments.reason)
     # y is to have the means that f and g have now
     flux.left += cells.volume * (certain.load.mean - load.mean)
-    if reaction:
+    if reacts(reaction):
         certain = replace(certain, load=certain.load.less(reaction, w))
     change = segments.through - edge.shares.sum(axis=0)
     flux.excess[edge.side.local, edge.side.cells] += change
     np.add.at(flux.left, edge.side.cells, change)
     left = carried = 0.0
-    if not flux.taken_up:
-        left = unbalanced(level, cells, flux.left, kappa.least, size, reaction)
+    if flux.taken_up is None or reaction.ndim:
+        left = unbalanced(level, cells, flux.loose, kappa.least, size, reaction)
         carried = balance(cells, flux, kappa.low, size, left)
         if carried:
-            left = unbalanced(level, cells, flux.left, kappa.least, size, reaction)
+            left = unbalanced(level, cells, flux.loose, kappa.least, size, reaction)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
@@ -464,7 +464,7 @@ ROUNDING = 64 * np.finfo(np.float64).eps
 
 
 def _rounding(
-    cells: Cells, kappa: Coefficient, reaction: float, w: FloatArray, load: Load, flux: Flux
+    cells: Cells, kappa: Coefficient, reaction: FloatArray, w: FloatArray, load: Load, flux: Flux
 ) -> float:
     """What rounding may do to ‖p ± b‖; collective.
 
@@ -483,7 +483,7 @@ def _rounding(
         if load.variance is not None:
             of_load += np.sqrt(load.variance[part])
         square += cells.diameter2[part] * cells.volume[part] * of_load**2 / low
-        square += reaction * cells.volume[part] * values**2
+        square += pick(reaction, part) * cells.volume[part] * values**2
         if largest is not None:
             square += trace * largest[part] ** 2 / low
         if cells.stretch is not None:  # it is as good as κ's eigenvalues are near to one another
@@ -509,8 +509,8 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         missed = certain.missed
         assert sums.steepness is not None
         for part in blocks(cells.number):
-            by_slope = rough = mean_to_norm(cells, kappa.low, 0.0, part) * certain.rough[part]
-            if known.reaction:
+            by_slope = rough = mean_to_norm(cells, kappa.low, NOTHING, part) * certain.rough[part]
+            if reacts(known.reaction):
                 rough = mean_to_norm(cells, kappa.low, known.reaction, part) * certain.rough[part]
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
             if cells.tdim == 2:
@@ -555,8 +555,9 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     assert sums.indicators is not None
     change = before * steep + np.sqrt(cells.volume[which]) * f * area
     if sums.apart is not None:
-        steep = np.hypot(steep, np.sqrt(reaction) * area)
-        change += np.sqrt(reaction * sums.apart[which]) * area
+        c = pick(reaction, which)
+        steep = np.hypot(steep, np.sqrt(c) * area)
+        change += np.sqrt(c * sums.apart[which]) * area
     # on facets of Γ1 with a flux that is known
     loss, known_flux, apart = known.segments.at_facets(v.vertices, v.bumps, known.w)
     there, on_contact = v.boundary.alpha.side.dofs, place[-len(edge) :] if len(edge) else place[:0]

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
+from ..data.loads import reacts
 from ..data.moments import OnFacets, OnParts
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, sum_rows
 from .cusps import Cusps
@@ -48,19 +49,24 @@ class Masses:
 
     Attributes:
         some: Whether there is a c or a b, here or on other ranks.
-        reaction: c.
+        reaction: c, shape (cells,) or ().
         side: Facets with a b.
         loss: b |F| there, shape (n,).
     """
 
     some: bool
-    reaction: float
+    reaction: FloatArray
     side: Side
     loss: FloatArray
 
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
         """Add what heights of bumps are pulled by, in units of 8/3, shape (3, n)."""
-        return self.reaction * cells.volume[part] / 20.0 * (excess - 2.0 * sum_rows(excess))
+        return (
+            pick(self.reaction, part)
+            * cells.volume[part]
+            / 20.0
+            * (excess - 2.0 * sum_rows(excess))
+        )
 
     def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
         """The same of b, on its facets."""
@@ -436,14 +442,14 @@ def _sweep(
         E, and what it would fall by if each height were put right as if it were alone.
     """
     slope, diagonal = np.empty_like(excess), np.empty(cells.number)
-    energy, c = 0.0, masses.reaction
+    energy, c, reacting = 0.0, masses.reaction, reacts(masses.reaction)
     for part in blocks(cells.number):
         k = pick(kappa, part)
         diagonal[part] = k * cells.trace(part)
         np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
         energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
-        if c:
-            volume = c * cells.volume[part]
+        if reacting:
+            volume = pick(c, part) * cells.volume[part]
             energy += float(np.sum(volume * distance(excess[:, part], None)))
             slope[:, part] += masses.pull(cells, excess[:, part], part)
             diagonal[part] += volume / 15.0
@@ -458,8 +464,8 @@ def _sweep(
         """The matrix of E, but for b, times heights of local bumps, which are lost."""
         image = _across(cells, height, part)
         image *= 2.0 * pick(kappa, part)
-        if c:
-            image += c * cells.volume[part] / 15.0 * sum_rows(height)
+        if reacting:
+            image += pick(c, part) * cells.volume[part] / 15.0 * sum_rows(height)
         height *= diagonal[part]
         image += height
         return image
@@ -476,7 +482,7 @@ def _sweep(
     down = cells.over_facets(slope)
     down[held] = 0.0
     weight = np.tile(diagonal, (len(excess), 1))
-    if c:
+    if reacting:
         weight += c * cells.volume / 15.0
     np.add.at(weight, at, lost[masses.side.dofs])
     weight = cells.over_facets(weight)

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
-from ..data.loads import Known, Load, to_cells
+from ..data.loads import NOTHING, Known, Load, reacts, to_cells
 from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare, sum_rows
 from .beyond import Beyond
 
@@ -36,7 +36,7 @@ class Flux:
         left: ∫_T (f + div y), shape (cells,).
         steepness: ‖∇u_h‖²_T, shape (cells,).
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
-        taken_up: Whether c takes up what is left.
+        taken_up: Where c takes up what is left, shape (cells,); None for nowhere on any rank.
         shed: ∫_F (g − b u_h − y·n) for b to take up, in the order of `Known`; None for nothing.
     """
 
@@ -46,8 +46,13 @@ class Flux:
     left: FloatArray
     steepness: FloatArray
     beyond: Beyond | None = None
-    taken_up: bool = False
+    taken_up: BoolArray | None = None
     shed: FloatArray | None = None
+
+    @property
+    def loose(self) -> FloatArray:
+        """What is left and not taken up, shape (cells,)."""
+        return self.left if self.taken_up is None else np.where(self.taken_up, 0.0, self.left)
 
 
 def equilibrate(
@@ -119,34 +124,37 @@ def relax(
     cells: Cells,
     kappa: FloatArray,
     flux: Flux,
-    reaction: float,
+    reaction: FloatArray,
     edge: Known,
     on_contact: Side,
     signs: FloatArray,
-) -> bool:
+) -> BoolArray | None:
     """Bring y nearer to κ∇u_h where c can take up what it then lacks; collective.
 
     With f + div y = left_T/|T| on T instead of 0 the bound has ‖c^{-1/2} left_T/|T|‖_T more, and
     where c h_T² is larger than κ that is less than what ‖κ^{-1/2}(y − κ∇u_h)‖_T falls by. So it is
     with b, g − b u_h − y·n and ‖b^{-1/2} ·‖_F. The squares' sum is minimised by conjugate gradients
-    in the fluxes through facets inside, on Γ0, with a b and in contact; forces that come out below
-    0 are 0.
+    in the fluxes through facets inside, on Γ0, with a b and in contact, but for those of cells
+    without a c; forces that come out below 0 are 0.
 
     Args:
         cells: The mesh.
         kappa: Mean of κ, shape (cells,) or ().
         flux: y, changed in place.
-        reaction: c.
+        reaction: c, shape (cells,) or ().
         edge: Integrals of g − b u_h.
         on_contact: The facets of Γ1, once for each bound.
         signs: 1 for α, −1 for β, shape (n,).
 
     Returns:
-        Whether it was called for, and c and b are to take up all that is left.
+        `Flux.taken_up`.
     """
-    ratio = float((reaction * cells.diameter2 / kappa).max(initial=0.0)) if reaction else 0.0
-    if cells.tdim != 2 or cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
-        return False
+    if cells.tdim != 2 or not reacts(reaction):
+        return None
+    ratio = float((reaction * cells.diameter2 / kappa).max(initial=0.0))
+    if cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
+        return None
+    takers = np.broadcast_to(reaction > 0.0, cells.number)
     held, lossy = cells.exterior.astype(np.float64), np.zeros(len(cells.exterior))
     for part in cells.fixed:
         held[cells.sides[part].dofs] = 0.0
@@ -154,11 +162,14 @@ def relax(
     touched = on_contact.dofs[flux.touching]
     held[on_contact.dofs] = lossy[on_contact.dofs] == 0.0
     held[touched] = lossy[touched] = 0.0
+    if reaction.ndim:
+        held[cells.facets[:, ~takers]] = 1.0
     sides = edge.side.local, edge.side.cells
     loss = lossy[edge.side.dofs] * measures(cells, edge.side)
     of_edge = np.divide(1.0, loss, out=np.zeros_like(loss), where=loss > 0.0)
     free = cells.share(held) == 0.0
-    owned, weight = slice(cells.owned_facets()), 1.0 / (reaction * cells.volume)
+    owned, mass = slice(cells.owned_facets()), reaction * cells.volume
+    weight = np.divide(1.0, mass, out=np.zeros_like(mass), where=takers)
     # a flux counts as positive out of one of the facet's two cells, the same on all ranks
     sign = cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]])
 
@@ -200,7 +211,7 @@ def relax(
     flux.shed = np.where(loss > 0.0, -fluxes[sides], 0.0)
     flux.excess += fluxes
     flux.left += sum_rows(fluxes)
-    return True
+    return takers
 
 
 def _field_slopes(cells: Cells, fluxes: FloatArray) -> FloatArray:
@@ -221,7 +232,7 @@ def unbalanced(
     left: FloatArray,
     kappa_min: FloatArray,
     size: float = 0.0,
-    reaction: float = 0.0,
+    reaction: FloatArray = NOTHING,
 ) -> float:
     """Bound W with |Σ_T left_T e_T| ≤ W times e's energy norm, for e ∈ H¹ that vanishes on Γ0.
 
@@ -235,12 +246,15 @@ def unbalanced(
         left: Integrals over the cells, shape (cells,).
         kappa_min: Lower bound of κ's eigenvalues on each cell, shape (cells,) or ().
         size: Of the bound, to which what is carried may be small.
-        reaction: c: ‖c^{1/2} e‖ bounds it, too.
+        reaction: c, shape (cells,) or (): ‖c^{1/2} e‖ bounds it, too.
     """
     volume, bound = cells.volume, 0.0
     taken_up = np.inf
-    if reaction > 0.0:
-        taken_up = float(np.sqrt(cells.total(np.sum(left**2 / volume))[0] / reaction))
+    if reacts(reaction):
+        mass = reaction * volume
+        share = np.where(left == 0.0, 0.0, np.inf)
+        np.divide(left**2, mass, out=share, where=mass > 0.0)
+        taken_up = float(np.sqrt(cells.total(np.sum(share))[0]))
         if taken_up <= WORTH * size:
             return taken_up
     meshes = level.meshes
@@ -263,7 +277,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
 
     Args:
         cells: The mesh.
-        flux: y; what is left becomes 0 but for rounding.
+        flux: y; what is left and not taken up becomes 0 but for rounding.
         kappa_min: Lower bound of κ on each cell, shape (cells,) or ().
         size: About ‖κ^{-1/2}(y − κ∇u_h)‖.
         bound: What `unbalanced` gives.
@@ -273,7 +287,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     """
     if bound <= WORTH * size or cells.sinks:
         return 0.0
-    fluxes, all_reached = _carry(cells, flux.left)
+    fluxes, all_reached = _carry(cells, flux.loose)
     if not all_reached:
         return 0.0
     squares = field_squares(cells, fluxes) / kappa_min

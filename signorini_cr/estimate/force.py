@@ -13,7 +13,7 @@ from dolfinx.la import InsertMode
 
 from ..arrays import FloatArray, Int32Array
 from ..data.diffusion import diffusion
-from ..data.loads import trace_of
+from ..data.loads import reacts, trace_of
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
 from ..fem.conditions import Condition, facets_of
@@ -168,14 +168,14 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray
     work -= (s * total - dot_rows(P, at)) / d - s * total / (d + 1)
     if made.hats is not None:
         work -= cells.volume * dot_rows(made.hats, at)
-    if made.reaction:
+    if reacts(made.reaction):
         means = (sum_rows(v - w) * total + dot_rows(v - w, at)) / 12.0
         means += (2.0 * sum_rows(height) * total - dot_rows(height, at)) / 15.0
         work += made.reaction * cells.volume * means
     slack = np.abs(made.left * total) / (d + 1)
-    if made.taken_up:
-        work -= made.left * total / (d + 1)
-        slack[:] = 0.0
+    if made.taken_up is not None:
+        work -= np.where(made.taken_up, made.left * total, 0.0) / (d + 1)
+        slack[made.taken_up] = 0.0
     edge = made.segments
     on_edge = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, at))
     of_edge = edge.measure * np.sum(edge.weights[:, None] * edge.rest * on_edge, axis=0)
@@ -194,7 +194,8 @@ def square(made: Made, cells: Cells, at: FloatArray) -> float:
     total, edge = sum_rows(at), made.segments
     slopes = cells.apply(at, slice(0, cells.number))
     found = float(np.sum(made.kappa * dot_rows(at, slopes)))
-    found += made.reaction / 12.0 * float(cells.volume @ (total**2 + dot_rows(at, at)))
+    masses = made.reaction * cells.volume
+    found += float(masses @ (total**2 + dot_rows(at, at))) / 12.0
     (a, b), measure = trace_of(cells, edge.facets, at), measures(cells, edge.facets)
     return found + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
 
@@ -202,13 +203,13 @@ def square(made: Made, cells: Cells, at: FloatArray) -> float:
 def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
     """About a in P1, with data in functions: the same form for all problems, compiled once."""
     mesh, edge = V.mesh, made.segments
-    kappa, loss = (
-        made.cells().coefficient(made.kappa),
-        fem.Function(fem.functionspace(mesh, ("DG", 0))),
-    )
+    constants = fem.functionspace(mesh, ("DG", 0))
+    reaction, loss = fem.Function(constants), fem.Function(constants)
+    reaction.x.array[: len(made.left)] = made.reaction
     loss.x.array[edge.facets.cells] = edge.loss
-    loss.x.scatter_forward()
-    reaction = fem.Constant(mesh, float(made.reaction))
+    for function in (reaction, loss):
+        function.x.scatter_forward()
+    kappa = made.cells().coefficient(made.kappa)
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
     inside = ufl.inner(kappa * ufl.grad(u), ufl.grad(w)) + reaction * u * w
     found: fem.Form = compiled(mesh.comm, fem.form, inside * ufl.dx + loss * u * w * ufl.ds)

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..data.loads import Load, Segments, trace_of
+from ..data.loads import NOTHING, Load, Segments, reacts, trace_of
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bump_squares, distance, on_facet
@@ -34,7 +34,7 @@ def integrate(
     load: Load,
     flux: Flux,
     v: Companion,
-    reaction: float = 0.0,
+    reaction: FloatArray = NOTHING,
 ) -> Sums:
     """Sum up the parts of the gap.
 
@@ -45,12 +45,12 @@ def integrate(
         load: Moments of f − c u_h.
         flux: y.
         v: v.
-        reaction: c.
+        reaction: c, shape (cells,) or ().
     """
     d = cells.tdim
     indicators, steepness, middle, across = np.empty((4, cells.number))
     sums = Sums(indicators=indicators, steepness=steepness, middle=middle, across=across)
-    if reaction > 0.0:
+    if reacts(reaction):
         sums.zeroth, sums.apart = np.zeros((2, cells.number))
     for part in blocks(cells.number):
         P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
@@ -93,7 +93,7 @@ def integrate(
             osc = square / pick(kappa.low, part)
             taken = _taken_up(square, volume * left[part], kappa, part, reaction)
             if taken is not None and sums.zeroth is not None:
-                osc = np.where(taken, volume * left[part] / reaction, osc)
+                np.divide(volume * left[part], pick(reaction, part), out=osc, where=taken)
                 square = np.where(taken, 0.0, square)
                 sums.zeroth[part] = np.where(taken, osc, 0.0)
             share += osc
@@ -133,22 +133,24 @@ def integrate(
                 beside += osc + 2.0 * (against - work)
         if sums.zeroth is not None and sums.apart is not None:
             size = sum_rows(W) ** 2 + dot_rows(W, W)
-            apart = reaction * volume * distance(c, height)
+            mass = pick(reaction, part) * volume
+            apart = mass * distance(c, height)
             sums.energy += 0.5 * float(np.sum(apart))
-            own = 0.5 * float(np.sum(reaction * volume * size / ((d + 1) * (d + 2))))
+            own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
             sums.energy -= own
             sums.energy_slack += EPS * own
             sums.companion += float(np.sum(apart))
             sums.apart[part] = apart
             sums.zeroth[part] += apart
             share += apart
-            if flux.taken_up:
-                given = flux.left[part] ** 2 / (reaction * volume)
+            if flux.taken_up is not None:
+                rest = np.where(flux.taken_up[part], flux.left[part], 0.0)
+                given = np.divide(rest**2, mass, out=np.zeros_like(rest), where=rest != 0.0)
                 means = sum_rows(c) / (d + 1)
                 if height is not None:
                     means += sum_rows(height) / 3
                 sums.load += float(np.sum(given))
-                sums.load_companion += float(flux.left[part] @ means)
+                sums.load_companion += float(rest @ means)
                 sums.zeroth[part] += given
                 share += given
         sums.flux += float(np.sum(pp))
@@ -165,7 +167,7 @@ def _taken_up(
     variance: FloatArray,
     kappa: Coefficient,
     where: slice | IndexArray,
-    reaction: float,
+    reaction: FloatArray,
 ) -> BoolArray | None:
     """Where c takes up what f has beyond its mean more cheaply than σ does; None for nowhere.
 
@@ -174,11 +176,11 @@ def _taken_up(
         variance: ‖f − f_T‖²_T, shape (n,).
         kappa: The coefficient.
         where: Which cells.
-        reaction: c.
+        reaction: c, shape (cells,) or ().
     """
-    if reaction <= 0.0:
+    if not reacts(reaction):
         return None
-    return np.asarray(variance * pick(kappa.low, where) < reaction * square)
+    return np.asarray(variance * pick(kappa.low, where) < pick(reaction, where) * square)
 
 
 def integrate_edge(
@@ -190,7 +192,7 @@ def integrate_edge(
     flux: Flux,
     v: Companion,
     sums: Sums,
-    reaction: float = 0.0,
+    reaction: FloatArray = NOTHING,
 ) -> float:
     """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
 
@@ -207,7 +209,7 @@ def integrate_edge(
         flux: y.
         v: v.
         sums: What to add to.
-        reaction: c.
+        reaction: c, shape (cells,) or ().
 
     Returns:
         This rank's share of the square of what goes into ω.

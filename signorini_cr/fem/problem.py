@@ -339,11 +339,6 @@ class Forms:
         return tuple(c for c in self.conditions if c.flux is not None)
 
     @property
-    def reaction_number(self) -> float:
-        """c, where it is a number; else 0."""
-        return number(self.reaction) or 0.0
-
-    @property
     def sinks(self) -> dict[int, float]:
         """The parts whose b is a number above 0, and these."""
         found = {c.number: number(c.loss) for c in self.conditions if c.loss is not None}
@@ -354,10 +349,8 @@ class Forms:
         """Why there is no certificate, if the form, the reaction or some condition has none."""
         if self.problem.form is not None:
             return "the form is the user's own: the flux that goes with it is not known"
-        if is_by_cells(self.reaction):
-            return "the reaction differs from cell to cell, and has one number in the bounds"
-        if number(self.reaction) is None:
-            return "the reaction is no number: its part of the energy has no enclosure"
+        if number(self.reaction) is None and not is_by_cells(self.reaction):
+            return "the reaction varies within cells: its part of the energy has no enclosure"
         for condition in self.conditions:
             if condition.uncertified:
                 return condition.uncertified

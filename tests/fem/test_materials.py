@@ -8,6 +8,7 @@ from dolfinx.mesh import compute_midpoints, create_rectangle, exterior_facet_ind
 from mpi4py import MPI
 
 from signorini_cr import (
+    Contact,
     Domain,
     InputError,
     Material,
@@ -197,11 +198,46 @@ def test_materials_in_time():
         next(solve_in_time(of_rock, domain, end=0.1, steps=3))
 
 
-def test_a_reaction_of_materials_has_no_certificate():
-    problem = Problem(f=-1.0, obstacle=-0.1, materials={"rock": Material(reaction=3.0)})
-    solution = solve(problem, layers())
-    assert solution.certificate.bound_h1 is None
-    assert "the reaction differs from cell to cell" in solution.certificate.reason
+@pytest.mark.parametrize(("soil", "rock"), [(0.0, 5.0), (3.0, 0.0), (1e4, 0.0), (1.0, 1e8)])
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_rates_and_bounds_with_reactions_of_materials(soil, rock, adaptive):
+    """u is smooth, in contact for x < ½ with the pressure ½ − x."""
+
+    def u(x):
+        return ufl.sin(2.0 * x[0] + x[1]) + x[1] ** 2
+
+    def pressed(x):
+        return ufl.max_value(0.5 - x[0], 0.0)
+
+    conditions = {
+        "contact": Contact(
+            lambda x: u(x) - ufl.max_value(x[0] - 0.5, 0.0),
+            g=lambda x: -ufl.cos(2.0 * x[0] + x[1]) - pressed(x),
+        )
+    }
+    problem = Problem(
+        exact=u,
+        reaction=soil,
+        conditions=conditions,
+        materials={"rock": Material(reaction=rock)},
+    )
+    errors = []
+    for solution in series(problem, layers(8), adaptive, 3):
+        mesh = solution.domain.mesh
+        made, x = solution.certificate, ufl.SpatialCoordinate(mesh)
+        c = ufl.conditional(ufl.gt(x[1], 0.5), rock, soil)
+        off = u(x) - solution.u
+        rows = ufl.inner(ufl.grad(off), ufl.grad(off)), c * off**2
+        squares = [
+            mesh.comm.allreduce(
+                fem.assemble_scalar(fem.form(row * ufl.dx(metadata={"quadrature_degree": 8})))
+            )
+            for row in rows
+        ]
+        errors.append(np.sqrt(squares[0]))
+        assert made.bound_h1 >= errors[-1]
+        assert 1.0 <= made.bound_energy_norm / np.sqrt(sum(squares)) < 1.3
+    assert adaptive or np.isclose(errors[-2] / errors[-1], 2.0, rtol=0.05)
 
 
 @pytest.mark.parametrize(
