@@ -8,7 +8,7 @@ function of Crouzeix-Raviart, so that all its integrals are exact, the certifica
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from types import TracebackType
@@ -110,23 +110,42 @@ class Solver:
         """The discrete space."""
         return self._level.V
 
-    def solve(self, source: fem.Function | None = None, before: Solution | None = None) -> Solution:
+    def solve(
+        self,
+        source: fem.Function | None = None,
+        before: Solution | None = None,
+        rate: FloatArray | float = 1.0,
+    ) -> Solution:
         """Solve with the data as they are now; collective.
 
         Args:
             source: Added to f, a function in `V`, ghosts up to date.
             before: What to start from, with its active set; from this solver.
+            rate: What the source is multiplied by, one number or one for each owned cell, see
+                `by_material`.
 
         Raises:
             InputError: As for `solve`.
             NotConverged: As for `solve`.
         """
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
-        data = diffusion(self._level.data).renewed(None if source is None else source.x.array)
+        own = None if source is None else source.x.array
+        data = diffusion(self._level.data).renewed(own, np.asarray(rate, dtype=np.float64))
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
         level = Level((*meshes[:-1], renewed), self._held, self._level.system)
         start = Start() if before is None else Start(known=before.u)
         return solve_level(level, lambda _: nullcontext(self._cycle), start, None, {"mesh": 0.0})
+
+    def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
+        """Numbers of materials on owned cells, shape (cells,), or () where all are the same."""
+        if not own:
+            return np.array(usual)
+        domain = self._level.domain
+        index_map = domain.mesh.topology.index_map(domain.mesh.topology.dim)
+        found = np.full(index_map.size_local, usual)
+        for name, value in own.items():
+            found[domain.materials.where(name)[: len(found)]] = value
+        return found
 
     def projected(self, data: Data) -> fem.Function:
         """The function of `V` that is nearest to data in L²; collective."""
@@ -169,7 +188,7 @@ def solve_in_time(
         steps: How many steps of the same length there are.
         scheme: "euler", of first order, or "bdf2", of second order after a first step of Euler's.
         initial: u at the time 0; it is projected to the discrete space.
-        capacity: Above 0.
+        capacity: Above 0; materials may have their own.
         levels: How many nested meshes there are; solved is on the last of them.
         time: That Constant; it is set to the time of each step.
 
@@ -186,33 +205,58 @@ def solve_in_time(
         raise InputError(f"steps is {steps}; it must be 1 or more")
     if scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
-    if not (capacity > 0.0 and np.isfinite(capacity)):
-        raise InputError(f"capacity is {capacity}; it must be above 0")
+    capacities = {name: each.capacity for name, each in problem.materials.items()}
+    own = {name: each for name, each in capacities.items() if each is not None}
+    for name, each in {"": capacity, **own}.items():
+        if not (each > 0.0 and np.isfinite(each)):
+            of = f" of {name}" if name else ""
+            raise InputError(f"capacity{of} is {each}; it must be above 0")
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")
-    c = number(as_expression(problem.reaction, ufl.SpatialCoordinate(domain.mesh)))
-    if c is None or any(each.reaction is not None for each in problem.materials.values()):
-        raise InputError("problems in time need a reaction that is a number, the same everywhere")
-    rate, own = capacity * steps / end, 1.0
+    x = ufl.SpatialCoordinate(domain.mesh)
+    reactions = {"": problem.reaction}
+    reactions |= {n: m.reaction for n, m in problem.materials.items() if m.reaction is not None}
+    found = {n: number(as_expression(c, x)) for n, c in reactions.items()}
+    c = {name: each for name, each in found.items() if each is not None}
+    if len(c) < len(found):
+        raise InputError("problems in time need a reaction that is a number in each material")
+
+    def stepping(factor: float) -> Problem:
+        """The problem of a step: rate + c in the place of c."""
+        materials = {
+            name: replace(each, reaction=c.get(name, c[""]) + factor * own.get(name, capacity))
+            for name, each in problem.materials.items()
+            if name in own or name in c
+        }
+        return replace(
+            problem,
+            reaction=c[""] + factor * capacity,
+            materials={**problem.materials, **materials},
+        )
+
+    rates: FloatArray = np.empty(0)
+    factor = 0.0
     solver: Solver | None = None
     last: Solution | None = None
     before = then = np.empty(0)
     try:
         for step in range(1, steps + 1):
             second = scheme == "bdf2" and step > 1
-            if solver is None or second != (own > rate):
-                own, former = 1.5 * rate if second else rate, solver
-                solver = Solver(replace(problem, reaction=c + own), domain, levels, former)
+            needed = (1.5 if second else 1.0) * steps / end
+            if solver is None or needed != factor:
+                factor, former = needed, solver
+                solver = Solver(stepping(factor), domain, levels, former)
+                rates = factor * solver.by_material(capacity, own)
                 if former is None:
                     then = solver.projected(initial).x.array
                 else:
                     former.close()
             source = fem.Function(solver.V)
-            source.x.array[:] = own * ((4.0 * then - before) / 3.0 if second else then)
+            source.x.array[:] = (4.0 * then - before) / 3.0 if second else then
             t = end * step / steps
             if time is not None:
                 time.value = t
-            last = solver.solve(source, last)
+            last = solver.solve(source, last, rates)
             before, then = then, last.u.x.array
             yield t, last
     finally:

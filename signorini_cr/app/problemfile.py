@@ -501,7 +501,7 @@ def _expressions(
     for part, table in parts.items():
         given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
     for material, table in materials.items():
-        given |= {f"material.{material}.{key}": v for key, v in table.items() if key != "polygon"}
+        given |= {f"material.{material}.{key}": v for key, v in table.items() if key not in PLAIN}
     if "initial" in sections["time"]:
         given["time.initial"] = sections["time"]["initial"]
     result = {}
@@ -562,6 +562,17 @@ def _capacity(key: str, value: Any) -> float:
     if not isinstance(found, float) or found <= 0.0:
         raise InputError(f"{key}: a number above 0 is needed, found {shown(value)}")
     return found
+
+
+def _own_capacity(name: str, material: Mapping[str, Any]) -> float | None:
+    """The capacity of a material, if it has one."""
+    if "capacity" not in material:
+        return None
+    return _capacity(f"material.{name}.capacity", material["capacity"])
+
+
+PLAIN = ("polygon", "capacity")
+"""Keys of materials that are no expressions."""
 
 
 def _data(expression: Expression) -> Any:
@@ -628,8 +639,9 @@ def _problem(
                 **{
                     key: data(f"material.{name}.{key}", None)
                     for key in material
-                    if key != "polygon"
-                }
+                    if key not in PLAIN
+                },
+                capacity=_own_capacity(name, material),
             )
             for name, material in materials.items()
         },

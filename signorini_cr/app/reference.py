@@ -124,6 +124,8 @@ KEYS = (
         "of wood along its grain and across.", "coefficient = [[0.3, 0], [0, 0.12]]"),
     Key(MATERIAL, "f", EXPRESSION, "that of [data]", "The load there.", "f = -2"),
     Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there.", "reaction = 2"),
+    Key(MATERIAL, "capacity", "a number above 0", "that of [time]", "What multiplies ∂u/∂t there, "
+        "with a section [time].", "capacity = 1.7e6"),
     Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "
         "are then computed, and f, g and dirichlet, where left out, are derived from it.",
         'u = "x**2 - y**2"'),

@@ -14,7 +14,7 @@ from .problemfile import ProblemFile
 from .screen import WIDTH
 
 INDENT = 11
-_SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c"}
+_SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c", "capacity": "capacity"}
 LONGEST = 50
 """Characters of an expression; what is longer is cut."""
 

@@ -32,9 +32,11 @@ class DiffusionOnMesh:
         V: The discrete space.
         source: A function of CR by dof that f has beside what the problem says, ghosts included;
             None for nothing.
+        rate: What it is multiplied by on owned cells, shape (cells,) or ().
     """
 
     source: FloatArray | None = None
+    rate: FloatArray = np.array(1.0)
 
     def __init__(self, compiled: Compiled, domain: Domain):
         """Make the space; collective."""
@@ -52,18 +54,19 @@ class DiffusionOnMesh:
         kappa = self.compiled.kappa
         return kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
 
-    def renewed(self, source: FloatArray | None = None) -> DiffusionOnMesh:
+    def renewed(self, source: FloatArray | None, rate: FloatArray) -> DiffusionOnMesh:
         """The same with data as they are now; a_h must be what it was.
 
         Data that hold neither Constants nor Functions are what they were, and not sampled anew.
 
         Args:
             source: As above.
+            rate: As above.
         """
         other = copy(self)
         for name in ("load", *self._changing):
             other.__dict__.pop(name, None)
-        other.source = source
+        other.source, other.rate = source, rate
         return other
 
     @cached_property
@@ -104,7 +107,7 @@ class DiffusionOnMesh:
         """Moments of f, as given, and what it has beside."""
         if self.source is None:
             return load
-        return load.less(-1.0, vertex_rows(self.source, self.cells))
+        return load.less(-self.rate, vertex_rows(self.source, self.cells))
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:

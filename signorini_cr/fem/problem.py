@@ -43,11 +43,13 @@ class Material:
         coefficient: κ.
         f: Volume load.
         reaction: c.
+        capacity: What multiplies ∂u/∂t in problems in time, above 0.
     """
 
     coefficient: Data | None = None
     f: Data | None = None
     reaction: Data | None = None
+    capacity: float | None = None
 
 
 @dataclass(frozen=True)

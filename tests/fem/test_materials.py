@@ -193,9 +193,52 @@ def test_materials_in_time():
         assert one.energy == pytest.approx(other.energy, rel=1e-8)
         bounds = [solution.certificate.bound_h1 for solution in (one, other)]
         assert bounds[0] == pytest.approx(bounds[1], rel=1e-4)
-    of_rock = Problem(materials={"rock": Material(reaction=2.0)}, **common)
-    with pytest.raises(InputError, match="the same everywhere"):
-        next(solve_in_time(of_rock, domain, end=0.1, steps=3))
+
+
+@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+def test_capacities_of_materials(scheme):
+    """u = (1 + t)(2 + y) in soil: a load by hand; what rock takes up is four times as much."""
+    mesh_time = {}
+
+    def u(x):
+        return (1.0 + mesh_time["t"]) * (2.0 + x[1])
+
+    domain = layers()
+    mesh_time["t"] = t = fem.Constant(domain.mesh, 0.0)
+    problem = Problem(
+        f=lambda x: 3.0 * (2.0 + x[1]) + 5.0 * u(x),
+        reaction=5.0,
+        dirichlet=u,
+        conditions={"contact": Contact(lambda x: u(x) - 1.0, g=lambda x: -(1.0 + t))},
+        materials={
+            "rock": Material(
+                capacity=12.0, reaction=7.0, f=lambda x: 12.0 * (2.0 + x[1]) + 7.0 * u(x)
+            )
+        },
+    )
+    steps = solve_in_time(
+        problem,
+        domain,
+        end=1.0,
+        steps=4,
+        scheme=scheme,
+        initial=lambda x: 2.0 + x[1],
+        capacity=3.0,
+        levels=2,
+        time=t,
+    )
+    for time, solution in steps:
+        x = ufl.SpatialCoordinate(solution.domain.mesh)
+        off = ((1.0 + time) * (2.0 + x[1]) - solution.u) ** 2 * ufl.dx
+        error = MPI.COMM_WORLD.allreduce(fem.assemble_scalar(fem.form(off)))
+        assert np.sqrt(error) < 1e-7
+        assert solution.certificate.bound_energy_norm < 1e-5
+    rock = Problem(materials={"rock": Material(capacity=-2.0)})
+    with pytest.raises(InputError, match="capacity of rock is -2"):
+        next(solve_in_time(rock, domain, end=0.1, steps=3))
+    varied = Problem(materials={"rock": Material(reaction=lambda x: x[0])})
+    with pytest.raises(InputError, match="a number in each material"):
+        next(solve_in_time(varied, domain, end=0.1, steps=3))
 
 
 @pytest.mark.parametrize(("soil", "rock"), [(0.0, 5.0), (3.0, 0.0), (1e4, 0.0), (1.0, 1e8)])
