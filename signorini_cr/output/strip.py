@@ -140,7 +140,7 @@ def plot_strip(
         axes.set_ylabel("")
     for axes in panels.flat[len(moments) :]:
         axes.remove()
-    bar = figure.colorbar(shown, ax=panels, aspect=30)
+    bar = figure.colorbar(shown, ax=list(panels.flat[: len(moments)]), aspect=30)
     label_bar(bar, units)
     bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
     legend(figure, list(marks.values()), list(marks), ncols=2)

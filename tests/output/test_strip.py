@@ -48,3 +48,17 @@ def test_a_strip_shows_what_touches_when(shared_tmp_path):
         assert pixels[:-150, :half].sum() > 1000 and pixels[:-150, half:].sum() == 0
     with pytest.raises(InputError, match="one moment at least"):
         plot_strip([])
+
+
+@pytest.mark.parametrize("number", [1, 4, 5, 6])
+def test_a_strip_of_any_number_of_moments(number, shared_tmp_path):
+    """Places in the last row may be left over."""
+    sides = ["contact", "neumann", "dirichlet", "neumann"]
+    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides).mesh(0.5)
+    solution = solve(Problem(f=-4.0, obstacle=-0.1), domain)
+    moments = [moment(float(k), solution) for k in range(number)]
+    figure = drawn(COMM, lambda: plot_strip(moments, shared_tmp_path / f"{number}.png"))
+    if COMM.rank == 0:
+        *panels, bar = figure.axes
+        assert [axes.get_title() for axes in panels] == [f"$t$ = {k}" for k in range(number)]
+        assert "u_h" in bar.get_ylabel()
