@@ -782,13 +782,14 @@ def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
     """A threshold below which shares add up to no more than some number; collective."""
     if comm.allreduce(float(share.sum())) <= enough:
         return enough
-    threshold = enough / max(comm.allreduce(len(share)), 1)
-    while threshold < enough:
-        below = share[share <= 2.0 * threshold]
-        if comm.allreduce(float(below.sum())) > enough:
-            break
-        threshold *= 2.0
-    return threshold
+    # It is the largest of these powers of two, times the share that all cells might have
+    count = max(comm.allreduce(len(share)), 1)
+    least, highest = enough / count, int(np.ceil(np.log2(count)))
+    mantissa, exponent = np.frexp(share / least)
+    power = np.clip(exponent - (mantissa == 0.5), 0, highest + 1)
+    power[~np.isfinite(share)] = highest + 1
+    sums = comm.allreduce(np.bincount(power, share, minlength=highest + 2))
+    return float(least * 2.0 ** np.searchsorted(np.cumsum(sums)[1:-1], enough, side="right"))
 
 
 def _extents(cells: Cells) -> Range:
