@@ -269,20 +269,35 @@ class Enclosure:
         return Jet(low, high, Balls(tuple(int(k) + 1 for k in there), mid, LOOSE * np.abs(mid)))
 
     def _component(self, vector: Any, index: Any) -> Jet:
-        i = index[0]
-        if not isinstance(i, classes.FixedIndex) or len(index) > 1:
+        if not all(isinstance(i, classes.FixedIndex) for i in index):
             raise Unknown("index")
+        place = tuple(map(int, index))
+        if isinstance(vector, fem.Constant):
+            return self._constant(float(np.asarray(vector.value)[place]))
+        if isinstance(vector, fem.Function):
+            return self._entry(vector, place)
+        (i,) = place
         if isinstance(vector, classes.SpatialCoordinate):
-            box, i = self.boxes, int(i)
+            box = self.boxes
             if box.along is not None:
                 return self._linear(box.low[i], box.high[i], box.along[:, i])
             return self._linear(box.low[i], box.high[i], np.eye(len(box.low))[:, [i]])
         if isinstance(vector, classes.FacetNormal) and self.boxes.normal is not None:
-            n = self.boxes.normal[int(i)]
+            n = self.boxes.normal[i]
             return Jet(*out((n, n), LOOSE))
-        if isinstance(vector, fem.Constant):
-            return self._constant(float(np.asarray(vector.value)[int(i)]))
         raise Unknown(type(vector).__name__)
+
+    def _entry(self, function: fem.Function, place: tuple[int, ...]) -> Jet:
+        """An entry of a tensor that is constant on each cell."""
+        box, V = self.boxes, function.function_space
+        size, steady = int(np.prod(function.ufl_shape)), V.ufl_element().embedded_superdegree == 0
+        if box.cells is None or box.domain is None or not steady or V.dofmap.bs != size:
+            raise Unknown(function.name)
+        dofs = box.domain.own(function).function_space.dofmap.list[box.cells, 0]
+        values = function.x.array[
+            size * dofs + int(np.ravel_multi_index(place, function.ufl_shape))
+        ]
+        return Jet(values, values)
 
     def _function(self, function: fem.Function) -> Jet:
         """Functions that are affine on each cell, or constant."""

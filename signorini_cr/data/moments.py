@@ -213,7 +213,8 @@ class Coefficient:
     def _of_tensor(self, kappa: Tensor, cells: Cells) -> None:
         means = kappa.means(cells.domain)
         eigenvalues = np.linalg.eigvalsh(means)
-        self.mean = np.exp(np.log(eigenvalues).mean(axis=1))
+        self.mean = self.low = self.high = np.exp(np.log(eigenvalues).mean(axis=1))
+        self.least, self.most = eigenvalues[:, 0], eigenvalues[:, -1]
         off = np.zeros((means[0].size if len(means) else cells.tdim**2, len(means)))
         for row, entry, mean in zip(
             off, kappa.entries, means.reshape(len(means), -1).T, strict=True
@@ -240,8 +241,7 @@ class Coefficient:
         if (theta >= 1.0).any():
             self.reason = "the coefficient is a tensor that varies too much within a cell"
         self.low, self.high = (1.0 - theta) * self.mean, (1.0 + theta) * self.mean
-        self.least = (1.0 - theta) * eigenvalues[:, 0]
-        self.most = (1.0 + theta) * eigenvalues[:, -1]
+        self.least, self.most = (1.0 - theta) * self.least, (1.0 + theta) * self.most
 
     def _by_mean(self, sizes: FloatArray, cells: Cells) -> FloatArray:
         """Bounds of |κ_T^{-1/2} E κ_T^{-1/2}|, E with entries of such sizes, shape (cells,)."""

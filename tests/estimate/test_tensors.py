@@ -230,3 +230,26 @@ def test_a_tensor_that_varies_too_much():
     *_, solution = solve_levels(problem, square(), 1)
     assert solution.certificate.bound_h1 is None
     assert "varies too much" in solution.certificate.reason
+
+
+def test_every_way_to_give_a_tensor():
+    """Numbers, a Constant, Functions of degree 0, products: the same bounds; Bessel's has none."""
+    kappa, domain = turned(0.4, 5.0), square()
+    constant = fem.Constant(domain.mesh, kappa)
+    function = fem.Function(fem.functionspace(domain.mesh, ("DG", 0, (2, 2))))
+    function.x.array[:] = np.tile(kappa.ravel(), len(function.x.array) // 4)
+    half = ufl.as_matrix(root(kappa).tolist())
+    ways = [as_ufl(kappa), lambda x: constant, lambda x: function, lambda x: half * half.T]
+    ways.append(lambda x: as_ufl(kappa)(x) * (1.0 + ufl.bessel_J(1, x[0]) ** 2))
+    bounds = []
+    for way in ways:
+        problem = Problem(
+            f=-2.0,
+            obstacle=-0.05,
+            coefficient=way,
+            conditions={"right": Dirichlet(0.0), "left": Dirichlet(0.0)},
+        )
+        *_, solution = solve_levels(problem, domain, 1)
+        bounds.append(solution.certificate.bound_energy_norm)
+    assert np.allclose(bounds[1:-1], bounds[0], rtol=1e-9)
+    assert bounds[-1] is None and "computable" in solution.certificate.reason
