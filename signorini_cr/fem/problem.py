@@ -501,9 +501,11 @@ class Forms:
         return form
 
     def _adjustable(self, data: Expr) -> Expr:
-        """A Constant in the place of a number: one form is compiled for all numbers."""
-        value = number(data)
-        return data if value is None else fem.Constant(self.mesh, value)
+        """A Constant in the place of a number, or of a tensor of numbers: one form serves all."""
+        values = [number(data[index]) for index in np.ndindex(data.ufl_shape)]
+        if None in values:
+            return data
+        return fem.Constant(self.mesh, np.array(values, dtype=np.float64).reshape(data.ufl_shape))
 
     @cached_property
     def _squared_errors(self) -> Kernel:

@@ -64,8 +64,9 @@ def as_ufl(matrix):
     return lambda x: ufl.as_matrix(matrix.tolist())
 
 
-@pytest.mark.parametrize(("angle", "ratio"), [(0.3, 4.0), (1.2, 300.0), (2.5, 1e4)])
-@pytest.mark.parametrize("reaction", [0.0, 30.0])
+@pytest.mark.parametrize(
+    ("angle", "ratio", "reaction"), [(0.3, 4.0, 30.0), (1.2, 300.0, 0.0), (2.5, 1e4, 0.0)]
+)
 def test_a_tensor_is_a_number_on_the_image(angle, ratio, reaction):
     """∇·(κ∇u) is kΔu where (κ/k)^{-1/2} x stands for x, k² = det κ: so is all that is certain."""
     kappa = turned(angle, ratio, size=2.5)
@@ -167,13 +168,14 @@ class Across:
             cells = solution.domain.materials.where("west" if tag == WEST else "east")
             there = fem.Function(fem.functionspace(mesh, ("DG", 0)))
             there.x.array[: len(cells)] = cells
-            for i, weight in enumerate((ufl.as_matrix(kappa.tolist()), ufl.Identity(2))):
+            for i, weight in enumerate((kappa, np.eye(2))):
+                weight = fem.Constant(mesh, weight)
                 square = there * ufl.inner(weight * off, off) * ufl.dx
                 total[i] += fem.assemble_scalar(fem.form(square))
         return np.sqrt(mesh.comm.allreduce(total))
 
 
-@pytest.mark.parametrize(("first", "second"), [(3.0, 20.0), (50.0, 1.0), (1.0, 40.0)])
+@pytest.mark.parametrize(("first", "second"), [(3.0, 20.0), (1.0, 40.0)])
 def test_rates_and_bounds_across_materials(first, second):
     case = Across(turned(0.7, first), turned(1.9, second, size=10.0))
     errors = []

@@ -241,7 +241,7 @@ def test_capacities_of_materials(scheme):
         next(solve_in_time(varied, domain, end=0.1, steps=3))
 
 
-@pytest.mark.parametrize(("soil", "rock"), [(0.0, 5.0), (3.0, 0.0), (1e4, 0.0), (1.0, 1e8)])
+@pytest.mark.parametrize(("soil", "rock"), [(3.0, 0.0), (0.0, 1e4), (1.0, 1e8)])
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_rates_and_bounds_with_reactions_of_materials(soil, rock, adaptive):
     """u is smooth, in contact for x < ½ with the pressure ½ − x."""
@@ -268,7 +268,7 @@ def test_rates_and_bounds_with_reactions_of_materials(soil, rock, adaptive):
     for solution in series(problem, layers(8), adaptive, 3):
         mesh = solution.domain.mesh
         made, x = solution.certificate, ufl.SpatialCoordinate(mesh)
-        c = ufl.conditional(ufl.gt(x[1], 0.5), rock, soil)
+        c = ufl.conditional(ufl.gt(x[1], 0.5), *(fem.Constant(mesh, each) for each in (rock, soil)))
         off = u(x) - solution.u
         rows = ufl.inner(ufl.grad(off), ufl.grad(off)), c * off**2
         squares = [
