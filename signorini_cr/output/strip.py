@@ -117,9 +117,13 @@ def plot_strip(
     marks: dict[str, Line2D] = {}
     time = units.after("time").replace("$", r"\$")
     low, high = (pick(each.limits[i] for each in moments) for i, pick in enumerate((min, max)))
-    for each, axes in zip(moments, panels.flat, strict=False):
+    for number, (each, axes) in enumerate(zip(moments, panels.flat, strict=False)):
         plane_axes(box, ax=axes, units=units)
+        name = axes.get_xlabel()
         axes.label_outer()
+        if number >= len(moments) - columns:  # with nothing below it
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel(name)
         shown = axes.imshow(
             each.image,
             extent=(box[0, 0], box[1, 0], box[0, 1], box[1, 1]),
