@@ -20,7 +20,7 @@ from dolfinx import fem
 
 from .arrays import FloatArray
 from .data.diffusion import diffusion
-from .data.loads import Load, chi
+from .data.loads import VolumeMoments, chi
 from .data.moments import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError
@@ -155,7 +155,7 @@ class Solver:
         sums: list[FloatArray] = []
         for each in (data, 1.0):
             volume = Volume(as_expression(each, forms.x), forms.mesh, rule)
-            moments = chi(Load.of(volume, on_mesh.cells), (), on_mesh.cells)
+            moments = chi(VolumeMoments.of(volume, on_mesh.cells), (), on_mesh.cells)
             sums.append(Layout.of_space(V).shared_sum(moments))
         # the matrix of products of CR's functions is diagonal for triangles
         found.x.array[:] = sums[0] / sums[1]

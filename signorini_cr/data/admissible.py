@@ -21,7 +21,7 @@ from mpi4py import MPI
 from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
-from ..fem.cells import Cells, Side, corner_points
+from ..fem.cells import BoundaryFacets, Cells, corner_points
 from ..fem.conditions import negative
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, function_space, ghosted_vector
@@ -130,7 +130,9 @@ def _negative(datum: _Values, at: tuple[FloatArray, Int32Array], name: str) -> l
     return complaints
 
 
-def differs(cells: Cells, side: Side, gap: FloatArray, scale: float, *data: Trace) -> bool:
+def differs(
+    cells: Cells, side: BoundaryFacets, gap: FloatArray, scale: float, *data: Trace
+) -> bool:
     """Tell whether data differ at the vertices of facets by more than their rounding; collective.
 
     Args:

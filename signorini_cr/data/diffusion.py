@@ -18,7 +18,7 @@ from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
 from ..mesh.domain import Domain, is_by_cells
-from .loads import Edge, Load, chi
+from .loads import NeumannMoments, VolumeMoments, chi
 from .moments import Compiled, OnFacets, Tensor
 
 
@@ -84,12 +84,12 @@ class DiffusionOnMesh:
         )
 
     @cached_property
-    def of_f(self) -> Load:
+    def of_f(self) -> VolumeMoments:
         """Moments of f."""
-        return Load.of(self.compiled.f, self.cells)
+        return VolumeMoments.of(self.compiled.f, self.cells)
 
     @cached_property
-    def load(self) -> Load:
+    def load(self) -> VolumeMoments:
         """Moments of f and what it has beside."""
         return self.with_source(self.of_f)
 
@@ -103,17 +103,17 @@ class DiffusionOnMesh:
         dofs = own.function_space.dofmap.list[: self.cells.number, 0]
         return np.asarray(own.x.array[dofs], dtype=np.float64)
 
-    def with_source(self, load: Load) -> Load:
+    def with_source(self, load: VolumeMoments) -> VolumeMoments:
         """Moments of f, as given, and what it has beside."""
         if self.source is None:
             return load
         return load.less(-self.rate, vertex_rows(self.source, self.cells))
 
     @cached_property
-    def edges(self) -> tuple[Edge, ...]:
+    def edges(self) -> tuple[NeumannMoments, ...]:
         """Moments of the fluxes that are known, one for each condition."""
         sampled = self._sampled(self.forms.natural, lambda condition: condition.flux)
-        return tuple(Edge(on_facets, self.cells) for on_facets in sampled)
+        return tuple(NeumannMoments(on_facets, self.cells) for on_facets in sampled)
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:

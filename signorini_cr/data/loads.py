@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
 from ..fem.conditions import number
 from ..fem.space import facet_quadrature
 from .jets import Boxes, Enclosure, Unknown
@@ -21,7 +21,7 @@ NOTHING = np.array(0.0)
 """A reaction that is none."""
 
 
-class Load:
+class VolumeMoments:
     """f as the certificate sees it: a few moments on each cell.
 
     Attributes:
@@ -64,7 +64,7 @@ class Load:
         out *= cells.volume[part]
         return out
 
-    def less(self, c: float | FloatArray, w: FloatArray) -> Load:
+    def less(self, c: float | FloatArray, w: FloatArray) -> VolumeMoments:
         """The same of f − c w, w affine on each cell.
 
         Args:
@@ -78,17 +78,17 @@ class Load:
         variance = dot_rows(w - middle, hats)
         rows = [*hats, *((total / 45.0 - w / 15.0) if k == 3 else np.zeros_like(w))]
         if self.hats is None or self.bumps is None or self.variance is None:
-            return Load(self.mean - c * middle, -c * np.stack(rows), c**2 * variance)
+            return VolumeMoments(self.mean - c * middle, -c * np.stack(rows), c**2 * variance)
         variance = self.variance - 2.0 * c * dot_rows(w, self.hats) + c**2 * variance
         of_f = [*self.hats, *self.bumps]
-        return Load(
+        return VolumeMoments(
             self.mean - c * middle,
             np.stack([a - c * b for a, b in zip(of_f, rows, strict=True)]),
             np.maximum(variance, 0.0),
         )
 
     @classmethod
-    def of(cls, f: Volume, cells: Cells) -> Load:
+    def of(cls, f: Volume, cells: Cells) -> VolumeMoments:
         """Integrate f."""
         n, rule = cells.number, f.rule
         if f.number is not None:
@@ -106,7 +106,7 @@ class Load:
                 variance[part] = (here - mean[part, None]) ** 2 @ rule.weights
         return cls(mean, rows, variance)
 
-    def refined(self, f: Volume, cells: Cells, cut: Cut) -> Load:
+    def refined(self, f: Volume, cells: Cells, cut: Cut) -> VolumeMoments:
         """The same, with f integrated piece by piece where cells are cut."""
         which, place = cut.of
         if self.hats is None or self.bumps is None or self.variance is None or not len(which):
@@ -128,7 +128,7 @@ class Load:
         variance[which] = integral(off**2)
         for row, test in zip(rows, (*hats, *bumps), strict=True):
             row[which] = integral(off * test)
-        return Load(mean, rows, variance)
+        return VolumeMoments(mean, rows, variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class Certain:
         reason: Why there are none, if there are none.
     """
 
-    load: Load
+    load: VolumeMoments
     missed: FloatArray | None = None
     rough: FloatArray | None = None
     reason: str | None = None
@@ -154,7 +154,7 @@ class Certain:
     def of(
         cls,
         f: Volume,
-        load: Load,
+        load: VolumeMoments,
         cells: Cells,
         low: FloatArray,
         size: float,
@@ -174,7 +174,7 @@ class Certain:
             return cls(load)
         fine = f.exact_for(LOAD_DEGREE)
         if fine is not f:
-            load = Load.of(fine, cells)
+            load = VolumeMoments.of(fine, cells)
         deviation, points = f.deviation, np.hstack([fine.rule.hats, fine.plain.hats])
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
@@ -228,7 +228,7 @@ SHARE = 4e-3
 UNBOUNDED = "f is not bounded on the mesh, or not known to be"
 
 
-class Edge:
+class NeumannMoments:
     """What is needed of g on a part of the boundary.
 
     Attributes:
@@ -258,8 +258,8 @@ class Edge:
         return to_cells(self._cells, self.side, self.shares)
 
 
-def to_cells(cells: Cells, side: Side, shares: FloatArray) -> FloatArray:
-    """Integrals of g ψ_i over facets from those of g λ_j, see `Edge`."""
+def to_cells(cells: Cells, side: BoundaryFacets, shares: FloatArray) -> FloatArray:
+    """Integrals of g ψ_i over facets from those of g λ_j, see `NeumannMoments`."""
     d = cells.tdim
     out = np.tile(shares.sum(axis=0), (d + 1, 1))
     at = np.arange(shares.shape[1])
@@ -279,13 +279,13 @@ class Known:
         bounded: Whether u is bounded there, shape (n,).
     """
 
-    side: Side
+    side: BoundaryFacets
     shares: FloatArray
     loss: FloatArray
     bounded: BoolArray
 
     @classmethod
-    def of(cls, edges: Sequence[Edge], cells: Cells, w: FloatArray) -> Known:
+    def of(cls, edges: Sequence[NeumannMoments], cells: Cells, w: FloatArray) -> Known:
         """Put all parts together.
 
         Args:
@@ -294,7 +294,7 @@ class Known:
             w: u_h at the cells' vertices, shape (d + 1, cells).
         """
         d = cells.tdim
-        side = Side.joined([edge.side for edge in edges], d)
+        side = BoundaryFacets.joined([edge.side for edge in edges], d)
         loss = np.concatenate([np.full(len(e.measure), e.loss) for e in edges] or [np.empty(0)])
         bounded = [np.full(len(edge.measure), edge.bounded) for edge in edges]
         shares = np.concatenate([np.empty((d, 0)), *(edge.shares for edge in edges)], axis=1)
@@ -305,7 +305,7 @@ class Known:
         return cls(side, shares, loss, np.concatenate([np.empty(0, dtype=bool), *bounded]))
 
 
-def trace_of(cells: Cells, side: Side, w: FloatArray) -> FloatArray:
+def trace_of(cells: Cells, side: BoundaryFacets, w: FloatArray) -> FloatArray:
     """A function's values at the ends of boundary facets, seen from their cells, shape (d, n)."""
     return w[cells.others[side.local].T, side.cells]
 
@@ -335,8 +335,8 @@ class Segments:
     """
 
     cells: Cells
-    facets: Side
-    side: Side
+    facets: BoundaryFacets
+    side: BoundaryFacets
     place: IndexArray
     hats: FloatArray
     weights: FloatArray
@@ -352,7 +352,12 @@ class Segments:
 
     @classmethod
     def joined(
-        cls, edges: Sequence[Edge], cells: Cells, w: FloatArray, low: FloatArray, size: float
+        cls,
+        edges: Sequence[NeumannMoments],
+        cells: Cells,
+        w: FloatArray,
+        low: FloatArray,
+        size: float,
     ) -> Segments:
         """Enclose g on several parts, and take b u_h off; collective.
 
@@ -369,7 +374,7 @@ class Segments:
         def rows(name: str, axis: int = -1) -> FloatArray:
             return np.concatenate([getattr(each, name) for each in found], axis=axis)
 
-        facets = Side.joined([each.facets for each in found], cells.tdim)
+        facets = BoundaryFacets.joined([each.facets for each in found], cells.tdim)
         loss, hats, values, through = rows("loss"), rows("hats"), rows("values"), rows("through")
         place = np.concatenate([e.place + k for e, k in zip(found, first[:-1], strict=True)])
         measure = rows("measure")
@@ -383,7 +388,7 @@ class Segments:
         return cls(
             cells,
             facets,
-            Side.joined([each.side for each in found], cells.tdim),
+            BoundaryFacets.joined([each.side for each in found], cells.tdim),
             place,
             hats,
             found[0].weights,
@@ -399,7 +404,7 @@ class Segments:
         )
 
     @classmethod
-    def of(cls, edge: Edge, cells: Cells, low: FloatArray, size: float) -> Segments:
+    def of(cls, edge: NeumannMoments, cells: Cells, low: FloatArray, size: float) -> Segments:
         """Enclose g alone; collective.
 
         Args:
@@ -453,7 +458,7 @@ class Segments:
         return cls(
             cells,
             facets,
-            Side(facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]),
+            BoundaryFacets(facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]),
             at,
             np.einsum("chn,qc->qhn", pieces.hats, hats),
             weights,
@@ -551,7 +556,7 @@ class Segments:
 G_UNBOUNDED = "g is not bounded on the mesh, or not known to be"
 
 
-def _trace_constant(cells: Cells, side: Side) -> FloatArray:
+def _trace_constant(cells: Cells, side: BoundaryFacets) -> FloatArray:
     """c_F with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, shape (n,).
 
     |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F.
@@ -561,7 +566,7 @@ def _trace_constant(cells: Cells, side: Side) -> FloatArray:
     return np.sqrt(measures(cells, side) / cells.volume[side.cells] * c * (c + 2.0 * h / d))
 
 
-def chi(load: Load, edges: Sequence[Edge], cells: Cells) -> FloatArray:
+def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> FloatArray:
     """χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's cells' share."""
     if load.vanishes and all(edge.g.vanishes for edge in edges):
         return np.zeros(len(cells.exterior))

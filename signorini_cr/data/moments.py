@@ -24,7 +24,7 @@ from ufl.core.expr import Expr
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array
-from ..fem.cells import Cells, Side
+from ..fem.cells import BoundaryFacets, Cells
 from ..fem.conditions import Condition
 from ..fem.physics import Imposed
 from ..fem.problem import Forms, number
@@ -484,13 +484,13 @@ class OnFacets:
         return Imposed(key, self.facets, only, means, ends, self.sign)
 
     def seen_from(self, cells: Cells) -> OnFacets:
-        """Keep the facets of owned cells, those of the part's `Side`."""
+        """Keep the facets of owned cells, those of the part's `BoundaryFacets`."""
         own = self.entities[:, 0] < cells.number
         where = self.facets[own], self.entities[own]
         values = self.ends[:, own], self.middle[own], self.inside[:, own]
         return OnFacets(self.condition, self.trace, *where, *values, self.sign)
 
-    def side(self, cells: Cells) -> Side:
+    def side(self, cells: Cells) -> BoundaryFacets:
         """The facets of owned cells, seen from these."""
         return cells.sides[self.condition.number]
 
@@ -505,13 +505,13 @@ class OnParts:
     """
 
     parts: tuple[OnFacets, ...]
-    side: Side
+    side: BoundaryFacets
 
     @classmethod
     def of(cls, sampled: Sequence[OnFacets], cells: Cells) -> OnParts:
         """Keep the facets of owned cells."""
         parts = tuple(each.seen_from(cells) for each in sampled)
-        return cls(parts, Side.joined([each.side(cells) for each in parts], cells.tdim))
+        return cls(parts, BoundaryFacets.joined([each.side(cells) for each in parts], cells.tdim))
 
     @property
     def ends(self) -> FloatArray:

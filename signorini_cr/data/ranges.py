@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array
 from ..compat import cell_nodes
-from ..fem.cells import Cells, Side, blocks, corner_points
+from ..fem.cells import BoundaryFacets, Cells, blocks, corner_points
 from .balls import indices
 from .germs import allowance, first_inside, may_be_singular
 from .jets import (
@@ -240,7 +240,7 @@ class Frame:
     normal: FloatArray
 
     @classmethod
-    def of(cls, cells: Cells, side: Side) -> Frame:
+    def of(cls, cells: Cells, side: BoundaryFacets) -> Frame:
         """Of the facets of one part of the boundary."""
         apex, ends = corner_points(cells, side)
         # Gram and Schmidt; what is left of the way to the opposite vertex points inwards
@@ -280,7 +280,7 @@ class Pieces:
             object.__setattr__(self, "span", span)
 
     @classmethod
-    def of_facets(cls, cells: Cells, side: Side) -> Pieces:
+    def of_facets(cls, cells: Cells, side: BoundaryFacets) -> Pieces:
         """Boundary facets themselves."""
         _, ends = corner_points(cells, side)
         n, corners = len(side.cells), ends.transpose(0, 2, 1)

@@ -19,7 +19,7 @@ from dolfinx import fem
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
-from ..data.loads import NOTHING, Certain, Known, Load, Segments, mean_to_norm, reacts
+from ..data.loads import NOTHING, Certain, Known, Segments, VolumeMoments, mean_to_norm, reacts
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
@@ -464,7 +464,12 @@ ROUNDING = 64 * np.finfo(np.float64).eps
 
 
 def _rounding(
-    cells: Cells, kappa: Coefficient, reaction: FloatArray, w: FloatArray, load: Load, flux: Flux
+    cells: Cells,
+    kappa: Coefficient,
+    reaction: FloatArray,
+    w: FloatArray,
+    load: VolumeMoments,
+    flux: Flux,
 ) -> float:
     """What rounding may do to ‖p ± b‖; collective.
 

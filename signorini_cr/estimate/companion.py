@@ -20,7 +20,7 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
 from ..data.loads import reacts
 from ..data.moments import OnFacets, OnParts
-from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, sum_rows
+from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, sum_rows
 from .cusps import Cusps
 from .flux import Flux
 from .lifting import Cubic, Lift, affine, joined, lift
@@ -56,7 +56,7 @@ class Masses:
 
     some: bool
     reaction: FloatArray
-    side: Side
+    side: BoundaryFacets
     loss: FloatArray
 
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
@@ -139,7 +139,7 @@ class Floors:
         facets: Number of facets.
     """
 
-    side: Side
+    side: BoundaryFacets
     signs: FloatArray
     ends: FloatArray
     middle: FloatArray
@@ -423,7 +423,7 @@ def _sweep(
     excess: FloatArray,
     bumps: FloatArray,
     free: BoolArray,
-    bumped: tuple[Side, ...],
+    bumped: tuple[BoundaryFacets, ...],
     steps: int,
 ) -> tuple[float, float]:
     """Conjugate gradients for E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses in the heights of the bumps.
@@ -569,7 +569,7 @@ def bump_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
 
 
 def on_facet(
-    cells: Cells, side: Side, hats: FloatArray, v: FloatArray, bumps: FloatArray
+    cells: Cells, side: BoundaryFacets, hats: FloatArray, v: FloatArray, bumps: FloatArray
 ) -> FloatArray:
     """Values of v at points of facets, shape (q, n).
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import FloatArray
-from ..data.loads import Load, Segments
+from ..data.loads import Segments, VolumeMoments
 from ..fem.cells import Cells, blocks, measures, pick
 from .beyond import Beyond
 from .companion import Companion
@@ -49,7 +49,7 @@ def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
 
 
 def improve(
-    cells: Cells, kappa: FloatArray, load: Load, edge: Segments, flux: Flux, v: Companion
+    cells: Cells, kappa: FloatArray, load: VolumeMoments, edge: Segments, flux: Flux, v: Companion
 ) -> None:
     """Give y the curl and τ; collective.
 

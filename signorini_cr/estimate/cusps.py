@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array
-from ..data.loads import Load
+from ..data.loads import VolumeMoments
 from ..fem.cells import Cells, pick, poincare, sum_rows
 from .flux import Flux
 from .sums import Sums
@@ -186,7 +186,7 @@ class Cusps:
         return np.einsum("q,qin->in", self.weights, flow), of_bumps
 
     def add(
-        self, cells: Cells, w: FloatArray, load: Load, low: FloatArray, flux: Flux,
+        self, cells: Cells, w: FloatArray, load: VolumeMoments, low: FloatArray, flux: Flux,
         v: tuple[FloatArray, FloatArray], sums: Sums,
     ) -> float:  # fmt: skip
         """Add ψ to the parts of the gap.

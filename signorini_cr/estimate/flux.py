@@ -16,8 +16,8 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
-from ..data.loads import NOTHING, Known, Load, reacts, to_cells
-from ..fem.cells import Cells, Side, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..data.loads import NOTHING, Known, VolumeMoments, reacts, to_cells
+from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
 from .beyond import Beyond
 
 if TYPE_CHECKING:
@@ -59,9 +59,9 @@ def equilibrate(
     cells: Cells,
     kappa: FloatArray,
     w: FloatArray,
-    load: Load,
+    load: VolumeMoments,
     edge: Known,
-    on_contact: Side,
+    on_contact: BoundaryFacets,
     signs: FloatArray,
     gap: FloatArray,
 ) -> Flux:
@@ -126,7 +126,7 @@ def relax(
     flux: Flux,
     reaction: FloatArray,
     edge: Known,
-    on_contact: Side,
+    on_contact: BoundaryFacets,
     signs: FloatArray,
 ) -> BoolArray | None:
     """Bring y nearer to κ∇u_h where c can take up what it then lacks; collective.

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..data.loads import NOTHING, Load, Segments, reacts, trace_of
+from ..data.loads import NOTHING, Segments, VolumeMoments, reacts, trace_of
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bump_squares, distance, on_facet
@@ -31,7 +31,7 @@ def integrate(
     cells: Cells,
     kappa: Coefficient,
     w: FloatArray,
-    load: Load,
+    load: VolumeMoments,
     flux: Flux,
     v: Companion,
     reaction: FloatArray = NOTHING,
@@ -187,7 +187,7 @@ def integrate_edge(
     cells: Cells,
     kappa: Coefficient,
     w: FloatArray,
-    load: Load,
+    load: VolumeMoments,
     edge: Segments,
     flux: Flux,
     v: Companion,

@@ -18,7 +18,7 @@ from ..data.balls import indices, middle
 from ..data.jets import Enclosure, Jet, Unknown
 from ..data.moments import Trace
 from ..data.ranges import Pieces, refine
-from ..fem.cells import Cells, Side, corner_points
+from ..fem.cells import BoundaryFacets, Cells, corner_points
 
 ROUGH = "{} jumps on a boundary facet, or its derivative is not known to be bounded there"
 NO_RANGE = "{} holds an operator that has no enclosure: {}"
@@ -108,7 +108,7 @@ def joined(lifts: Sequence[Lift]) -> Lift:
 
 def lift(
     cells: Cells,
-    side: Side,
+    side: BoundaryFacets,
     trace: Trace,
     base: Cubic | None,
     v: Cubic,
@@ -269,7 +269,7 @@ def _jump_at_ends(
 
 def affine(
     cells: Cells,
-    side: Side,
+    side: BoundaryFacets,
     trace: Trace,
     v: FloatArray,
     values: FloatArray,

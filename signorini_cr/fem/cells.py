@@ -63,7 +63,7 @@ def poincare(tdim: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class BoundaryFacets:
     """Boundary facets of one part, seen from their cells.
 
     Attributes:
@@ -79,7 +79,7 @@ class Side:
     ends: IndexArray
 
     @classmethod
-    def joined(cls, sides: Sequence[Side], d: int) -> Side:
+    def joined(cls, sides: Sequence[BoundaryFacets], d: int) -> BoundaryFacets:
         """Those of several parts, one after the other, for cells of dimension d."""
         none = np.empty(0, dtype=np.intp)
         sides = [cls(none, none, none, none.reshape(d, 0)), *sides]
@@ -90,10 +90,10 @@ class Side:
             np.concatenate([side.ends for side in sides], axis=1),
         )
 
-    def picked(self, where: BoolArray) -> Side:
+    def picked(self, where: BoolArray) -> BoundaryFacets:
         """Some of the facets."""
         ends = self.ends[:, where]
-        return Side(self.cells[where], self.local[where], self.dofs[where], ends)
+        return BoundaryFacets(self.cells[where], self.local[where], self.dofs[where], ends)
 
     @property
     def entities(self) -> Int32Array:
@@ -216,14 +216,14 @@ class Cells:
         return np.where(np.less(*names), 1.0, -1.0)
 
     @cached_property
-    def sides(self) -> dict[int, Side]:
+    def sides(self) -> dict[int, BoundaryFacets]:
         """Boundary facets of owned cells."""
         sides = {}
         for part, found in self.domain.all_facets.items():
             cells, local = facet_entities(self.domain.mesh, found).T.astype(np.intp)
             own = cells < self.number
             cells, local = cells[own], local[own]
-            sides[part] = Side(
+            sides[part] = BoundaryFacets(
                 cells,
                 local,
                 self.facets[local, cells],
@@ -386,7 +386,7 @@ class Cells:
             out[part] = dot_rows(c[:, part], self.apply(c[:, part], part))
         return out
 
-    def opposite(self, side: Side) -> FloatArray:
+    def opposite(self, side: BoundaryFacets) -> FloatArray:
         """|T| |∇λ_i|² for the vertices opposite boundary facets, shape (n,)."""
         out = np.zeros(len(side.cells))
         for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
@@ -406,7 +406,7 @@ class Cells:
         return -2.0 * sum_rows(self.stiffness[:, part])
 
 
-def corner_points(cells: Cells, side: Side) -> tuple[FloatArray, FloatArray]:
+def corner_points(cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, FloatArray]:
     """Coordinates of the opposite vertex, shape (n, gdim), and of the ends, shape (d, n, gdim)."""
     mesh = cells.domain.mesh
     nodes = compat.cell_nodes(mesh)[side.cells]
@@ -415,7 +415,7 @@ def corner_points(cells: Cells, side: Side) -> tuple[FloatArray, FloatArray]:
     return apex, x[np.take_along_axis(nodes, cells.others[side.local], axis=1).T]
 
 
-def measures(cells: Cells, side: Side) -> FloatArray:
+def measures(cells: Cells, side: BoundaryFacets) -> FloatArray:
     """|F|, shape (n,)."""
     _, ends = corner_points(cells, side)
     edges = ends[1:] - ends[:1]

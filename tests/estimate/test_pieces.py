@@ -22,7 +22,7 @@ from signorini_cr.estimate.lifting import Cubic, Lift, lift
 from signorini_cr.estimate.nearest import Slopes, nearest
 from signorini_cr.estimate.shapes import best_heights, quadrature
 from signorini_cr.estimate.sums import Sums
-from signorini_cr.fem.cells import Cells, Side, corner_points
+from signorini_cr.fem.cells import BoundaryFacets, Cells, corner_points
 from signorini_cr.mesh.families import structured
 
 WORLD = MPI.COMM_WORLD
@@ -834,7 +834,7 @@ def test_energy_of_a_function_of_degree_two():
     np.add.at(falls, cells.facets, slopes.facets)
     traces = kappa * cells.trace(slice(0, cells.number))
     curvature = 4 / 3 * cells.over_facets(np.tile(traces, (3, 1)))
-    none = companion.Masses(False, np.array(0.0), Side.joined([], 2), np.empty(0))
+    none = companion.Masses(False, np.array(0.0), BoundaryFacets.joined([], 2), np.empty(0))
     found, promise = companion._sweep(cells, kappa, none, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, whole)
     assert np.isclose(promise, np.sum(falls[free] ** 2 / curvature[free]))
