@@ -332,10 +332,9 @@ def _companion(
         improve(cells, kappa.mean, load, known.segments, flux, v)
         sums = integrate(cells, kappa, known.w, load, flux, v)
     if v.cusps is not None:
-        sums.energy_slack += v.cusps.add(
+        sums.totals.energy_slack += v.cusps.add(
             cells, known.w, load, kappa.low, flux, (v.excess, v.bumps), sums
         )
-    assert sums.indicators is not None
     np.add.at(sums.indicators, alpha.side.cells, v.contact)
     return v, sums
 
@@ -356,8 +355,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
     hidden, hidden_energy = _hidden(known, v, sums)
     rounding = _rounding(cells, kappa, known.reaction, w, certain.load, flux)
-    assert sums.middle is not None and sums.steepness is not None
-    total = sums.over_ranks(cells)
+    total = sums.totals.over_ranks(cells)
     contact, edge_square, edge_energy, lift, lift_energy, lift_far, lift_near = cells.total(
         np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, lift_far, lift_near
     )
@@ -512,7 +510,6 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     missed, square, change = np.zeros(cells.number), 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
         missed = certain.missed
-        assert sums.steepness is not None
         for part in blocks(cells.number):
             by_slope = rough = mean_to_norm(cells, kappa.low, NOTHING, part) * certain.rough[part]
             if reacts(known.reaction):
@@ -555,9 +552,7 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
         f = np.hypot(f, np.sqrt(load.variance[which]))
     if certain.rough is not None:
         f += certain.rough[which] / np.sqrt(cells.volume[which])
-    assert sums.steepness is not None
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
-    assert sums.indicators is not None
     change = before * steep + np.sqrt(cells.volume[which]) * f * area
     if sums.apart is not None:
         c = pick(reaction, which)
@@ -570,7 +565,6 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     change += np.bincount(on_contact, more, minlength=len(which))
     steep = steep + np.bincount(on_contact, np.sqrt(loss[there]) * edge, minlength=len(which))
     change += 0.5 * steep**2
-    assert sums.middle is not None and sums.across is not None
     noise = 1e-14 * sums.indicators[which]
     if sums.zeroth is not None:
         noise = noise + 2.0 * sums.zeroth[which]

@@ -41,7 +41,6 @@ def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
     """
     if cells.tdim != 2:
         return False
-    assert sums.indicators is not None
     thin = np.flatnonzero(cells.diameter2 > THIN * cells.volume)
     squares = field_squares(cells, flux.excess[:, thin], thin) / pick(kappa, thin)
     there, whole = cells.total(np.sum(squares), np.sum(sums.indicators))

@@ -214,11 +214,11 @@ class Cusps:
         if flux.beyond is not None:
             through += np.stack([flux.beyond.through(cells, at, hat) for hat in self.hats])
         cross = np.einsum("q,qin,qin->n", self.weights, through, slope) / d
-        sums.companion += float(np.sum(more))
-        sums.cross += float(np.sum(cross))
-        sums.energy += float(np.sum(0.5 * steeper - cells.volume[at] * load.mean[at] * self.means))
-        assert sums.indicators is not None and sums.steepness is not None
-        assert sums.middle is not None and sums.across is not None
+        sums.totals.companion += float(np.sum(more))
+        sums.totals.cross += float(np.sum(cross))
+        sums.totals.energy += float(
+            np.sum(0.5 * steeper - cells.volume[at] * load.mean[at] * self.means)
+        )
         sums.indicators[at] += more
         sums.steepness[at] += steeper
         sums.middle[at] += more + 2.0 * cross
@@ -230,7 +230,7 @@ class Cusps:
         slack = np.sqrt(np.maximum(square * steep, 0.0) / pick(low, at))
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
-        sums.slack += float(np.sum(slack))
+        sums.totals.slack += float(np.sum(slack))
         return float(np.sum(slack))
 
     def _flow(self, cells: Cells, slope: FloatArray) -> FloatArray:

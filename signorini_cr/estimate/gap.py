@@ -48,10 +48,7 @@ def integrate(
         reaction: c, shape (cells,) or ().
     """
     d = cells.tdim
-    indicators, steepness, middle, across = np.empty((4, cells.number))
-    sums = Sums(indicators=indicators, steepness=steepness, middle=middle, across=across)
-    if reacts(reaction):
-        sums.zeroth, sums.apart = np.zeros((2, cells.number))
+    sums = Sums.empty(cells.number, reacts(reaction))
     for part in blocks(cells.number):
         P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
         height = v.bumps[cells.facets[:, part]] if d == 2 else None
@@ -62,17 +59,17 @@ def integrate(
             pp, bb, pb, vv, far, near, of_energy = _by_quadrature(cells, kappa, part, flux, v, w)
             around += near
             beside += far
-            sums.far += float(np.sum(far))
-            sums.near += float(np.sum(near))
-            sums.energy_slack += float(np.sum(of_energy))
+            sums.totals.far += float(np.sum(far))
+            sums.totals.near += float(np.sum(near))
+            sums.totals.energy_slack += float(np.sum(of_energy))
         if kappa.tensor is not None:
             gap = pp + bb - 2.0 * pb, pp + bb + 2.0 * pb
             vv, far, near, of_energy = _of_tensor(cells, kappa, part, flux, v, w, gap)
             around += near
             beside += far
-            sums.far += float(np.sum(far))
-            sums.near += float(np.sum(near))
-            sums.energy_slack += float(np.sum(of_energy))
+            sums.totals.far += float(np.sum(far))
+            sums.totals.near += float(np.sum(near))
+            sums.totals.energy_slack += float(np.sum(of_energy))
         volume, s = cells.volume[part], sum_rows(P)
         total = sum_rows(c) + sum_rows(W)
         fv = load.mean[part] * total / (d + 1)
@@ -97,17 +94,17 @@ def integrate(
                 square = np.where(taken, 0.0, square)
                 sums.zeroth[part] = np.where(taken, osc, 0.0)
             share += osc
-            sums.load += float(np.sum(osc))
+            sums.totals.load += float(np.sum(osc))
             if v.thirds is not None:
                 third = local_thirds(cells, v.thirds, part)
                 rise = 12.0 / 180.0 * np.stack([hats[j] - hats[k] for j, k in cells.others])
                 fv += dot_rows(third, rise)
                 off = volume * np.sqrt(left[part] / 840.0) * sum_rows(np.abs(third))
-                sums.energy_slack += float(np.sum(off))
+                sums.totals.energy_slack += float(np.sum(off))
             if flux.beyond is not None:
                 far, near = _swollen(beside, osc), _swollen(around, osc)
-                sums.far += float(np.sum(far))
-                sums.near += float(np.sum(near))
+                sums.totals.far += float(np.sum(far))
+                sums.totals.near += float(np.sum(near))
                 around += osc + near
                 beside += osc + far
             else:
@@ -121,13 +118,13 @@ def integrate(
                     # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
                     slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
                 work = volume * moment
-                sums.load_companion += float(np.sum(work))
+                sums.totals.load_companion += float(np.sum(work))
                 if taken is not None:
                     against, slack, work, osc = (
                         np.where(taken, 0.0, each) for each in (against, slack, work, osc)
                     )
-                sums.load_flux += float(np.sum(against))
-                sums.slack += float(np.sum(slack))
+                sums.totals.load_flux += float(np.sum(against))
+                sums.totals.slack += float(np.sum(slack))
                 against += slack
                 around += osc + 2.0 * (against + work)
                 beside += osc + 2.0 * (against - work)
@@ -135,11 +132,11 @@ def integrate(
             size = sum_rows(W) ** 2 + dot_rows(W, W)
             mass = pick(reaction, part) * volume
             apart = mass * distance(c, height)
-            sums.energy += 0.5 * float(np.sum(apart))
+            sums.totals.energy += 0.5 * float(np.sum(apart))
             own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
-            sums.energy -= own
-            sums.energy_slack += EPS * own
-            sums.companion += float(np.sum(apart))
+            sums.totals.energy -= own
+            sums.totals.energy_slack += EPS * own
+            sums.totals.companion += float(np.sum(apart))
             sums.apart[part] = apart
             sums.zeroth[part] += apart
             share += apart
@@ -149,16 +146,16 @@ def integrate(
                 means = sum_rows(c) / (d + 1)
                 if height is not None:
                     means += sum_rows(height) / 3
-                sums.load += float(np.sum(given))
-                sums.load_companion += float(rest @ means)
+                sums.totals.load += float(np.sum(given))
+                sums.totals.load_companion += float(rest @ means)
                 sums.zeroth[part] += given
                 share += given
-        sums.flux += float(np.sum(pp))
-        sums.companion += float(np.sum(bb))
-        sums.cross += float(np.sum(pb))
-        sums.energy += float(np.sum(0.5 * vv - volume * fv))
-        indicators[part], steepness[part] = share, vv
-        middle[part], across[part] = around, beside
+        sums.totals.flux += float(np.sum(pp))
+        sums.totals.companion += float(np.sum(bb))
+        sums.totals.cross += float(np.sum(pb))
+        sums.totals.energy += float(np.sum(0.5 * vv - volume * fv))
+        sums.indicators[part], sums.steepness[part] = share, vv
+        sums.middle[part], sums.across[part] = around, beside
     return sums
 
 
@@ -217,19 +214,17 @@ def integrate_edge(
     side, d = edge.side, cells.tdim
     at, sizes = edge.oscillation(flux.beyond is not None)
     low = pick(kappa.low, at)
-    assert sums.indicators is not None
-    assert sums.middle is not None and sums.across is not None
     sums.indicators[at] += sizes**2 / low
-    sums.neumann = float(np.sum(sizes**2 / low))
+    sums.totals.neumann = float(np.sum(sizes**2 / low))
     if edge.loss.any():
         _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
     if d != 2:
-        return sums.neumann
+        return sums.totals.neumann
     if flux.beyond is not None:
-        sums.load += sums.neumann
+        sums.totals.load += sums.totals.neumann
         far, near = (_swollen(row[at], sizes**2 / low) for row in (sums.across, sums.middle))
-        sums.far += float(np.sum(far))
-        sums.near += float(np.sum(near))
+        sums.totals.far += float(np.sum(far))
+        sums.totals.near += float(np.sum(near))
         sums.across[at] += sizes**2 / low + far
         sums.middle[at] += sizes**2 / low + near
         return 0.0
@@ -241,13 +236,13 @@ def integrate_edge(
         if (taken := _taken_up(of_f**2, variance, kappa, at, reaction)) is not None:
             of_f[taken] = 0.0
     more = (2.0 * of_f * sizes + sizes**2) / low
-    sums.load += float(np.sum(more))
+    sums.totals.load += float(np.sum(more))
     for row in (sums.middle, sums.across):
         row[at] += more
     ends = cells.others[side.local].T, side.cells
     weights = edge.measure * edge.weights[:, None] * edge.rest
     jump = apart(cells, w, edge, v.vertices, v.bumps)
-    sums.load_companion += float(np.sum(weights * jump))
+    sums.totals.load_companion += float(np.sum(weights * jump))
     # The potential of y − κ_T∇u_h, as in _against_potential
     P = flux.excess[:, side.cells]
     s = sum_rows(P)
@@ -263,12 +258,12 @@ def integrate_edge(
     potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
     potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
     weights = np.where(edge.given[edge.place], 0.0, weights)
-    sums.load_flux += float(np.sum(weights * potential))
+    sums.totals.load_flux += float(np.sum(weights * potential))
     np.add.at(sums.middle, side.cells, 2.0 * (weights * (potential + jump)).sum(axis=0))
     np.add.at(sums.across, side.cells, 2.0 * (weights * (potential - jump)).sum(axis=0))
     if kappa.varies:
         slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], w[:, at])
-        sums.slack += float(np.sum(slack))
+        sums.totals.slack += float(np.sum(slack))
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
     return 0.0
@@ -298,22 +293,21 @@ def _add_loss(
     """
     if sums.zeroth is None:
         sums.zeroth = np.zeros(cells.number)
-    assert sums.indicators is not None
     loss = edge.loss[edge.place] * edge.measure
     apart = loss * (edge.weights @ jump**2)
     own = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
     size = 0.5 * float(np.sum(loss * (edge.weights @ own**2)))
-    sums.energy += 0.5 * float(np.sum(apart)) - size
-    sums.energy_slack += EPS * size
-    sums.companion += float(np.sum(apart))
+    sums.totals.energy += 0.5 * float(np.sum(apart)) - size
+    sums.totals.energy_slack += EPS * size
+    sums.totals.companion += float(np.sum(apart))
     given = np.where(edge.given, edge.squares / np.maximum(edge.loss, 1e-300), 0.0)
     if flux.shed is not None:
         n = len(edge.loss)
         area = np.bincount(edge.place, edge.measure, minlength=n)
         given += flux.shed**2 / (np.maximum(edge.loss, 1e-300) * area)
         means = np.bincount(edge.place, edge.measure * (edge.weights @ jump), minlength=n) / area
-        sums.load_companion += float(flux.shed @ means)
-    sums.load += float(np.sum(given))
+        sums.totals.load_companion += float(flux.shed @ means)
+    sums.totals.load += float(np.sum(given))
     for at, amounts in ((edge.side.cells, apart), (edge.facets.cells, given)):
         np.add.at(sums.indicators, at, amounts)
         np.add.at(sums.zeroth, at, amounts)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, field
+
+import numpy as np
 
 from ..arrays import FloatArray
 from ..fem.cells import Cells
 
 
 @dataclass(eq=False)
-class Sums:
-    """Totals over this rank's cells.
+class Totals:
+    """Sums over cells: of this rank, or of all.
 
     Attributes:
         flux: ‖p‖².
@@ -25,13 +27,6 @@ class Sums:
         energy: ½∫ κ|∇v|² + c v² − ∫ f v.
         energy_slack: How far this may be from the truth.
         neumann: The part of load that comes from g alone.
-        indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).
-        steepness: ∫_T κ|∇v|², shape (cells,).
-        middle: Bounds of ∫_T |p + κ^{-1/2}σ + b|², shape (cells,).
-        across: The same of ∫_T |p + κ^{-1/2}σ − b|².
-        zeroth: What the terms without gradients add to the cells' shares, shape (cells,); None
-            where there are none.
-        apart: c‖v − u_h‖²_T, shape (cells,); or None.
     """
 
     flux: float = 0.0
@@ -46,17 +41,44 @@ class Sums:
     energy: float = 0.0
     energy_slack: float = 0.0
     neumann: float = 0.0
-    indicators: FloatArray | None = None
-    steepness: FloatArray | None = None
-    middle: FloatArray | None = None
-    across: FloatArray | None = None
+
+    def over_ranks(self, cells: Cells) -> Totals:
+        """The same of all ranks' cells; collective."""
+        return Totals(*(float(value) for value in cells.total(*astuple(self))))
+
+
+@dataclass(eq=False)
+class Sums:
+    """What the cells of this rank have of the gap, each for itself and all together.
+
+    Attributes:
+        indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).
+        steepness: ∫_T κ|∇v|², shape (cells,).
+        middle: Bounds of ∫_T |p + κ^{-1/2}σ + b|², shape (cells,).
+        across: The same of ∫_T |p + κ^{-1/2}σ − b|².
+        zeroth: What the terms without gradients add to the cells' shares, shape (cells,); None
+            where there are none.
+        apart: c‖v − u_h‖²_T, shape (cells,); or None.
+        totals: All cells' together.
+    """
+
+    indicators: FloatArray
+    steepness: FloatArray
+    middle: FloatArray
+    across: FloatArray
     zeroth: FloatArray | None = None
     apart: FloatArray | None = None
+    totals: Totals = field(default_factory=Totals)
 
-    def over_ranks(self, cells: Cells) -> Sums:
-        """The totals over all ranks' cells; collective."""
-        names = [field.name for field in fields(self) if field.type == "float"]
-        total, found = replace(self), cells.total(*(getattr(self, name) for name in names))
-        for name, value in zip(names, found, strict=True):
-            setattr(total, name, float(value))
-        return total
+    @classmethod
+    def empty(cls, cells: int, reacts: bool) -> Sums:
+        """Make room for what comes range by range of cells.
+
+        Args:
+            cells: How many cells there are.
+            reacts: Whether there are terms without gradients.
+        """
+        sums = cls(*np.empty((4, cells)))
+        if reacts:
+            sums.zeroth, sums.apart = np.zeros((2, cells))
+        return sums

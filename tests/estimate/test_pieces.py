@@ -353,8 +353,10 @@ def test_integrals_of_cusps(where):
         points = hats.T @ x[cell]
         field = points * P[:, cell].sum() - P[:, cell] @ x[cell]
         crosses[cell] = weights @ (slope * field).sum(axis=1) / (2 * volume)
-    assert np.isclose(sums.companion, gains.sum()) and np.isclose(sums.cross, crosses.sum())
-    assert np.isclose(sums.energy, energy.sum()) and np.allclose(sums.steepness, steepness)
+    assert np.isclose(sums.totals.companion, gains.sum()) and np.isclose(
+        sums.totals.cross, crosses.sum()
+    )
+    assert np.isclose(sums.totals.energy, energy.sum()) and np.allclose(sums.steepness, steepness)
     change = np.zeros(number)
     change[cusp.at] = gains
     assert np.allclose(sums.indicators, change)
@@ -374,7 +376,7 @@ def test_integrals_of_cusps(where):
         truth += each
         assert np.isclose(sums.middle[cell], before[cell] + 2 * each)
         assert np.isclose(sums.across[cell], before[cell] - 4 * crosses[cell] + 2 * each)
-    assert np.isclose(slack, truth) and np.isclose(sums.slack, truth)
+    assert np.isclose(slack, truth) and np.isclose(sums.totals.slack, truth)
 
 
 @pytest.mark.serial
@@ -1199,15 +1201,15 @@ def test_what_oscillates_on_thin_cells():
     near, far = (np.sqrt(pp + bb + 2 * sign * pb) for sign in (1, -1))
     assert np.allclose(sums.middle, (near + norm) ** 2)
     assert np.allclose(sums.across, (far + norm) ** 2)
-    assert np.isclose(sums.near, np.sum(2 * near * norm))
-    assert np.isclose(sums.far, np.sum(2 * far * norm))
-    assert np.isclose(sums.load, np.sum(norm**2))
+    assert np.isclose(sums.totals.near, np.sum(2 * near * norm))
+    assert np.isclose(sums.totals.far, np.sum(2 * far * norm))
+    assert np.isclose(sums.totals.load, np.sum(norm**2))
     assert np.allclose(sums.indicators, pp + bb + norm**2)
-    assert sums.load_flux == sums.load_companion == sums.slack == 0.0
+    assert sums.totals.load_flux == sums.totals.load_companion == sums.totals.slack == 0.0
     # ∫ c_F² = |T|/840
     thirds = np.abs(v.thirds[cells.facets]).sum(axis=0)
     slack = np.sum(np.sqrt(cells.volume * load.rest) * thirds * np.sqrt(cells.volume / 840))
-    assert np.isclose(sums.energy_slack, slack)
+    assert np.isclose(sums.totals.energy_slack, slack)
 
 
 @pytest.mark.serial
@@ -1226,9 +1228,12 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     assert found == 0.0 and len(at) == 4 and sizes.min() > 1e-3
     norms = np.zeros(cells.number)
     norms[at] = sizes / np.sqrt(kappa.low[at])
-    assert np.isclose(sums.neumann, np.sum(norms**2)) and sums.load == sums.neumann
+    assert (
+        np.isclose(sums.totals.neumann, np.sum(norms**2))
+        and sums.totals.load == sums.totals.neumann
+    )
     assert np.allclose(sums.indicators, before["indicators"] + norms**2)
-    for name, more in (("middle", sums.near), ("across", sums.far)):
+    for name, more in (("middle", sums.totals.near), ("across", sums.totals.far)):
         assert np.allclose(getattr(sums, name), (np.sqrt(before[name]) + norms) ** 2)
         assert np.isclose(more, np.sum(2 * np.sqrt(before[name]) * norms))
 
