@@ -11,6 +11,7 @@ All of them are quadratic forms in a handful of numbers per cell, in which the m
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,116 +48,256 @@ def integrate(
         v: v.
         reaction: c, shape (cells,) or ().
     """
-    d = cells.tdim
     sums = Sums.empty(cells.number, reacts(reaction))
+    gap = _Gap(cells, kappa, w, load, flux, v, reaction, sums)
     for part in blocks(cells.number):
-        P, c, W = flux.excess[:, part], v.excess[:, part], w[:, part]
-        height = v.bumps[cells.facets[:, part]] if d == 2 else None
-        around, beside = np.zeros((2, part.stop - part.start))
+        gap.add(part)
+    return sums
+
+
+@dataclass(frozen=True)
+class _Products:
+    """∫_T of what the gap is made of, and what may be missed of it; shapes (n,).
+
+    Attributes:
+        pp: |p|².
+        bb: |b|².
+        pb: p·b.
+        vv: κ|∇v|².
+        far: How far ∫_T |p − b|² may be above its value.
+        near: The same of |p + b|².
+        energy: The same of ½κ|∇v|².
+    """
+
+    pp: FloatArray
+    bb: FloatArray
+    pb: FloatArray
+    vv: FloatArray
+    far: FloatArray
+    near: FloatArray
+    energy: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Gap:
+    """The gap between y and v, which is added up range by range of cells.
+
+    Attributes:
+        cells: The mesh.
+        kappa: The coefficient.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        load: Moments of f − c u_h.
+        flux: y.
+        v: v.
+        reaction: c, shape (cells,) or ().
+        sums: What is added to.
+    """
+
+    cells: Cells
+    kappa: Coefficient
+    w: FloatArray
+    load: VolumeMoments
+    flux: Flux
+    v: Companion
+    reaction: FloatArray
+    sums: Sums
+
+    def add(self, part: slice) -> None:
+        """Add what a range of cells has of the gap."""
+        height = self.v.bumps[self.cells.facets[:, part]] if self.cells.tdim == 2 else None
+        products = self._products(part, height)
+        self._add_fields(part, products)
+        moment = self._moment(part, height)
+        if moment is not None:
+            self._add_oscillation(part, products.pp, moment)
+        self._add_zeroth(part, height)
+        self._add_energy(part, products.vv, moment, height)
+
+    def _products(self, part: slice, height: FloatArray | None) -> _Products:
+        """Integrate the products of p, b and ∇v, exactly where κ and y allow for it."""
+        cells, kappa, flux, v, w = self.cells, self.kappa, self.flux, self.v, self.w
         if kappa.values is None and flux.beyond is None:
-            pp, bb, pb, vv = _exact(cells, kappa, part, P, c, W, height)
+            nothing_missed = np.zeros((3, part.stop - part.start))
+            found = _Products(*_exact(cells, kappa, part, flux, v, w, height), *nothing_missed)
         else:
-            pp, bb, pb, vv, far, near, of_energy = _by_quadrature(cells, kappa, part, flux, v, w)
-            around += near
-            beside += far
-            sums.totals.far += float(np.sum(far))
-            sums.totals.near += float(np.sum(near))
-            sums.totals.energy_slack += float(np.sum(of_energy))
-        if kappa.tensor is not None:
-            gap = pp + bb - 2.0 * pb, pp + bb + 2.0 * pb
-            vv, far, near, of_energy = _of_tensor(cells, kappa, part, flux, v, w, gap)
-            around += near
-            beside += far
-            sums.totals.far += float(np.sum(far))
-            sums.totals.near += float(np.sum(near))
-            sums.totals.energy_slack += float(np.sum(of_energy))
-        volume, s = cells.volume[part], sum_rows(P)
-        total = sum_rows(c) + sum_rows(W)
-        fv = load.mean[part] * total / (d + 1)
+            found = _Products(*_by_quadrature(cells, kappa, part, flux, v, w))
+        if kappa.tensor is None:
+            return found
+        square, cross = found.pp + found.bb, 2.0 * found.pb
+        gap = square - cross, square + cross
+        vv, far, near, energy = _of_tensor(cells, kappa, part, flux, v, w, gap)
+        return replace(
+            found,
+            vv=vv,
+            far=found.far + far,
+            near=found.near + near,
+            energy=found.energy + energy,
+        )
+
+    def _add_fields(self, part: slice, found: _Products) -> None:
+        """Begin the cells' shares with p and b."""
+        sums, totals = self.sums, self.sums.totals
+        square = found.pp + found.bb
+        sums.indicators[part], sums.steepness[part] = square, found.vv
+        sums.middle[part] = found.near + (square + 2.0 * found.pb)
+        sums.across[part] = found.far + (square - 2.0 * found.pb)
+        totals.flux += float(np.sum(found.pp))
+        totals.companion += float(np.sum(found.bb))
+        totals.cross += float(np.sum(found.pb))
+        totals.far += float(np.sum(found.far))
+        totals.near += float(np.sum(found.near))
+        totals.energy_slack += float(np.sum(found.energy))
+
+    def _moment(self, part: slice, height: FloatArray | None) -> FloatArray | None:
+        """Means of (f − f_T)(v − u_h), shape (n,); None where f is constant on each cell."""
+        if self.load.hats is None or self.load.bumps is None:
+            return None
+        moment = dot_rows(self.load.hats[:, part], self.v.excess[:, part])
+        if height is not None:
+            moment += dot_rows(self.load.bumps[:, part], height)
+        return moment
+
+    # what f has beyond its means
+
+    def _add_oscillation(self, part: slice, pp: FloatArray, moment: FloatArray) -> None:
+        """Add σ, or where that is dear and c is large, what c takes up instead.
+
+        Args:
+            part: Which cells.
+            pp: ∫_T |p|², shape (n,).
+            moment: Means of (f − f_T)(v − u_h), shape (n,).
+        """
+        cells, sums, reaction = self.cells, self.sums, self.reaction
+        load, volume = self.load, cells.volume[part]
+        left = load.variance if self.flux.beyond is None else load.rest
+        assert left is not None
+        square = poincare(cells.tdim) ** 2 * cells.diameter2[part] * volume * left[part]
+        share = square / pick(self.kappa.low, part)
+        taken = _taken_up(square, volume * left[part], self.kappa, part, reaction)
+        if taken is not None and sums.zeroth is not None:
+            np.divide(volume * left[part], pick(reaction, part), out=share, where=taken)
+            square = np.where(taken, 0.0, square)
+            sums.zeroth[part] = np.where(taken, share, 0.0)
+        sums.indicators[part] += share
+        sums.totals.load += float(np.sum(share))
+        if self.flux.beyond is not None:
+            _add_by_size(sums, part, share)
+            return
+        work = volume * moment
+        sums.totals.load_companion += float(np.sum(work))
+        against, slack = self._against(part, pp, square, share)
+        if taken is not None:
+            against, slack, work, share = (
+                np.where(taken, 0.0, each) for each in (against, slack, work, share)
+            )
+        sums.totals.load_flux += float(np.sum(against))
+        sums.totals.slack += float(np.sum(slack))
+        against += slack
+        sums.middle[part] += share + 2.0 * (against + work)
+        sums.across[part] += share + 2.0 * (against - work)
+
+    def _against(
+        self, part: slice, pp: FloatArray, square: FloatArray, weighted: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """∫_T κ^{-1/2}σ·p, and how far that may be from the truth, shapes (n,).
+
+        Args:
+            part: Which cells.
+            pp: ∫_T |p|², shape (n,).
+            square: Bound of ‖σ‖²_T, shape (n,).
+            weighted: Bound of ‖κ^{-1/2}σ‖²_T, shape (n,).
+        """
+        cells, load = self.cells, self.load
+        P = self.flux.excess[:, part]
+        if cells.tdim == 2 and load.hats is not None and load.bumps is not None:
+            hats, bumps = load.hats[:, part], load.bumps[:, part]
+            against = _against_potential(cells, P, sum_rows(P), hats, bumps, part)
+            against /= pick(self.kappa.mean, part)
+            slack = np.zeros_like(against)
+        else:
+            against, slack = np.zeros_like(pp), np.sqrt(weighted * pp)
+        if self.kappa.varies:
+            # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
+            slack += np.sqrt(square) * _twist(cells, self.kappa, part, P, self.w[:, part])
+        return against, slack
+
+    # terms without gradients
+
+    def _add_zeroth(self, part: slice, height: FloatArray | None) -> None:
+        """Add c‖v − u_h‖², what c takes up, and to the energy ½ c (v − u_h)² − ½ c u_h²."""
+        sums, totals, c, W = self.sums, self.sums.totals, self.v.excess[:, part], self.w[:, part]
+        if sums.zeroth is None or sums.apart is None:
+            return
+        d = self.cells.tdim
+        mass = pick(self.reaction, part) * self.cells.volume[part]
+        apart = mass * distance(c, height)
+        size = sum_rows(W) ** 2 + dot_rows(W, W)
+        own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
+        totals.energy += 0.5 * float(np.sum(apart))
+        totals.energy -= own
+        totals.energy_slack += EPS * own
+        totals.companion += float(np.sum(apart))
+        sums.apart[part] = apart
+        sums.zeroth[part] += apart
+        sums.indicators[part] += apart
+        if self.flux.taken_up is not None:
+            rest = np.where(self.flux.taken_up[part], self.flux.left[part], 0.0)
+            given = np.divide(rest**2, mass, out=np.zeros_like(rest), where=rest != 0.0)
+            means = sum_rows(c) / (d + 1)
+            if height is not None:
+                means += sum_rows(height) / 3
+            totals.load += float(np.sum(given))
+            totals.load_companion += float(rest @ means)
+            sums.zeroth[part] += given
+            sums.indicators[part] += given
+
+    # the energy
+
+    def _add_energy(
+        self, part: slice, vv: FloatArray, moment: FloatArray | None, height: FloatArray | None
+    ) -> None:
+        """Add ½∫ κ|∇v|² − ∫ (f − c u_h) v.
+
+        Args:
+            part: Which cells.
+            vv: ∫_T κ|∇v|², shape (n,).
+            moment: Means of (f − f_T)(v − u_h), shape (n,); None where f is constant on each cell.
+            height: Heights of v's bumps, shape (3, n); None where it has none.
+        """
+        cells, load, totals = self.cells, self.load, self.sums.totals
+        d, volume, W = cells.tdim, cells.volume[part], self.w[:, part]
+        fv = load.mean[part] * (sum_rows(self.v.excess[:, part]) + sum_rows(W)) / (d + 1)
         if height is not None:
             fv += load.mean[part] * sum_rows(height) / 3
-        share = pp + bb
-        around += share + 2.0 * pb
-        beside += share - 2.0 * pb
-        if load.hats is not None and load.bumps is not None and load.variance is not None:
-            hats, bumps = load.hats[:, part], load.bumps[:, part]
-            moment = dot_rows(hats, c)
+        if moment is not None and load.hats is not None:
+            hats = load.hats[:, part]
             fv += dot_rows(hats, W)
-            if height is not None:
-                moment += dot_rows(bumps, height)
             fv += moment
-            left = load.variance if flux.beyond is None else load.rest
-            square = poincare(d) ** 2 * cells.diameter2[part] * volume * left[part]
-            osc = square / pick(kappa.low, part)
-            taken = _taken_up(square, volume * left[part], kappa, part, reaction)
-            if taken is not None and sums.zeroth is not None:
-                np.divide(volume * left[part], pick(reaction, part), out=osc, where=taken)
-                square = np.where(taken, 0.0, square)
-                sums.zeroth[part] = np.where(taken, osc, 0.0)
-            share += osc
-            sums.totals.load += float(np.sum(osc))
-            if v.thirds is not None:
-                third = local_thirds(cells, v.thirds, part)
+            if self.v.thirds is not None:
+                third = local_thirds(cells, self.v.thirds, part)
                 rise = 12.0 / 180.0 * np.stack([hats[j] - hats[k] for j, k in cells.others])
                 fv += dot_rows(third, rise)
+                # ∫_T c_F² = |T|/840, for what f has beyond its affine part
+                left = load.variance if self.flux.beyond is None else load.rest
+                assert left is not None
                 off = volume * np.sqrt(left[part] / 840.0) * sum_rows(np.abs(third))
-                sums.totals.energy_slack += float(np.sum(off))
-            if flux.beyond is not None:
-                far, near = _swollen(beside, osc), _swollen(around, osc)
-                sums.totals.far += float(np.sum(far))
-                sums.totals.near += float(np.sum(near))
-                around += osc + near
-                beside += osc + far
-            else:
-                against, slack = np.zeros_like(osc), np.zeros_like(osc)
-                if d == 2:
-                    against = _against_potential(cells, P, s, hats, bumps, part)
-                    against /= pick(kappa.mean, part)
-                else:
-                    slack = np.sqrt(osc * pp)
-                if kappa.varies:
-                    # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
-                    slack += np.sqrt(square) * _twist(cells, kappa, part, P, W)
-                work = volume * moment
-                sums.totals.load_companion += float(np.sum(work))
-                if taken is not None:
-                    against, slack, work, osc = (
-                        np.where(taken, 0.0, each) for each in (against, slack, work, osc)
-                    )
-                sums.totals.load_flux += float(np.sum(against))
-                sums.totals.slack += float(np.sum(slack))
-                against += slack
-                around += osc + 2.0 * (against + work)
-                beside += osc + 2.0 * (against - work)
-        if sums.zeroth is not None and sums.apart is not None:
-            size = sum_rows(W) ** 2 + dot_rows(W, W)
-            mass = pick(reaction, part) * volume
-            apart = mass * distance(c, height)
-            sums.totals.energy += 0.5 * float(np.sum(apart))
-            own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
-            sums.totals.energy -= own
-            sums.totals.energy_slack += EPS * own
-            sums.totals.companion += float(np.sum(apart))
-            sums.apart[part] = apart
-            sums.zeroth[part] += apart
-            share += apart
-            if flux.taken_up is not None:
-                rest = np.where(flux.taken_up[part], flux.left[part], 0.0)
-                given = np.divide(rest**2, mass, out=np.zeros_like(rest), where=rest != 0.0)
-                means = sum_rows(c) / (d + 1)
-                if height is not None:
-                    means += sum_rows(height) / 3
-                sums.totals.load += float(np.sum(given))
-                sums.totals.load_companion += float(rest @ means)
-                sums.zeroth[part] += given
-                share += given
-        sums.totals.flux += float(np.sum(pp))
-        sums.totals.companion += float(np.sum(bb))
-        sums.totals.cross += float(np.sum(pb))
-        sums.totals.energy += float(np.sum(0.5 * vv - volume * fv))
-        sums.indicators[part], sums.steepness[part] = share, vv
-        sums.middle[part], sums.across[part] = around, beside
-    return sums
+                totals.energy_slack += float(np.sum(off))
+        totals.energy += float(np.sum(0.5 * vv - volume * fv))
+
+
+def _add_by_size(sums: Sums, where: slice | IndexArray, squares: FloatArray) -> None:
+    """Add a part of σ to the cells' squares of which no more than the norm is known.
+
+    Args:
+        sums: What to add to.
+        where: Which cells, each once.
+        squares: ‖κ^{-1/2}σ‖²_T, shape (n,).
+    """
+    far, near = (_swollen(row[where], squares) for row in (sums.across, sums.middle))
+    sums.totals.far += float(np.sum(far))
+    sums.totals.near += float(np.sum(near))
+    sums.across[where] += squares + far
+    sums.middle[where] += squares + near
 
 
 def _taken_up(
@@ -166,7 +307,7 @@ def _taken_up(
     where: slice | IndexArray,
     reaction: FloatArray,
 ) -> BoolArray | None:
-    """Where c takes up what f has beyond its mean more cheaply than σ does; None for nowhere.
+    """Tell where c takes up what f has beyond its mean more cheaply than σ; None for nowhere.
 
     Args:
         square: Bound of ‖σ‖²_T, shape (n,).
@@ -211,62 +352,99 @@ def integrate_edge(
     Returns:
         This rank's share of the square of what goes into ω.
     """
-    side, d = edge.side, cells.tdim
     at, sizes = edge.oscillation(flux.beyond is not None)
     low = pick(kappa.low, at)
-    sums.indicators[at] += sizes**2 / low
-    sums.totals.neumann = float(np.sum(sizes**2 / low))
+    squares = sizes**2 / low
+    sums.indicators[at] += squares
+    sums.totals.neumann = float(np.sum(squares))
     if edge.loss.any():
         _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
-    if d != 2:
+    if cells.tdim != 2:
         return sums.totals.neumann
     if flux.beyond is not None:
         sums.totals.load += sums.totals.neumann
-        far, near = (_swollen(row[at], sizes**2 / low) for row in (sums.across, sums.middle))
-        sums.totals.far += float(np.sum(far))
-        sums.totals.near += float(np.sum(near))
-        sums.across[at] += sizes**2 / low + far
-        sums.middle[at] += sizes**2 / low + near
+        _add_by_size(sums, at, squares)
         return 0.0
-    of_f: FloatArray = np.zeros(len(at))
-    if load.variance is not None:
-        square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
-        of_f = poincare(d) * np.sqrt(square)
-        variance = cells.volume[at] * load.variance[at]
-        if (taken := _taken_up(of_f**2, variance, kappa, at, reaction)) is not None:
-            of_f[taken] = 0.0
+    # σ has been counted for f: ‖σ_f + σ_g‖² is at most ‖σ_f‖² and this more
+    of_f = _size_of_oscillation(cells, kappa, load, at, reaction)
     more = (2.0 * of_f * sizes + sizes**2) / low
     sums.totals.load += float(np.sum(more))
     for row in (sums.middle, sums.across):
         row[at] += more
-    ends = cells.others[side.local].T, side.cells
-    weights = edge.measure * edge.weights[:, None] * edge.rest
-    jump = apart(cells, w, edge, v.vertices, v.bumps)
-    sums.totals.load_companion += float(np.sum(weights * jump))
-    # The potential of y − κ_T∇u_h, as in _against_potential
-    P = flux.excess[:, side.cells]
-    s = sum_rows(P)
-    a = P - s / (d + 1)
-    apex, base = corner_points(cells, side)
-    if cells.stretch is not None:
-        stretch = cells.stretch[side.cells]
-        apex, base = (np.einsum("nij,...nj->...ni", stretch, x) for x in (apex, base))
-    middle = (apex + base.sum(axis=0)) / (d + 1)
-    pull = a[side.local, np.arange(len(s))][:, None] * (apex - middle)
-    pull += np.einsum("in,ink->nk", a[ends[0], np.arange(len(s))], base - middle)
-    x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
-    potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
-    potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
-    weights = np.where(edge.given[edge.place], 0.0, weights)
-    sums.totals.load_flux += float(np.sum(weights * potential))
-    np.add.at(sums.middle, side.cells, 2.0 * (weights * (potential + jump)).sum(axis=0))
-    np.add.at(sums.across, side.cells, 2.0 * (weights * (potential - jump)).sum(axis=0))
+    _add_edge_products(cells, kappa, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
     if kappa.varies:
         slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], w[:, at])
         sums.totals.slack += float(np.sum(slack))
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
     return 0.0
+
+
+def _size_of_oscillation(
+    cells: Cells, kappa: Coefficient, load: VolumeMoments, at: IndexArray, reaction: FloatArray
+) -> FloatArray:
+    """Bound ‖σ‖_T of what f has beyond its mean and c does not take up, shape (n,).
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        load: Moments of f.
+        at: Which cells, shape (n,).
+        reaction: c, shape (cells,) or ().
+    """
+    if load.variance is None:
+        return np.zeros(len(at))
+    square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
+    size: FloatArray = poincare(cells.tdim) * np.sqrt(square)
+    taken = _taken_up(size**2, cells.volume[at] * load.variance[at], kappa, at, reaction)
+    return size if taken is None else np.where(taken, 0.0, size)
+
+
+def _add_edge_products(
+    cells: Cells,
+    kappa: Coefficient,
+    edge: Segments,
+    flux: Flux,
+    jump: FloatArray,
+    sums: Sums,
+) -> None:
+    """Add σ's products with p and b: ∫_F (g − g_F) φ with the potentials φ of both, d = 2.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        edge: Values of g − b u_h.
+        flux: y.
+        jump: v − u_h at its points, shape (q, n).
+        sums: What to add to.
+    """
+    at, weights = edge.side.cells, edge.measure * edge.weights[:, None] * edge.rest
+    sums.totals.load_companion += float(np.sum(weights * jump))
+    potential = _edge_potential(cells, kappa, edge, flux)
+    # where b takes up g − g_F there is no σ
+    weights = np.where(edge.given[edge.place], 0.0, weights)
+    sums.totals.load_flux += float(np.sum(weights * potential))
+    np.add.at(sums.middle, at, 2.0 * (weights * (potential + jump)).sum(axis=0))
+    np.add.at(sums.across, at, 2.0 * (weights * (potential - jump)).sum(axis=0))
+
+
+def _edge_potential(cells: Cells, kappa: Coefficient, edge: Segments, flux: Flux) -> FloatArray:
+    """φ with ∇φ = κ_T⁻¹ y − ∇u_h, as in `_against_potential`, at the points, shape (q, n)."""
+    side, d = edge.side, cells.tdim
+    P = flux.excess[:, side.cells]
+    s = sum_rows(P)
+    a, row = P - s / (d + 1), np.arange(len(s))
+    apex, base = corner_points(cells, side)
+    if cells.stretch is not None:
+        stretch = cells.stretch[side.cells]
+        apex, base = (np.einsum("nij,...nj->...ni", stretch, x) for x in (apex, base))
+    middle = (apex + base.sum(axis=0)) / (d + 1)
+    pull = a[side.local, row][:, None] * (apex - middle)
+    pull += np.einsum("in,ink->nk", a[cells.others[side.local].T, row], base - middle)
+    x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
+    potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
+    potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
+    return potential
 
 
 def apart(
@@ -344,25 +522,26 @@ def _exact(
     cells: Cells,
     kappa: Coefficient,
     part: slice,
-    P: FloatArray,
-    c: FloatArray,
-    W: FloatArray,
+    flux: Flux,
+    v: Companion,
+    w: FloatArray,
     height: FloatArray | None,
-) -> tuple[FloatArray, ...]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """∫_T of |p|², |b|², p·b and κ|∇v|² for κ constant on T, shapes (cells in the part,).
 
     Args:
         cells: The mesh.
         kappa: The coefficient.
         part: Which cells.
-        P: Fluxes of y − κ_T∇u_h out of the cells.
-        c: v − u_h at the vertices.
-        W: u_h at the vertices.
-        height: Heights of v's bumps.
+        flux: y.
+        v: v.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        height: Heights of v's bumps, shape (3, n); None where it has none.
     """
     d, k = cells.tdim, pick(kappa.mean, part)
+    P, c = flux.excess[:, part], v.excess[:, part]
     s, c_sum = sum_rows(P), sum_rows(c)
-    z = c + W
+    z = c + w[:, part]
     Sc, Sz = cells.apply(c, part), cells.apply(z, part)
     if height is None:
         bb, vv, on_facets = dot_rows(c, Sc), dot_rows(z, Sz), c
@@ -382,8 +561,7 @@ def _by_quadrature(
     """The same for any κ and any y, and how far it may be from the truth.
 
     Returns:
-        ∫_T of |p|², |b|², p·b and κ|∇v|²; and bounds of what quadrature may miss of ∫_T |p − b|²,
-        ∫_T |p + b|² and ½∫_T κ|∇v|².
+        The fields of `_Products`, in their order.
     """
     values, cut, mean = kappa.values, kappa.cut, kappa.mean
     if values is None or cut is None:
