@@ -30,7 +30,7 @@ from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
-from .sums import Sums
+from .sums import Sums, Totals
 
 if TYPE_CHECKING:
     from ..vi.level import Level
@@ -345,81 +345,140 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     Raises:
         _NoBound: With the reason.
     """
-    cells, kappa, flux, w = known.cells, known.kappa, known.flux, known.w
-    certain, segments = known.certain, known.segments
-    edge_square = integrate_edge(
-        cells, kappa, w, certain.load, segments, flux, v, sums, known.reaction
+    cells, kappa, segments = known.cells, known.kappa, known.segments
+    totals, load = sums.totals, known.certain.load
+    totals.loose = integrate_edge(
+        cells, kappa, known.w, load, segments, known.flux, v, sums, known.reaction
     )
-    lift, lift_energy, lift_far, lift_near = _lifted(known, v, sums)
+    totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
+    totals.energy_slack += more_energy
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
-    edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
+    of_edge = segments.measure @ (segments.weights @ (segments.values * on_edge))
+    totals.energy -= float(of_edge)
+    totals.contact = float(np.sum(v.contact))
+    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
+    totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
     hidden, hidden_energy = _hidden(known, v, sums)
-    rounding = _rounding(cells, kappa, known.reaction, w, certain.load, flux)
-    total = sums.totals.over_ranks(cells)
-    contact, edge_square, edge_energy, lift, lift_energy, lift_far, lift_near = cells.total(
-        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, lift_far, lift_near
-    )
-    of_gradients, steep = cells.total(
-        np.sum(np.maximum(sums.middle, 0.0) / kappa.least), np.sum(np.maximum(sums.steepness, 0.0))
-    )
+    rounding = _rounding(cells, kappa, known.reaction, known.w, load, known.flux)
+    total = totals.over_ranks(cells)
 
-    # ‖p + κ^{-1/2}σ ∓ b‖ and the ball around (y + κ∇v)/2 that has κ∇u in it
-    loose = np.sqrt(edge_square) + known.left + hidden + rounding
-    same = total.flux + total.companion + total.load + 2 * (total.load_flux + total.slack)
-    mixed = 2 * (total.cross + total.load_companion)
-    far = np.sqrt(max(same - mixed + total.far, 0.0) + lift_far) + loose
-    near = np.sqrt(max(same + mixed + total.near, 0.0) + lift_near) + rounding
-    radius = loose / 2 + np.sqrt(far**2 / 4 + contact)
-    bound = near / 2 + radius
-    bound_h1 = np.sqrt(of_gradients) / 2 + (rounding / 2 + radius) / np.sqrt(kappa.smallest)
+    ball = _Ball.of(total, known.left, hidden, rounding)
     _insist(v.reason or (ADRIFT if np.isposinf(known.left) else None))
-    _insist(None if np.isfinite(bound) else HUGE)
-
-    energy = total.energy - edge_energy
-    unsure = lift_energy + hidden_energy + total.energy_slack
-    unsure += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    lift = np.sqrt(lift)
+    _insist(None if np.isfinite(ball.bound) else HUGE)
+    bound_h1 = np.sqrt(total.of_gradients) / 2
+    bound_h1 += (rounding / 2 + ball.radius) / np.sqrt(kappa.smallest)
+    lift = np.sqrt(total.lift)
     return Certificate(
-        bound_h1=float(min(bound_h1, bound / np.sqrt(kappa.smallest))),
-        bound_energy_norm=float(bound),
-        bound_companion=float((far + np.sqrt(far**2 + 4 * contact)) / 2 + lift),
-        energy=(float(energy - unsure - far**2 / 2 - contact), float(energy + unsure)),
+        bound_h1=float(min(bound_h1, ball.bound / np.sqrt(kappa.smallest))),
+        bound_energy_norm=float(ball.bound),
+        bound_companion=float(ball.of_companion + lift),
+        energy=_bracket(total, ball, hidden_energy, rounding),
         parts={
             "flux": float(np.sqrt(total.flux)),
             "companion": float(np.sqrt(total.companion)),
-            "contact": float(np.sqrt(contact)),
+            "contact": float(np.sqrt(total.contact)),
             "load": float(np.sqrt(total.load) + hidden),
             "neumann": float(np.sqrt(total.neumann)),
             "boundary": float(lift),
             "solver": float(known.left + known.carried),
         },
         indicators=sums.indicators,
-        _made=Made(
-            level=known.level,
-            w=w,
-            kappa=kappa.mean,
-            stretch=cells.stretch,
-            hats=certain.load.hats,
-            segments=segments,
-            varies=kappa.varies,
-            excess=flux.excess,
-            beyond=flux.beyond,
-            vertices=v.vertices,
-            bumps=v.bumps,
-            thirds=v.thirds,
-            cusps=v.cusps,
-            reaction=known.reaction,
-            left=flux.left,
-            taken_up=flux.taken_up,
-            shed=flux.shed,
-            forces=_forces(v.boundary.alpha, flux),
-            missed=float(segments.missed.sum())
-            + (0.0 if certain.missed is None else float(certain.missed.sum())),
-            reach=float(bound - near / 2 + loose + lift / 2),
-            loose=float(loose + lift),
-            lift=v.lift,
-            bounded=v.boundary.alpha.side.dofs,
-        ),
+        _made=_made(known, v, ball, lift),
+    )
+
+
+@dataclass(frozen=True)
+class _Ball:
+    """The ball around (y + κ∇v)/2 that has κ∇u in it.
+
+    Attributes:
+        far: Bound of ‖p + κ^{-1/2}σ − b‖, what is loose included.
+        near: Bound of ‖p + κ^{-1/2}σ + b‖.
+        loose: What is known of −div y = f and y·n = g by its size alone, and rounding.
+        contact: The contact term.
+    """
+
+    far: float
+    near: float
+    loose: float
+    contact: float
+
+    @classmethod
+    def of(cls, total: Totals, left: float, hidden: float, rounding: float) -> _Ball:
+        """Put it together.
+
+        Args:
+            total: The integrals over all ranks' cells.
+            left: What is left of −div y = f.
+            hidden: What quadrature may have missed of f and g.
+            rounding: What rounding may do.
+        """
+        loose = np.sqrt(total.loose) + left + hidden + rounding
+        same = total.flux + total.companion + total.load + 2 * (total.load_flux + total.slack)
+        mixed = 2 * (total.cross + total.load_companion)
+        far = np.sqrt(max(same - mixed + total.far, 0.0) + total.lift_far) + loose
+        near = np.sqrt(max(same + mixed + total.near, 0.0) + total.lift_near) + rounding
+        return cls(far, near, loose, total.contact)
+
+    @property
+    def radius(self) -> float:
+        """Its radius."""
+        return float(self.loose / 2 + np.sqrt(self.far**2 / 4 + self.contact))
+
+    @property
+    def bound(self) -> float:
+        """How far its points are from κ∇u_h, at most."""
+        return self.near / 2 + self.radius
+
+    @property
+    def of_companion(self) -> float:
+        """How far its points are from κ∇v, at most."""
+        return float((self.far + np.sqrt(self.far**2 + 4 * self.contact)) / 2)
+
+
+def _bracket(total: Totals, ball: _Ball, hidden: float, rounding: float) -> tuple[float, float]:
+    """Two numbers with J(u) between them: J(v) is above it, by the gap at most.
+
+    Args:
+        total: The integrals over all ranks' cells.
+        ball: What the gap is made of.
+        hidden: What quadrature may have missed of J(v).
+        rounding: What rounding may do to norms.
+    """
+    steep, energy = total.steepness, total.energy
+    unsure = hidden + total.energy_slack
+    unsure += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
+    return float(energy - unsure - ball.far**2 / 2 - ball.contact), float(energy + unsure)
+
+
+def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
+    """Keep what y and v are made of, and the ball, lift being ℓ's norm."""
+    flux, certain, segments, alpha = known.flux, known.certain, known.segments, v.boundary.alpha
+    missed = 0.0 if certain.missed is None else float(certain.missed.sum())
+    return Made(
+        level=known.level,
+        w=known.w,
+        kappa=known.kappa.mean,
+        stretch=known.cells.stretch,
+        hats=certain.load.hats,
+        segments=segments,
+        varies=known.kappa.varies,
+        excess=flux.excess,
+        beyond=flux.beyond,
+        vertices=v.vertices,
+        bumps=v.bumps,
+        thirds=v.thirds,
+        cusps=v.cusps,
+        reaction=known.reaction,
+        left=flux.left,
+        taken_up=flux.taken_up,
+        shed=flux.shed,
+        forces=_forces(alpha, flux),
+        missed=float(segments.missed.sum()) + missed,
+        reach=float(ball.bound - ball.near / 2 + ball.loose + lift / 2),
+        loose=float(ball.loose + lift),
+        lift=v.lift,
+        bounded=alpha.side.dofs,
     )
 
 
@@ -542,25 +601,19 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     at, slope, size, edge = v.lift
     if not len(at):
         return 0.0, 0.0, 0.0, 0.0
-    cells, kappa, certain, reaction = known.cells, known.kappa, known.certain, known.reaction
+    cells, kappa = known.cells, known.kappa
     which, place = np.unique(at, return_inverse=True)
     high = kappa.most[which] if kappa.most.ndim else kappa.most
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
-    load = certain.load
-    f = np.abs(load.mean[which])
-    if load.variance is not None:
-        f = np.hypot(f, np.sqrt(load.variance[which]))
-    if certain.rough is not None:
-        f += certain.rough[which] / np.sqrt(cells.volume[which])
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
-    change = before * steep + np.sqrt(cells.volume[which]) * f * area
+    change = before * steep + np.sqrt(cells.volume[which]) * _mean_square(known, which) * area
     if sums.apart is not None:
-        c = pick(reaction, which)
+        c = pick(known.reaction, which)
         steep = np.hypot(steep, np.sqrt(c) * area)
         change += np.sqrt(c * sums.apart[which]) * area
     # on facets of Γ1 with a flux that is known
     loss, known_flux, apart = known.segments.at_facets(v.vertices, v.bumps, known.w)
-    there, on_contact = v.boundary.alpha.side.dofs, place[-len(edge) :] if len(edge) else place[:0]
+    there, on_contact = v.boundary.alpha.side.dofs, place[len(place) - len(edge) :]
     more = edge * (known_flux[there] + loss[there] * apart[there])
     change += np.bincount(on_contact, more, minlength=len(which))
     steep = steep + np.bincount(on_contact, np.sqrt(loss[there]) * edge, minlength=len(which))
@@ -575,3 +628,14 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     sums.middle[which] = np.maximum(sums.middle[which], 0.0) + near
     sums.indicators[which] += steep**2
     return float(np.sum(steep**2)), float(np.sum(change)), float(np.sum(far)), float(np.sum(near))
+
+
+def _mean_square(known: _Known, which: IndexArray) -> FloatArray:
+    """Bound |T|^{-1/2}‖f − c u_h‖_T on some cells, shape (n,)."""
+    load, rough = known.certain.load, known.certain.rough
+    f = np.abs(load.mean[which])
+    if load.variance is not None:
+        f = np.hypot(f, np.sqrt(load.variance[which]))
+    if rough is not None:
+        f += rough[which] / np.sqrt(known.cells.volume[which])
+    return f
