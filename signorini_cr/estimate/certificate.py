@@ -24,7 +24,7 @@ from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from .beyond import Beyond
-from .companion import Companion, Lifted, Masses, companion, on_facet
+from .companion import Companion, Functional, Lifted, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
@@ -207,7 +207,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     base = solution if flux_from is None else flux_from
     try:
         known = _equilibrated(solution, base)
-        v, sums = _companion(solution, base, known, sweeps)
+        v, sums = _companion(solution, known, sweeps)
         certificate = _added_up(known, v, sums)
     except _NoBound as why:
         certificate = Certificate(reason=str(why))
@@ -300,9 +300,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
 
 
-def _companion(
-    solution: Solved, base: Solved, known: _Known, sweeps: int
-) -> tuple[Companion, Sums]:
+def _companion(solution: Solved, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
     """Make v, improve y where that promises much, and integrate the gap; collective."""
     cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     if solution.element != "CR":
@@ -315,16 +313,9 @@ def _companion(
     data = diffusion(known.level.data)
     u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
     plain = data.forms.of_one is None
-    steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
-    u = base.u.x.array
-    segments = known.segments
-    lossy = segments.loss > 0.0
-    side = segments.facets.picked(lossy)
-    of_facets = segments.loss[lossy] * measures(cells, side)
-    masses = Masses(not plain, known.reaction, side, of_facets)
-    v = companion(cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal, masses)
+    v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal)
     sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
     if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
@@ -337,6 +328,18 @@ def _companion(
         )
     np.add.at(sums.indicators, alpha.side.cells, v.contact)
     return v, sums
+
+
+def _functional(known: _Known, plain: bool) -> Functional:
+    """Say what v is to make small; plain tells that there are gradients only, on all ranks."""
+    cells, kappa, segments = known.cells, known.kappa, known.segments
+    steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
+    lossy = segments.loss > 0.0
+    side = segments.facets.picked(lossy)
+    loss = segments.loss[lossy] * measures(cells, side)
+    return Functional(
+        cells, known.w, kappa.mean, steady, Masses(not plain, known.reaction, side, loss)
+    )
 
 
 def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
