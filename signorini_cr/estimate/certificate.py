@@ -279,7 +279,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, data.of_f, cells, kappa.low, size, reaction)
     _insist(certain.reason)
-    certain = replace(certain, load=data.with_source(certain.load))
+    certain = replace(certain, load=data.moments.with_source(certain.load))
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
     # y is to have the means that f and g have now
