@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 DONE, FAULT, BAD_INPUT, NOT_CONVERGED = 0, 1, 2, 3
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+FRAMES = 10_000
+"""Calls within one another: UFL differentiates by recursion, 40 calls at most for each of the 250
+operations that `expressions.LONGEST_CHAIN` allows one upon the other."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,8 +66,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         screen.complain(str(error))
         wait_for_all()
         return BAD_INPUT
-    with _interruptible() as asked:
+    with _interruptible() as asked, room_for_recursion():
         return _run(args, screen, asked)
+
+
+@contextmanager
+def room_for_recursion() -> Iterator[None]:
+    """Let expressions be as deep as they may be; the process is the command's, while it runs."""
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(before, FRAMES))
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(before)
 
 
 @contextmanager
