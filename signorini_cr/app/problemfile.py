@@ -10,7 +10,6 @@ import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from ..adaptive import solve_adaptive
 from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
-from ..errors import InputError, on_root
+from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Material, Problem
@@ -38,7 +37,6 @@ from .readers import (
     array,
     get,
     insist_known,
-    named,
     number,
     one_of,
     parse_toml,
@@ -125,13 +123,11 @@ class ProblemFile:
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Make or read the coarsest mesh; collective."""
         key = "domain.mesh" if isinstance(self.domain, Path) else "domain"
-        try:
+        with naming(key):
             if isinstance(self.domain, Path):
                 return read_gmsh(self.domain, comm, self.parts, self.materials)
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
-        except InputError as error:
-            raise InputError(f"{key}: {error}") from None
 
     def check(self, domain: Domain) -> list[str]:
         """Try the data out on the coarsest mesh; collective.
@@ -361,7 +357,8 @@ def _domain(
     for name, material in materials.items():
         key, needed = f"material.{name}", "a list of points [x, y]"
         points = _points(f"{key}.polygon", get(material, key, "polygon", array, needed=needed))
-        named(f"{key}.polygon", check_loops, [coordinates(points)], rule=SIMPLE)
+        with naming(f"{key}.polygon", SIMPLE):
+            check_loops([coordinates(points)])
         polygons[name] = points
     for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
         key = f"domain.holes[{i}]"
@@ -378,11 +375,11 @@ def _domain(
         else:
             holes.append(_polygon(hole, key, names, size))
     if holes or polygons:
-        apart = "holes must lie inside the polygon and apart from each other"
-        whole_polygon = partial(replace, polygon, holes=tuple(holes))
-        polygon = named("domain.holes", whole_polygon, rule=apart)
+        with naming("domain.holes", "holes must lie inside the polygon and apart from each other"):
+            polygon = replace(polygon, holes=tuple(holes))
         polygon = replace(polygon, materials=polygons)
-    named("domain.boundary", polygon.check_parts)
+    with naming("domain.boundary"):
+        polygon.check_parts()
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
     for name in names:
         if name not in labels:
@@ -413,8 +410,10 @@ def _polygon(
             f" found {len(boundary)} labels"
         )
     arcs = _arcs(f"{section}.arcs", array(f"{section}.arcs", table.get("arcs", [])))
-    points, labels, edges = named(f"{section}.arcs", cut, points, boundary, arcs, size)
-    return named(key, partial(Polygon, edges=edges), points, labels, (), names, rule=SIMPLE)
+    with naming(f"{section}.arcs"):
+        points, labels, edges = cut(points, boundary, arcs, size)
+    with naming(key, SIMPLE):
+        return Polygon(points, labels, names=names, edges=edges)
 
 
 def _arcs(key: str, arcs: list[Any]) -> dict[int, list[float]]:
@@ -442,7 +441,8 @@ def _circle(table: Mapping[str, Any], section: str, names: tuple[str, ...], size
     center = get(table, section, "center", _pair, needed="a point [x, y]")
     radius = get(table, section, "radius", positive, needed="a number above 0")
     part = get(table, section, "boundary", _label(names), needed="one label")
-    return named(section, partial(Polygon.circle, names=names), center, radius, part, size)
+    with naming(section):
+        return Polygon.circle(center, radius, part, size, names=names)
 
 
 def _label(names: tuple[str, ...]) -> Callable[[str, Any], str]:
@@ -489,9 +489,10 @@ def _expressions(
             raise InputError("define.t: t is the time, as there is a section [time]")
         names["t"] = Expression("t", Node("clock", (clock,)))
     for name, value in define.items():
-        named(f"define.{name}", check_name, name)
+        with naming(f"define.{name}"):
+            checked = check_name(name)
         later = [other for other in define if other not in names]
-        names[check_name(name)] = _expression(f"define.{name}", value, names, later)
+        names[checked] = _expression(f"define.{name}", value, names, later)
     given = {
         key: sections[section][name]
         for key in USED_ON
@@ -597,7 +598,8 @@ def _expression(
     key: str, value: Any, names: Mapping[str, Expression], later: Collection[str]
 ) -> Expression:
     if isinstance(value, str):
-        return named(key, parse, value, names, later)
+        with naming(key):
+            return parse(value, names, later)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(
             f"{key}: an expression (a string) or a number is needed, found {shown(value)}"

@@ -32,7 +32,7 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
-from ..errors import InputError, on_root, raise_together
+from ..errors import InputError, naming, on_root, raise_together
 from . import gmshmesh
 from .exchange import Exchange
 from .materials import Materials
@@ -43,6 +43,8 @@ from .polygon import check_labels, check_loops, circle, coordinates, cut
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
 """Names that parts of a boundary have by themselves, and their values in facet tags."""
+USUAL = ("contact", "dirichlet")
+"""Parts that there must be where no part has a name of its own: they hold the solution."""
 REST = NEUMANN
 """The part of the exterior facets that nobody names: the weak form's natural condition."""
 
@@ -173,7 +175,7 @@ class Domain:
         parts = numbered(others)
         needed = {parts[name] for name, own in given.items() if own is not None} - {REST}
         if not others:
-            needed |= {CONTACT, DIRICHLET}
+            needed |= {PARTS[name] for name in USUAL}
         wanted: dict[int, Int32Array] = {}
         for name, own in given.items():
             usual: list[int] = [PARTS[name]] if own is None and parts[name] in needed else []
@@ -361,10 +363,8 @@ class Polygon:
         polygons = {name: coordinates(polygon) for name, polygon in self.materials.items()}
         object.__setattr__(self, "materials", polygons)
         for name, polygon in polygons.items():
-            try:
+            with naming(f"the material {name}"):
                 check_loops([polygon])
-            except InputError as error:
-                raise InputError(f"the material {name}: {error}") from None
         if any(hole.holes for hole in self.holes):
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
@@ -376,7 +376,7 @@ class Polygon:
         if self.names:
             return
         labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
-        for part in ("contact", "dirichlet"):
+        for part in USUAL:
             if part not in labels:
                 raise InputError(
                     f"no edge is labelled {part!r}: the boundary needs a contact part and a "
@@ -442,7 +442,9 @@ def read_gmsh(
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
     parts, numbers = numbered(names), numbered_materials(materials)
-    what = Path(path), parts, not names, numbers
+    own = [name for name in parts if name not in PARTS]
+    needed, holding = (own, ()) if names else (USUAL, USUAL)
+    what = Path(path), parts, needed, holding, numbers
     return _distribute(comm, parts, numbers, gmshmesh.read, *what)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray
-from ..errors import InputError
+from ..errors import InputError, naming
 
 FARTHEST = 1e100
 """Largest coordinate: areas, and products of them, stay finite."""
@@ -81,10 +81,8 @@ def cut(
     for edge, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
         piece = start[None]
         if edge in arcs:
-            try:
+            with naming(f"the arc of edge {edge}"):
                 piece = _arc(start, _one(arcs[edge]), end, size)
-            except InputError as error:
-                raise InputError(f"the arc of edge {edge}: {error}") from None
         pieces.append(piece)
     edges = [edge for edge, piece in enumerate(pieces) for _ in piece]
     return np.concatenate(pieces), tuple(boundary[edge] for edge in edges), tuple(edges)
