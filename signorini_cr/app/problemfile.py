@@ -23,14 +23,13 @@ from ..data.admissible import check_data
 from ..data.consistency import doubts
 from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
-from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
 from ..solution import Solution
-from .datacheck import USED_ON, bare, check_values, is_kappa
+from .datacheck import bare, check_values, is_kappa
 from .expressions import Expression, check_name, parse
 from .formula import Clock, Node
 from .readers import (
@@ -47,7 +46,18 @@ from .readers import (
     whole,
     word,
 )
-from .reference import ADAPTIVE, DOMAIN, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
+from .reference import (
+    ADAPTIVE,
+    DOMAIN,
+    EXPRESSIONS,
+    KINDS,
+    MATERIAL,
+    PART,
+    QUANTITIES,
+    SECTIONS,
+    TYPES,
+    allowed,
+)
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -493,18 +503,18 @@ def _expressions(
             checked = check_name(name)
         later = [other for other in define if other not in names]
         names[checked] = _expression(f"define.{name}", value, names, later)
-    given = {
-        key: sections[section][name]
-        for key in USED_ON
-        for section, name in [key.split(".")]
-        if name in sections[section]
+    tables = {
+        **{name: (name, sections[name]) for name in ("data", "exact")},
+        **{f"boundary.{name}": (PART, table) for name, table in parts.items()},
+        **{f"material.{name}": (MATERIAL, table) for name, table in materials.items()},
+        "time": ("time", sections["time"]),
     }
-    for part, table in parts.items():
-        given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
-    for material, table in materials.items():
-        given |= {f"material.{material}.{key}": v for key, v in table.items() if key not in PLAIN}
-    if "initial" in sections["time"]:
-        given["time.initial"] = sections["time"]["initial"]
+    given = {
+        f"{section}.{key}": value
+        for section, (like, table) in tables.items()
+        for key, value in table.items()
+        if f"{like}.{key}" in EXPRESSIONS
+    }
     result = {}
     for key, value in _by_entries(given).items():
         expression = _expression(key, value, names, ())
@@ -572,10 +582,6 @@ def _own_capacity(name: str, material: Mapping[str, Any]) -> float | None:
     return _capacity(f"material.{name}.capacity", material["capacity"])
 
 
-PLAIN = ("polygon", "capacity")
-"""Keys of materials that are no expressions."""
-
-
 def _data(expression: Expression) -> Any:
     """An expression as `Problem` takes it."""
     return expression.ufl if expression.constant is None else expression.constant
@@ -607,45 +613,31 @@ def _expression(
     return parse(repr(number(key, value)))
 
 
-KINDS = {"contact": Contact, "dirichlet": Dirichlet, "neumann": Neumann, "robin": Robin}
-
-
 def _problem(
     expressions: Mapping[str, Expression],
     parts: Mapping[str, Mapping[str, Any]],
     materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
-    def data(key: str, default: Any) -> Any:
-        if f"{key}[0][0]" in expressions:
-            return _tensor([expressions[f"{key}[{i}][{j}]"] for i, j in ENTRIES])
-        if key not in expressions:
-            return default
-        return _data(expressions[key])
+    def own(section: str) -> dict[str, Any]:
+        """The data of a section, by key."""
+        found: dict[str, Any] = {}
+        for key, expression in expressions.items():
+            home, _, name = bare(key).rpartition(".")
+            if home == section and key == bare(key):
+                found[name] = _data(expression)
+            elif home == section:
+                entries = (expressions[f"{home}.{name}[{i}][{j}]"] for i, j in ENTRIES)
+                found[name] = _tensor(list(entries))
+        return found
 
-    conditions = {
-        name: KINDS[part["type"]](
-            **{key: data(f"boundary.{name}.{key}", None) for key in part if key != "type"}
-        )
-        for name, part in parts.items()
-    }
     return Problem(
-        f=data("data.f", None),
-        g=data("data.g", None),
-        obstacle=data("data.obstacle", 0.0),
-        dirichlet=data("data.dirichlet", None),
-        coefficient=data("data.coefficient", 1.0),
-        reaction=data("data.reaction", 0.0),
-        conditions=conditions,
+        **own("data"),
+        exact=own("exact").get("u"),
+        conditions={
+            name: KINDS[part["type"]](**own(f"boundary.{name}")) for name, part in parts.items()
+        },
         materials={
-            name: Material(
-                **{
-                    key: data(f"material.{name}.{key}", None)
-                    for key in material
-                    if key not in PLAIN
-                },
-                capacity=_own_capacity(name, material),
-            )
+            name: Material(**own(f"material.{name}"), capacity=_own_capacity(name, material))
             for name, material in materials.items()
         },
-        exact=data("exact.u", None),
     )
