@@ -150,12 +150,13 @@ KEYS = (
     Key("refine", "levels", "a whole number above 0", "1; if adaptive, as many as it takes",
         "Number of meshes, the coarsest included.", "levels = 5"),
     Key("refine", "tolerance", "a number, 0 or above", USUAL["tolerance"],
-        "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it.", "tolerance = 0.05", not_negative),
+        "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it.",
+        "tolerance = 0.05", not_negative),
     Key("refine", "max_dofs", "a whole number above 0", USUAL["max_dofs"],
         "Adaptive: stop before a mesh with more degrees of freedom.", "max_dofs = 200000", whole),
     Key("refine", "fraction", "a number above 0, at most 1", USUAL["fraction"],
-        "Adaptive: the part of the squared bound that the cells to be refined hold. Less takes more meshes, "
-        "and fewer cells for the same bound.", "fraction = 0.3", part),
+        "Adaptive: the part of the squared bound that the cells to be refined hold. Less takes "
+        "more meshes, and fewer cells for the same bound.", "fraction = 0.3", part),
     Key("time", "end", "a number above 0", "", "The last time; the first is 0. Needed.",
         "end = 36000"),
     Key("time", "steps", "a whole number above 0", "", "Steps of equal length. Needed.",
