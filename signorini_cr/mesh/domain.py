@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import itertools
 import time
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import basix.ufl
 import numpy as np
@@ -49,6 +50,26 @@ REST = NEUMANN
 """The part of the exterior facets that nobody names: the weak form's natural condition."""
 
 
+class Refinement(NamedTuple):
+    """From a mesh to one that was made from it.
+
+    Attributes:
+        mesh: The coarse one, as long as anyone else needs it.
+        parent: Row of the coarse cell that holds each cell, shape (cells,).
+        exchange: What fetches these rows from other ranks, if cells have moved.
+    """
+
+    mesh: weakref.ref[Mesh]
+    parent: Int32Array | IndexArray
+    exchange: Exchange | None = None
+
+    def carry(self, values: npt.NDArray) -> npt.NDArray:
+        """Give the fine cells what their parents have, of the coarse cells in order; collective."""
+        rows = values if self.exchange is None else self.exchange.fetch(values)
+        found: npt.NDArray = rows[self.parent]
+        return found
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
     """A mesh whose exterior facets are sorted into Γ0, Γ1, Γg and other parts.
@@ -58,8 +79,7 @@ class Domain:
         tags: Facet tags; each exterior facet has the value of one part.
         parts: The parts' names, and their values in the tags.
         materials: What the cells consist of.
-        coarser: What it was refined from, the cell there that holds each cell, and what fetches
-            these cells from other ranks, as `balance.balance` returns them.
+        descent: From the coarsest mesh to this one, a step for each refinement.
         seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
@@ -68,7 +88,7 @@ class Domain:
     seconds: float = 0.0
     parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
     materials: Materials = field(default_factory=Materials)
-    coarser: tuple[Domain, Int32Array | IndexArray, Exchange | None] | None = None
+    descent: tuple[Refinement, ...] = ()
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
@@ -115,21 +135,18 @@ class Domain:
         V = function.function_space
         if V.mesh is self.mesh:
             return function
-        if self.coarser is None or not is_by_cells(function):
+        above = [i for i, step in enumerate(self.descent) if step.mesh() is V.mesh]
+        if not above or not is_by_cells(function):
             raise InputError(
                 "data given as a dolfinx Function live on one mesh only, unless they are of degree"
                 " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
             )
         if function not in self._own:
-            coarse, parents, exchange = self.coarser
-            above = coarse.own(function)
+            values = function.x.array[V.dofmap.list[:, 0]]
+            for step in self.descent[above[0] :]:
+                values = step.carry(values)
             fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
-            at = (space.dofmap.list[:, 0] for space in (fine.function_space, above.function_space))
-            here, there = at
-            values = above.x.array[there]
-            if exchange is not None:
-                values = exchange.fetch(values)
-            fine.x.array[here[: len(parents)]] = values[parents]
+            fine.x.array[fine.function_space.dofmap.list[: len(values), 0]] = values
             self._own[function] = fine
         return self._own[function]
 

@@ -5,6 +5,7 @@ Both keep the children of a cell on its rank and carry boundary parts and materi
 
 from __future__ import annotations
 
+import weakref
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from dolfinx.mesh import refine as split
 from .. import compat
 from ..arrays import Int32Array
 from ..errors import InputError
-from .domain import Domain
+from .domain import Domain, Refinement
 
 
 def refine(domain: Domain) -> tuple[Domain, Int32Array]:
@@ -153,9 +154,8 @@ def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
 def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
     """The fine domain: its cells consist of what their parents do."""
     materials = domain.materials.of_children(parent)
-    return Domain(
-        fine, tags, parts=domain.parts, materials=materials, coarser=(domain, parent, None)
-    )
+    descent = (*domain.descent, Refinement(weakref.ref(domain.mesh), parent))
+    return Domain(fine, tags, parts=domain.parts, materials=materials, descent=descent)
 
 
 def _count(index_map: Any) -> int:
