@@ -187,63 +187,125 @@ class Domain:
             InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
-        fdim = mesh.topology.dim - 1
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
         parts = numbered(others)
-        needed = {parts[name] for name, own in given.items() if own is not None} - {REST}
+        needed = {name for name, own in given.items() if own is not None} - {"neumann"}
         if not others:
-            needed |= {PARTS[name] for name in USUAL}
-        wanted: dict[int, Int32Array] = {}
-        for name, own in given.items():
-            usual: list[int] = [PARTS[name]] if own is None and parts[name] in needed else []
-            numbers = np.asarray(usual if own is None else own, dtype=np.int32)
-            wanted[parts[name]] = np.unique(np.atleast_1d(numbers))
-        called = {value: name for name, value in parts.items()}
-        for a, b in itertools.combinations(wanted, 2):
-            if len(both := np.intersect1d(wanted[a], wanted[b])):
-                raise InputError(
-                    f"the facet value {both[0]} stands for {called[a]} and for {called[b]}: "
-                    "a value can stand for one part only"
-                )
+            needed |= set(USUAL)
+        wanted = _wanted(given, parts, needed)
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
         exterior = _exterior(mesh)
-        values = np.full(_count(mesh, fdim), REST, dtype=np.int32)
-        inside = np.ones(len(values), dtype=bool)
-        inside[exterior] = False
-        complaint = None
-        owned = mesh.topology.index_map(fdim).size_local
-        for part, numbers in wanted.items():
-            chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]
-            chosen = chosen[chosen < owned]
-            values[chosen] = part
-            if np.any(inside[chosen]):
-                complaint = (
-                    f"{np.count_nonzero(inside[chosen])} facets tagged {called[part]} lie "
-                    "inside the domain: only exterior facets can be tagged"
-                )
-        raise_together(mesh.comm, complaint)
-        at = exterior[exterior < owned]
-        mine = set(facet_tags.values[np.isin(facet_tags.indices, at)].tolist())
-        there = set().union(*mesh.comm.allgather(mine))
-        known = {0}
-        for part, numbers in wanted.items():
-            known.update(int(value) for value in numbers)
-            missing = [int(value) for value in numbers if value not in there]
-            if part in needed and (missing or not len(numbers)):
-                raise InputError(
-                    f"no exterior facet is tagged {called[part]} (value {_list(missing)}): the"
-                    f" values there are {_list(sorted(there))}"
-                )
-        if (neumann is not None or others) and (left := sorted(there - known)):
-            words = [f"{called[part]} {_list(numbers)}" for part, numbers in wanted.items()]
+        values = _values(mesh, facet_tags, exterior, wanted, parts)
+        known = {int(value) for numbers in wanted.values() for value in numbers}
+        there = _insist_on(mesh, facet_tags, exterior, wanted, needed)
+        if (neumann is not None or others) and (left := sorted(there - known - {0})):
+            words = [f"{part} {_list(numbers)}" for part, numbers in wanted.items()]
             words[0] = words[0].replace(" ", " is ", 1)
             raise InputError(
                 f"exterior facets are tagged {_list(left)}, which stands for nothing:"
                 f" {', '.join(words[:-1])} and {words[-1]}"
             )
         made = Materials.from_tags(mesh, cell_tags, materials or {})
-        tags = meshtags(mesh, fdim, exterior, values[exterior])
+        tags = meshtags(mesh, mesh.topology.dim - 1, exterior, values[exterior])
         return cls(mesh, tags, parts=parts, materials=made)
+
+
+def _wanted(
+    given: Mapping[str, int | Sequence[int] | None], parts: Mapping[str, int], needed: set[str]
+) -> dict[str, Int32Array]:
+    """The values in a user's facet tags that stand for each part, ascending, by name.
+
+    Args:
+        given: What the user says of them.
+        parts: The values of our own.
+        needed: The parts that there must be.
+
+    Raises:
+        InputError: A value stands for two parts.
+    """
+    wanted = {}
+    for name, own in given.items():
+        usual = [parts[name]] if own is None and name in needed else []
+        numbers = np.asarray(usual if own is None else own, dtype=np.int32)
+        wanted[name] = np.unique(np.atleast_1d(numbers))
+    for a, b in itertools.combinations(wanted, 2):
+        if len(both := np.intersect1d(wanted[a], wanted[b])):
+            raise InputError(
+                f"the facet value {both[0]} stands for {a} and for {b}: "
+                "a value can stand for one part only"
+            )
+    return wanted
+
+
+def _values(
+    mesh: Mesh,
+    facet_tags: MeshTags,
+    exterior: Int32Array,
+    wanted: Mapping[str, Int32Array],
+    parts: Mapping[str, int],
+) -> Int32Array:
+    """The part that each local facet belongs to, shape (facets,); collective.
+
+    Args:
+        mesh: The user's.
+        facet_tags: The user's.
+        exterior: Local indices of the exterior facets.
+        wanted: From `_wanted`.
+        parts: The values of our own.
+
+    Raises:
+        InputError: A tag of one of the parts is on a facet inside.
+    """
+    fdim = mesh.topology.dim - 1
+    values = np.full(_count(mesh, fdim), REST, dtype=np.int32)
+    inside = np.ones(len(values), dtype=bool)
+    inside[exterior] = False
+    complaint = None
+    owned = mesh.topology.index_map(fdim).size_local
+    for name, numbers in wanted.items():
+        chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]
+        chosen = chosen[chosen < owned]
+        values[chosen] = parts[name]
+        if np.any(inside[chosen]):
+            complaint = (
+                f"{np.count_nonzero(inside[chosen])} facets tagged {name} lie "
+                "inside the domain: only exterior facets can be tagged"
+            )
+    raise_together(mesh.comm, complaint)
+    return values
+
+
+def _insist_on(
+    mesh: Mesh,
+    facet_tags: MeshTags,
+    exterior: Int32Array,
+    wanted: Mapping[str, Int32Array],
+    needed: set[str],
+) -> set[int]:
+    """Insist on the values of the parts that there must be; collective.
+
+    Args:
+        mesh: The user's.
+        facet_tags: The user's.
+        exterior: Local indices of the exterior facets.
+        wanted: From `_wanted`.
+        needed: The parts that there must be.
+
+    Returns:
+        The values of exterior facets, of all ranks.
+    """
+    owned = mesh.topology.index_map(mesh.topology.dim - 1).size_local
+    at = exterior[exterior < owned]
+    mine = set(facet_tags.values[np.isin(facet_tags.indices, at)].tolist())
+    there: set[int] = set().union(*mesh.comm.allgather(mine))
+    for name, numbers in wanted.items():
+        missing = [int(value) for value in numbers if value not in there]
+        if name in needed and (missing or not len(numbers)):
+            raise InputError(
+                f"no exterior facet is tagged {name} (value {_list(missing)}): the"
+                f" values there are {_list(sorted(there))}"
+            )
+    return there
 
 
 def is_by_cells(function: object) -> bool:

@@ -124,42 +124,9 @@ def triangulate(
         numbers: The materials' numbers.
     """
     loops, labels, inner = arranged(loops, labels, list(polygons.values()))
-    lengths = [np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1) for loop in loops]
-    lengths += [np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)]
-    counts = [np.maximum(1, np.ceil(length / size - 1e-9)) for length in lengths]
-    triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
-    if sum(map(np.sum, counts)) > _MOST_FACETS or triangles > _MOST_TRIANGLES:
-        raise InputError(
-            f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
-        )
-    facets = [length / count for length, count in zip(lengths, counts)]
-    ends = [np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in loops] + [inner]
-    shortest = min(each.min(initial=np.inf) for each in facets)
-    x, edges = _numbered(np.concatenate(ends))
-    near = _sizes(x, edges, np.concatenate(facets))
-    near_ends = near[edges]
-    graded = _graded(np.concatenate(lengths), np.concatenate(facets), near_ends)
-    if graded > _MOST_GRADED:
-        raise InputError(
-            f"an edge has facets of {shortest:.3g} beside much longer edges: those that grow from"
-            f" there along these would be about {graded:.1e}, and {_MOST_GRADED:g} are allowed;"
-            " longer edges are needed, or a mesh file"
-        )
+    outline = _outline(loops, inner, size)
     with _session() as gmsh:
-        geo = gmsh.model.geo
-        points = [geo.addPoint(*at, 0.0, h) for at, h in zip(x, near)]
-        curves = [geo.addLine(points[a], points[b]) for a, b in edges]
-        even = near_ends.min(axis=1) > _UNEVEN * np.concatenate(facets)
-        for i in np.flatnonzero(even):
-            geo.mesh.setTransfiniteCurve(curves[i], int(np.concatenate(counts)[i]) + 1)
-        *rings, within = np.split(np.array(curves), np.cumsum([len(loop) for loop in loops]))
-        surface = geo.addPlaneSurface([geo.addCurveLoop(ring.tolist()) for ring in rings])
-        geo.synchronize()
-        if len(within):
-            gmsh.model.mesh.embed(1, within.tolist(), 2, surface)
-        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
-        if shortest < _UNEVEN * size:
-            _widen_inwards(gmsh, curves, surface, size)
+        curves = _draw(gmsh, outline, [len(loop) for loop in loops], size)
         try:
             gmsh.model.mesh.generate(2)
         except Exception as error:
@@ -177,6 +144,87 @@ def triangulate(
         return raw
     middles = raw.points[raw.triangles].mean(axis=1)
     return raw._replace(materials=sorted_out(middles, polygons, numbers))
+
+
+class _Outline(NamedTuple):
+    """The lines that a mesh follows, one loop after the other and then those inside.
+
+    Attributes:
+        x: Their ends, each once, shape (points, 2).
+        near: Facet length wanted at each of these, shape (points,).
+        edges: The ends' numbers, shape (lines, 2).
+        counts: How many facets each line is cut into, where they are equal, shape (lines,).
+        facets: How long these are, shape (lines,).
+    """
+
+    x: FloatArray
+    near: FloatArray
+    edges: IndexArray
+    counts: FloatArray
+    facets: FloatArray
+
+
+def _outline(loops: Sequence[FloatArray], inner: FloatArray, size: float) -> _Outline:
+    """Find how finely lines are to be cut.
+
+    Args:
+        loops: Vertices of the polygon and of each hole, shapes (n, 2).
+        inner: Ends of the lines inside, shape (m, 2, 2).
+        size: Facet length wanted.
+
+    Raises:
+        InputError: There would be too many facets or triangles.
+    """
+    ends = np.concatenate(
+        [*(np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in loops), inner]
+    )
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    counts = np.maximum(1, np.ceil(lengths / size - 1e-9))
+    triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
+    if counts.sum() > _MOST_FACETS or triangles > _MOST_TRIANGLES:
+        raise InputError(
+            f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
+        )
+    facets = lengths / counts
+    x, edges = _numbered(ends)
+    near = _sizes(x, edges, facets)
+    graded = _graded(lengths, facets, near[edges])
+    if graded > _MOST_GRADED:
+        raise InputError(
+            f"an edge has facets of {facets.min():.3g} beside much longer edges: those that grow"
+            f" from there along these would be about {graded:.1e}, and {_MOST_GRADED:g} are"
+            " allowed; longer edges are needed, or a mesh file"
+        )
+    return _Outline(x, near, edges, counts, facets)
+
+
+def _draw(gmsh: Any, outline: _Outline, loops: Sequence[int], size: float) -> list[int]:
+    """Tell gmsh the outline, and how fine the mesh is to be.
+
+    Args:
+        gmsh: From `_session`.
+        outline: The lines.
+        loops: How many of them each loop has.
+        size: Facet length wanted.
+
+    Returns:
+        The tags of the lines.
+    """
+    geo, edges = gmsh.model.geo, outline.edges
+    points = [geo.addPoint(*at, 0.0, h) for at, h in zip(outline.x, outline.near, strict=True)]
+    curves = [geo.addLine(points[a], points[b]) for a, b in edges]
+    even = outline.near[edges].min(axis=1) > _UNEVEN * outline.facets
+    for i in np.flatnonzero(even):
+        geo.mesh.setTransfiniteCurve(curves[i], int(outline.counts[i]) + 1)
+    *rings, within = np.split(np.array(curves), np.cumsum(loops))
+    surface = geo.addPlaneSurface([geo.addCurveLoop(ring.tolist()) for ring in rings])
+    geo.synchronize()
+    if len(within):
+        gmsh.model.mesh.embed(1, within.tolist(), 2, surface)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    if outline.facets.min() < _UNEVEN * size:
+        _widen_inwards(gmsh, curves, surface, size)
+    return curves
 
 
 def _numbered(ends: FloatArray) -> tuple[FloatArray, IndexArray]:
