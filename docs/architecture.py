@@ -4,14 +4,14 @@
 
 All of it is read from the sources: a sub-package is a street, the modules beside them are the
 drivers, if they import from a street, and the ground floor if they do not; a street stands above
-all that it imports from. An arrow's number is that of the import statements.
+all that it imports from. An arrow's number is that of the modules imported, by each file
+that does.
 """
 
 from __future__ import annotations
 
 import ast
 from collections import Counter
-from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -25,17 +25,44 @@ COLOURS = ("#004488", "#BB5566", "#997700", "#117733", "#882255", "#555555")
 Arrows = Counter[tuple[str, str]]
 
 
-def imports(path: Path) -> Iterator[Path]:
-    """The places in the package that a module imports from: streets, or modules beside them."""
+Module = tuple[str, ...]
+"""A module's name below the package, part by part; () for the package itself."""
+
+
+def public(package: Path) -> dict[str, Module]:
+    """The names that the front door of a package loads on first use, and whose they are."""
+    tables: dict[str, str] = {}
+    for node in ast.parse((package / "__init__.py").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in ("_ROOMS", "_MODULES"):
+            tables |= ast.literal_eval(node.value)
+    return {name: tuple(module.split(".")) for name, module in tables.items()}
+
+
+def imports(path: Path, package: Path = PACKAGE) -> list[Module]:
+    """List the modules and streets of a package that a file of it imports, wherever in it.
+
+    A public name counts as the module that defines it, not as the front door.
+
+    Raises:
+        ValueError: An import within the package is not relative, so nobody would see it.
+    """
+    doors, found = public(package), []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.level:
-            base = path.parents[node.level - 1]
-            if node.module:
-                yield base.joinpath(*node.module.split("."))
-            else:
-                places = (base / alias.name for alias in node.names)
-                # what is neither a module nor a street is a public name, loaded by the front door
-                yield from (p for p in places if p.is_dir() or p.with_suffix(".py").exists())
+            base = path.parents[node.level - 1].relative_to(package).parts
+            base += tuple(node.module.split(".")) if node.module else ()
+            for alias in node.names:
+                place = package.joinpath(*base, alias.name)
+                if place.is_dir() or place.with_suffix(".py").exists():
+                    found.append((*base, alias.name))
+                else:
+                    found.append(base or doors.get(alias.name, ()))
+        elif isinstance(node, ast.ImportFrom | ast.Import):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names]
+            if any(name.split(".")[0] == package.name for name in names):
+                raise ValueError(f"{path.name}: imports within the package are relative")
+    return found
 
 
 def read(package: Path = PACKAGE) -> Arrows:
@@ -45,8 +72,8 @@ def read(package: Path = PACKAGE) -> Arrows:
         if path.parent == package and path.stem.startswith("__"):
             continue  # the public names, loaded when they are first used
         names = found.setdefault(path.relative_to(package).parts[0].removesuffix(".py"), [])
-        places = [place.relative_to(package).parts[0] for place in imports(path)]
-        names += [place for place in places if not place.startswith("__")]
+        # what is left is the front door's own, as the version
+        names += [module[0] for module in dict.fromkeys(imports(path, package)) if module]
     streets = {name for name in found if (package / name).is_dir()}
     beside = {
         name: DRIVERS if streets & set(found[name]) else GROUND for name in set(found) - streets

@@ -15,6 +15,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from .shown import HTML
+
 if TYPE_CHECKING:
     from .adaptive import solve_adaptive
     from .errors import InputError, NotConverged
@@ -98,6 +100,14 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return import_module(f".{_MODULES[name]}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _as_html(solution: Solution) -> str:
+    html: str = import_module(".output.notebook", __name__).as_html(solution)
+    return html
+
+
+HTML["Solution"] = _as_html
 
 
 def __dir__() -> list[str]:

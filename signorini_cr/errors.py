@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from mpi4py import MPI
@@ -28,6 +29,20 @@ class NotConverged(RuntimeError):
         super().__init__(where + reason)
         self.reason = reason
         self.level = level
+
+
+@contextmanager
+def naming(thing: object, rule: str = "") -> Iterator[None]:
+    """Let the message of an InputError begin with what it is about.
+
+    Args:
+        thing: A file, a key or an option.
+        rule: What the message ends with.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{thing}: {error}" + (rule and f"; {rule}")) from None
 
 
 def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:

@@ -205,37 +205,11 @@ def solve_in_time(
         raise InputError(f"steps is {steps}; it must be 1 or more")
     if scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
-    capacities = {name: each.capacity for name, each in problem.materials.items()}
-    own = {name: each for name, each in capacities.items() if each is not None}
-    for name, each in {"": capacity, **own}.items():
-        if not (each > 0.0 and np.isfinite(each)):
-            of = f" of {name}" if name else ""
-            raise InputError(f"capacity{of} is {each}; it must be above 0")
+    own = _capacities(problem, capacity)
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")
-    x = ufl.SpatialCoordinate(domain.mesh)
-    reactions = {"": problem.reaction}
-    reactions |= {n: m.reaction for n, m in problem.materials.items() if m.reaction is not None}
-    found = {n: number(as_expression(c, x)) for n, c in reactions.items()}
-    c = {name: each for name, each in found.items() if each is not None}
-    if len(c) < len(found):
-        raise InputError("problems in time need a reaction that is a number in each material")
-
-    def stepping(factor: float) -> Problem:
-        """The problem of a step: rate + c in the place of c."""
-        materials = {
-            name: replace(each, reaction=c.get(name, c[""]) + factor * own.get(name, capacity))
-            for name, each in problem.materials.items()
-            if name in own or name in c
-        }
-        return replace(
-            problem,
-            reaction=c[""] + factor * capacity,
-            materials={**problem.materials, **materials},
-        )
-
-    rates: FloatArray = np.empty(0)
-    factor = 0.0
+    reactions = _reactions(problem, domain)
+    factor, rates = 0.0, np.array(0.0)
     solver: Solver | None = None
     last: Solution | None = None
     before = then = np.empty(0)
@@ -245,7 +219,8 @@ def solve_in_time(
             needed = (1.5 if second else 1.0) * steps / end
             if solver is None or needed != factor:
                 factor, former = needed, solver
-                solver = Solver(stepping(factor), domain, levels, former)
+                added = {name: factor * each for name, each in {"": capacity, **own}.items()}
+                solver = Solver(_stepping(problem, reactions, added), domain, levels, former)
                 rates = factor * solver.by_material(capacity, own)
                 if former is None:
                     then = solver.projected(initial).x.array
@@ -262,3 +237,49 @@ def solve_in_time(
     finally:
         if solver is not None:
             solver.close()
+
+
+def _capacities(problem: Problem, usual: float) -> dict[str, float]:
+    """The capacities of materials that have their own, by name; all of them are above 0."""
+    given = {name: each.capacity for name, each in problem.materials.items()}
+    own = {name: each for name, each in given.items() if each is not None}
+    for name, each in {"": usual, **own}.items():
+        if not (each > 0.0 and np.isfinite(each)):
+            of = f" of {name}" if name else ""
+            raise InputError(f"capacity{of} is {each}; it must be above 0")
+    return own
+
+
+def _reactions(problem: Problem, domain: Domain) -> dict[str, float]:
+    """The reactions, numbers, of materials that have their own, by name; "" is for all others."""
+    given = {name: each.reaction for name, each in problem.materials.items()}
+    x, found = ufl.SpatialCoordinate(domain.mesh), {}
+    for name, each in {"": problem.reaction, **given}.items():
+        if each is None:
+            continue
+        value = number(as_expression(each, x))
+        if value is None:
+            raise InputError("problems in time need a reaction that is a number in each material")
+        found[name] = value
+    return found
+
+
+def _stepping(
+    problem: Problem, reactions: Mapping[str, float], rates: Mapping[str, float]
+) -> Problem:
+    """The problem of a step: c + rate in the place of c.
+
+    Args:
+        problem: The data.
+        reactions: Of materials by name, "" for those that have none of their own.
+        rates: The same of what the step adds.
+    """
+    own = {
+        name: replace(
+            each, reaction=reactions.get(name, reactions[""]) + rates.get(name, rates[""])
+        )
+        for name, each in problem.materials.items()
+        if name in rates or name in reactions
+    }
+    materials = {**problem.materials, **own}
+    return replace(problem, reaction=reactions[""] + rates[""], materials=materials)

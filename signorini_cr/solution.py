@@ -16,6 +16,7 @@ from .estimate.certificate import Certificate
 from .fem import fields
 from .fem.problem import Problem
 from .mesh.domain import Domain
+from .shown import HTML
 from .vi.contact import Contact
 from .vi.level import Level
 from .vi.solver import Iterations
@@ -56,9 +57,7 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """A table and a picture, for notebooks; of the certificate what has been made."""
-        from . import notebook  # by the front door, as what draws stands above the solution
-
-        return str(notebook.as_html(self))
+        return HTML["Solution"](self)
 
     @property
     def domain(self) -> Domain:

@@ -17,7 +17,7 @@ import numpy as np
 from helpers import MESHES
 
 from signorini_cr.errors import InputError
-from signorini_cr.mesh.domain import PARTS
+from signorini_cr.mesh.domain import PARTS, USUAL
 from signorini_cr.mesh.gmshmesh import Triangulation, read
 
 NUMBERS = (
@@ -213,7 +213,7 @@ def outcome(path: Path, data: bytes) -> tuple[str, str]:
     path.write_bytes(data)
     began = time.perf_counter()
     try:
-        raw = read(path, PARTS)
+        raw = read(path, PARTS, USUAL, USUAL)
     except InputError as error:
         words = str(error)
         good = words.startswith(f"{path}: ") and "\n" not in words and len(words) < 600

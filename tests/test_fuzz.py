@@ -19,10 +19,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import basix.ufl
 import numpy as np
 import pytest
 import ufl
-from dolfinx.mesh import CellType, create_unit_square
 from helpers import MESHES
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
@@ -168,8 +168,7 @@ def by_python(text: str, x: float, y: float) -> float:
 
 
 POINTS = np.array([[0.3, 0.7], [-1.25, 0.5], [2.0, -3.0], [0.0, 1.0]])
-DOMAIN = create_unit_square(MPI.COMM_SELF, 1, 1, CellType.triangle)
-X = ufl.SpatialCoordinate(DOMAIN)
+X = ufl.SpatialCoordinate(ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))))
 
 
 def check_expression(text: str) -> None:

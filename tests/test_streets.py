@@ -1,15 +1,18 @@
 """The order of the package: imports lead from the upper streets to the lower ones, never back."""
 
 import ast
+import runpy
+import shutil
 from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
 import signorini_cr
 
 PACKAGE = Path(signorini_cr.__file__).parent
 FLOORS = (
-    ("arrays", "errors", "jit", "compat", "options", "garbage", "memory", "__init__"),
+    ("arrays", "errors", "jit", "compat", "options", "garbage", "memory", "shown", "__init__"),
     ("mesh",),
     ("fem",),
     ("data",),
@@ -28,58 +31,82 @@ LAZY = {("__init__", name) for names in FLOORS for name in names}
 """The public names are loaded when they are first used."""
 
 
-def module_name(path: Path) -> tuple[str, ...]:
-    return path.relative_to(PACKAGE).with_suffix("").parts
+IMPORTS = runpy.run_path(str(ROOT / "docs" / "architecture.py"))["imports"]
 
 
-def imported(path: Path) -> list[tuple[str, ...]]:
-    """The modules of the package that a file imports, wherever in it, for types as well."""
-    here = module_name(path)
-    found = []
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            base = [*here[: len(here) - node.level], *(node.module or "").split(".")]
-            base = [part for part in base if part]
-            for alias in node.names:
-                whole = (*base, alias.name)
-                is_module = PACKAGE.joinpath(*whole).with_suffix(".py").exists()
-                found.append(whole if is_module else tuple(base) or ("__init__",))
-        elif isinstance(node, ast.ImportFrom | ast.Import):
-            names = (
-                [node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
-            )
-            assert not any(name.split(".")[0] == "signorini_cr" for name in names if name), (
-                f"{path.name}: imports within the package are relative"
-            )
-    return found
+def graph(package: Path = PACKAGE) -> dict[tuple[str, ...], list[tuple[str, ...]]]:
+    """The modules that each file imports, wherever in it, for types as well."""
+    return {
+        path.relative_to(package).with_suffix("").parts: [
+            module or ("__init__",) for module in IMPORTS(path, package)
+        ]
+        for path in sorted(package.rglob("*.py"))
+    }
 
 
-FILES = sorted(path for path in PACKAGE.rglob("*.py"))
-GRAPH = {module_name(path): imported(path) for path in FILES}
+def upward(package: Path = PACKAGE) -> list[str]:
+    """The imports that lead to a higher floor."""
+    return [
+        f"{'.'.join(here)} imports {'.'.join(there)}"
+        for here, others in graph(package).items()
+        for there in others
+        if FLOOR[there[0]] > FLOOR[here[0]] and (here[0], there[0]) not in LAZY
+    ]
 
 
 @pytest.mark.serial
 def test_every_module_stands_on_a_floor() -> None:
-    assert {name[0] for name in GRAPH} == set(FLOOR)
-    for street in (name[0] for name in GRAPH if len(name) == 2):
+    found = graph()
+    assert {name[0] for name in found} == set(FLOOR)
+    for street in (name[0] for name in found if len(name) == 2):
         charter = ast.get_docstring(ast.parse((PACKAGE / street / "__init__.py").read_text()))
         assert charter and len(charter.split()) >= 8, f"{street} has no charter"
 
 
 @pytest.mark.serial
 def test_imports_lead_downwards() -> None:
-    upward = [
-        f"{'.'.join(here)} imports {'.'.join(there)}"
-        for here, others in GRAPH.items()
-        for there in others
-        if FLOOR[there[0]] > FLOOR[here[0]] and (here[0], there[0]) not in LAZY
-    ]
-    assert upward == []
+    assert upward() == []
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    "line, found",
+    [
+        ("from .. import plots, exact, solve", ["output.plots", "verification.exact", "levels"]),
+        ("from ..output.plots import can_draw", ["output.plots"]),
+        ("from .. import output, compat, InputError, __version__", ["output"]),
+        ("def late():\n    from .. import notebook", ["output.notebook"]),
+        ("from ..fem import space\nfrom .. import Problem", []),
+    ],
+)
+def test_an_import_that_leads_upwards_is_seen(tmp_path: Path, line: str, found: list[str]) -> None:
+    """Also one of a name that the front door hands on."""
+    package = tmp_path / PACKAGE.name
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    with (package / "estimate" / "flux.py").open("a") as file:
+        file.write(f"\n{line}\n")
+    assert upward(package) == [f"estimate.flux imports {name}" for name in found]
+
+
+@pytest.mark.serial
+def test_an_import_by_the_name_of_the_package_is_refused(tmp_path: Path) -> None:
+    package = tmp_path / PACKAGE.name
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "arrays.py").write_text("import signorini_cr.output\n")
+    with pytest.raises(ValueError, match="relative"):
+        graph(package)
+
+
+@pytest.mark.serial
+def test_only_the_front_door_imports_by_strings() -> None:
+    files = {path for path in PACKAGE.rglob("*.py") if "import_module" in path.read_text()}
+    assert files == {PACKAGE / "__init__.py"}
 
 
 @pytest.mark.serial
 def test_no_imports_in_a_circle() -> None:
-    below = {here: set(others) for here, others in GRAPH.items() if here != ("__init__",)}
+    below = {here: set(others) for here, others in graph().items() if here != ("__init__",)}
     while below:
         free = [here for here, others in below.items() if not others & set(below) - {here}]
         assert free, f"a circle among {sorted('.'.join(here) for here in below)}"

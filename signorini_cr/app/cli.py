@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 DONE, FAULT, BAD_INPUT, NOT_CONVERGED = 0, 1, 2, 3
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+FRAMES = 10_000
+"""Calls within one another: UFL differentiates by recursion, 40 calls at most for each of the 250
+operations that `expressions.LONGEST_CHAIN` allows one upon the other."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,8 +66,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         screen.complain(str(error))
         wait_for_all()
         return BAD_INPUT
-    with _interruptible() as asked:
+    with _interruptible() as asked, room_for_recursion():
         return _run(args, screen, asked)
+
+
+@contextmanager
+def room_for_recursion() -> Iterator[None]:
+    """Let expressions be as deep as they may be; the process is the command's, while it runs."""
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(before, FRAMES))
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(before)
 
 
 @contextmanager
@@ -174,13 +188,13 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
 
 
 def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
-    from ..errors import NotConverged
+    from ..errors import NotConverged, naming
     from ..memory import most_memory, ran_out_of_memory
     from ..output import report as output
     from ..output.files import check_writable
 
     folder = _folder(args)
-    with _named("--out"):
+    with naming("--out"):
         check_writable(folder, output.FILES, comm)
     screen.progress("reading")
     records: list[output.Record] = []
@@ -209,7 +223,7 @@ def _solve_levels(
     records: list[dict[str, Any]],
 ) -> None:
     """Solve, and append to `records` what is solved and safe in the folder."""
-    from ..errors import NotConverged
+    from ..errors import NotConverged, naming
     from ..output import report as output
     from ..output.tables import certified, legend, times
     from ..restart import Restart
@@ -239,7 +253,7 @@ def _solve_levels(
             report = output.make_report(
                 case.title, element, comm, [*records, record], False, case.units
             )
-            with _named("--out"):
+            with naming("--out"):
                 restart = Restart.of(solution, restart, case.mode == "adaptive")
                 output.write_levels(folder, report, solution, restart, said)
             records.append(record)
@@ -255,7 +269,7 @@ def _solve_levels(
         screen.progress("writing")
         complete = failure is None
         report = output.make_report(case.title, element, comm, records, complete, case.units)
-        with _named("--out"):
+        with naming("--out"):
             names = output.write_output(folder, report, finest, resumable=True)
             if args.html:
                 names += _write_page(args, comm, folder, problem, report)
@@ -279,7 +293,7 @@ def _solve_steps(
     domain: Domain,
 ) -> None:
     """Solve a problem in time; each step is safe in the folder before the next begins."""
-    from ..errors import InputError, NotConverged
+    from ..errors import InputError, NotConverged, naming
     from ..output import report as output
     from ..output import series, strip
     from ..output.tables import certified
@@ -305,7 +319,7 @@ def _solve_steps(
             records.append(record)
             if record["step"] in chosen:
                 moments.append(strip.moment(time, solution))
-            with _named("--out"):
+            with naming("--out"):
                 series.write_step(folder, records, solution)
             if len(records) == 1:
                 screen.line(series.header())
@@ -318,7 +332,7 @@ def _solve_steps(
         complete = failure is None
         report = output.make_report(case.title, "CR", comm, [last], complete, case.units)
         report["times"] = records
-        with _named("--out"):
+        with naming("--out"):
             names = output.write_output(folder, report, solution, moments=moments)
         screen.line("")
         if units := series.legend(case.units):
@@ -333,12 +347,13 @@ def _solve_steps(
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
+    from ..errors import naming
     from ..output import plots
     from ..output.files import check_writable, write_files
     from .statement import statement
 
     folder, picture = _folder(args), "mesh.png"
-    with _named("--out"):
+    with naming("--out"):
         check_writable(folder, [picture], comm)
     case, domain = _read(args, screen, comm)
     screen.line(f"{args.file}: in order")
@@ -350,7 +365,7 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     def draw(path: Path) -> None:
         plots.plot_mesh(domain, path, case.title, units=case.units)
 
-    with _named("--out"):
+    with naming("--out"):
         write_files(folder, {picture: draw}, comm=comm)
     screen.text(f"drawn in {folder / picture}")
     return DONE
@@ -396,10 +411,10 @@ def _resumed(
     """Where a run goes on; fills in the records of the levels before; collective."""
     import json
 
-    from ..errors import InputError
+    from ..errors import InputError, naming
     from ..output.checkpoint import read_checkpoint
 
-    with _named("--resume"):
+    with naming("--resume"):
         found = read_checkpoint(folder, comm)
         if found is None:
             return None
@@ -520,17 +535,6 @@ def _kept(records: list[dict[str, Any]], folder: Path) -> str:
     if len(records) == 1:
         return f"level 0 is finished and kept in {folder}"
     return f"levels 0 to {len(records) - 1} are finished and kept in {folder}"
-
-
-@contextmanager
-def _named(key: str) -> Iterator[None]:
-    """Put the key before what an InputError says."""
-    from ..errors import InputError
-
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{key}: {error}") from None
 
 
 def _folder(args: argparse.Namespace) -> Path:

@@ -11,27 +11,18 @@ from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import InputError
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from ..mesh.domain import Domain
 from .expressions import Expression
-
-USED_ON: dict[str, int | None] = {
-    "data.coefficient": None,
-    "data.f": None,
-    "data.reaction": None,
-    "data.dirichlet": DIRICHLET,
-    "data.g": NEUMANN,
-    "data.obstacle": CONTACT,
-    "exact.u": None,
-}
-"""Where each expression is used: a part of the boundary, or None for the whole domain; those of
-[boundary.NAME] and [material.NAME] are used there."""
+from .reference import EXPRESSIONS
 
 
 def _used_on(key: str, domain: Domain) -> int | None:
+    """The part of the boundary that an expression is used on, or None for the domain."""
     section, name, *_ = key.split(".", 2)
-    if section in ("material", "time"):
-        return None
-    return domain.parts[name] if section == "boundary" else USED_ON[bare(key)]
+    if section == "boundary":
+        return domain.parts[name]
+    told = EXPRESSIONS.get(bare(key))  # none for [material.NAME]
+    return domain.parts[told.used_on] if told is not None and told.used_on else None
 
 
 def _used_in(key: str, expressions: Collection[str], domain: Domain) -> BoolArray:

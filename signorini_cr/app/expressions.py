@@ -7,7 +7,6 @@ Python. What comes out is a graph of operations, see :mod:`signorini_cr.app.form
 import ast
 import difflib
 import math
-import sys
 import unicodedata
 import warnings
 from collections.abc import Callable, Collection, Mapping
@@ -32,8 +31,6 @@ LONGEST = 10_000  # characters
 DEEPEST = 150  # levels of nesting
 LARGEST = 10_000  # operations, definitions included
 LONGEST_CHAIN = 250  # operations, each of which needs the one before; at 500 UFL 2026.1 gives up
-PLAIN = 40  # levels that are no matter to UFL, which walks down them by recursion
-FRAMES = 40  # of Python that a level takes at most
 
 RESERVED = frozenset((*VARIABLES, *CONSTANTS, *FUNCTIONS))
 
@@ -102,8 +99,6 @@ def parse(
             f"the expression has {chain[id(root)]} operations one upon the other; at most "
             f"{LONGEST_CHAIN} are allowed"
         )
-    if chain[id(root)] > PLAIN:
-        sys.setrecursionlimit(max(sys.getrecursionlimit(), FRAMES * LONGEST_CHAIN))
     return Expression(text, root)
 
 

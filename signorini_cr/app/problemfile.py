@@ -10,7 +10,6 @@ import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +21,21 @@ from ..adaptive import solve_adaptive
 from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
-from ..errors import InputError, on_root
+from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
-from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
 from ..fem.problem import Forms, Material, Problem
 from ..levels import solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
 from ..solution import Solution
-from .datacheck import USED_ON, bare, check_values, is_kappa
+from .datacheck import bare, check_values, is_kappa
 from .expressions import Expression, check_name, parse
 from .formula import Clock, Node
 from .readers import (
     array,
     get,
     insist_known,
-    named,
     number,
     one_of,
     parse_toml,
@@ -49,7 +46,18 @@ from .readers import (
     whole,
     word,
 )
-from .reference import ADAPTIVE, DOMAIN, MATERIAL, PART, QUANTITIES, SECTIONS, TYPES, allowed
+from .reference import (
+    ADAPTIVE,
+    DOMAIN,
+    EXPRESSIONS,
+    KINDS,
+    MATERIAL,
+    PART,
+    QUANTITIES,
+    SECTIONS,
+    TYPES,
+    allowed,
+)
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
@@ -125,13 +133,11 @@ class ProblemFile:
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Make or read the coarsest mesh; collective."""
         key = "domain.mesh" if isinstance(self.domain, Path) else "domain"
-        try:
+        with naming(key):
             if isinstance(self.domain, Path):
                 return read_gmsh(self.domain, comm, self.parts, self.materials)
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
-        except InputError as error:
-            raise InputError(f"{key}: {error}") from None
 
     def check(self, domain: Domain) -> list[str]:
         """Try the data out on the coarsest mesh; collective.
@@ -361,7 +367,8 @@ def _domain(
     for name, material in materials.items():
         key, needed = f"material.{name}", "a list of points [x, y]"
         points = _points(f"{key}.polygon", get(material, key, "polygon", array, needed=needed))
-        named(f"{key}.polygon", check_loops, [coordinates(points)], rule=SIMPLE)
+        with naming(f"{key}.polygon", SIMPLE):
+            check_loops([coordinates(points)])
         polygons[name] = points
     for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
         key = f"domain.holes[{i}]"
@@ -378,11 +385,11 @@ def _domain(
         else:
             holes.append(_polygon(hole, key, names, size))
     if holes or polygons:
-        apart = "holes must lie inside the polygon and apart from each other"
-        whole_polygon = partial(replace, polygon, holes=tuple(holes))
-        polygon = named("domain.holes", whole_polygon, rule=apart)
+        with naming("domain.holes", "holes must lie inside the polygon and apart from each other"):
+            polygon = replace(polygon, holes=tuple(holes))
         polygon = replace(polygon, materials=polygons)
-    named("domain.boundary", polygon.check_parts)
+    with naming("domain.boundary"):
+        polygon.check_parts()
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
     for name in names:
         if name not in labels:
@@ -413,8 +420,10 @@ def _polygon(
             f" found {len(boundary)} labels"
         )
     arcs = _arcs(f"{section}.arcs", array(f"{section}.arcs", table.get("arcs", [])))
-    points, labels, edges = named(f"{section}.arcs", cut, points, boundary, arcs, size)
-    return named(key, partial(Polygon, edges=edges), points, labels, (), names, rule=SIMPLE)
+    with naming(f"{section}.arcs"):
+        points, labels, edges = cut(points, boundary, arcs, size)
+    with naming(key, SIMPLE):
+        return Polygon(points, labels, names=names, edges=edges)
 
 
 def _arcs(key: str, arcs: list[Any]) -> dict[int, list[float]]:
@@ -442,7 +451,8 @@ def _circle(table: Mapping[str, Any], section: str, names: tuple[str, ...], size
     center = get(table, section, "center", _pair, needed="a point [x, y]")
     radius = get(table, section, "radius", positive, needed="a number above 0")
     part = get(table, section, "boundary", _label(names), needed="one label")
-    return named(section, partial(Polygon.circle, names=names), center, radius, part, size)
+    with naming(section):
+        return Polygon.circle(center, radius, part, size, names=names)
 
 
 def _label(names: tuple[str, ...]) -> Callable[[str, Any], str]:
@@ -489,21 +499,22 @@ def _expressions(
             raise InputError("define.t: t is the time, as there is a section [time]")
         names["t"] = Expression("t", Node("clock", (clock,)))
     for name, value in define.items():
-        named(f"define.{name}", check_name, name)
+        with naming(f"define.{name}"):
+            checked = check_name(name)
         later = [other for other in define if other not in names]
-        names[check_name(name)] = _expression(f"define.{name}", value, names, later)
-    given = {
-        key: sections[section][name]
-        for key in USED_ON
-        for section, name in [key.split(".")]
-        if name in sections[section]
+        names[checked] = _expression(f"define.{name}", value, names, later)
+    tables = {
+        **{name: (name, sections[name]) for name in ("data", "exact")},
+        **{f"boundary.{name}": (PART, table) for name, table in parts.items()},
+        **{f"material.{name}": (MATERIAL, table) for name, table in materials.items()},
+        "time": ("time", sections["time"]),
     }
-    for part, table in parts.items():
-        given |= {f"boundary.{part}.{key}": v for key, v in table.items() if key != "type"}
-    for material, table in materials.items():
-        given |= {f"material.{material}.{key}": v for key, v in table.items() if key not in PLAIN}
-    if "initial" in sections["time"]:
-        given["time.initial"] = sections["time"]["initial"]
+    given = {
+        f"{section}.{key}": value
+        for section, (like, table) in tables.items()
+        for key, value in table.items()
+        if f"{like}.{key}" in EXPRESSIONS
+    }
     result = {}
     for key, value in _by_entries(given).items():
         expression = _expression(key, value, names, ())
@@ -571,10 +582,6 @@ def _own_capacity(name: str, material: Mapping[str, Any]) -> float | None:
     return _capacity(f"material.{name}.capacity", material["capacity"])
 
 
-PLAIN = ("polygon", "capacity")
-"""Keys of materials that are no expressions."""
-
-
 def _data(expression: Expression) -> Any:
     """An expression as `Problem` takes it."""
     return expression.ufl if expression.constant is None else expression.constant
@@ -597,7 +604,8 @@ def _expression(
     key: str, value: Any, names: Mapping[str, Expression], later: Collection[str]
 ) -> Expression:
     if isinstance(value, str):
-        return named(key, parse, value, names, later)
+        with naming(key):
+            return parse(value, names, later)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(
             f"{key}: an expression (a string) or a number is needed, found {shown(value)}"
@@ -605,45 +613,31 @@ def _expression(
     return parse(repr(number(key, value)))
 
 
-KINDS = {"contact": Contact, "dirichlet": Dirichlet, "neumann": Neumann, "robin": Robin}
-
-
 def _problem(
     expressions: Mapping[str, Expression],
     parts: Mapping[str, Mapping[str, Any]],
     materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
-    def data(key: str, default: Any) -> Any:
-        if f"{key}[0][0]" in expressions:
-            return _tensor([expressions[f"{key}[{i}][{j}]"] for i, j in ENTRIES])
-        if key not in expressions:
-            return default
-        return _data(expressions[key])
+    def own(section: str) -> dict[str, Any]:
+        """The data of a section, by key."""
+        found: dict[str, Any] = {}
+        for key, expression in expressions.items():
+            home, _, name = bare(key).rpartition(".")
+            if home == section and key == bare(key):
+                found[name] = _data(expression)
+            elif home == section:
+                entries = (expressions[f"{home}.{name}[{i}][{j}]"] for i, j in ENTRIES)
+                found[name] = _tensor(list(entries))
+        return found
 
-    conditions = {
-        name: KINDS[part["type"]](
-            **{key: data(f"boundary.{name}.{key}", None) for key in part if key != "type"}
-        )
-        for name, part in parts.items()
-    }
     return Problem(
-        f=data("data.f", None),
-        g=data("data.g", None),
-        obstacle=data("data.obstacle", 0.0),
-        dirichlet=data("data.dirichlet", None),
-        coefficient=data("data.coefficient", 1.0),
-        reaction=data("data.reaction", 0.0),
-        conditions=conditions,
+        **own("data"),
+        exact=own("exact").get("u"),
+        conditions={
+            name: KINDS[part["type"]](**own(f"boundary.{name}")) for name, part in parts.items()
+        },
         materials={
-            name: Material(
-                **{
-                    key: data(f"material.{name}.{key}", None)
-                    for key in material
-                    if key not in PLAIN
-                },
-                capacity=_own_capacity(name, material),
-            )
+            name: Material(**own(f"material.{name}"), capacity=_own_capacity(name, material))
             for name, material in materials.items()
         },
-        exact=data("exact.u", None),
     )

@@ -205,11 +205,3 @@ def shown(value: Any) -> str:
     if isinstance(value, int):
         return f"{value}" if abs(value) < 10**15 else "a huge number"
     return f"{value}"
-
-
-def named(key: str, function: Callable[..., Any], *args: Any, rule: str = "") -> Any:
-    """Call ``function(*args)``; what it complains about gets the key before and the rule after."""
-    try:
-        return function(*args)
-    except InputError as error:
-        raise InputError(f"{key}: {error}" + (rule and f"; {rule}")) from None

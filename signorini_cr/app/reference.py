@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from ..adaptive import solve_adaptive
+from ..fem.conditions import Condition, Contact, Dirichlet, Neumann, Robin
 from .formula import CONSTANTS, FUNCTIONS, VARIABLES
 from .readers import MOST_CHARACTERS, not_negative, part, whole
 
@@ -19,8 +22,10 @@ class Key(NamedTuple):
         default: What it means to leave it out; "" where it is needed.
         about: What it does.
         example: A line of TOML.
-        argument: How it is read, and what it is when left out, if it is nothing but an argument of
-            `solve_adaptive` by the same name; `problemfile` hands it on.
+        argument: How it is read, if it is nothing but an argument of `solve_adaptive` by the same
+            name; `problemfile` hands it on.
+        used_on: The part of the boundary that an expression of [data] is used on; "" for all of the
+            domain.
     """
 
     section: str
@@ -29,9 +34,21 @@ class Key(NamedTuple):
     default: str
     about: str
     example: str
-    argument: tuple[Callable[[str, Any], Any], float] | None = None
+    argument: Callable[[str, Any], Any] | None = None
+    used_on: str = ""
+
+    @property
+    def is_expression(self) -> bool:
+        """Whether expressions belong there."""
+        return self.value in (EXPRESSION, TENSOR)
 
 
+DEFAULTS = {
+    name: each.default for name, each in inspect.signature(solve_adaptive).parameters.items()
+}
+"""What arguments of `solve_adaptive` are when left out."""
+USUAL = {name: f"{value}".removesuffix(".0") for name, value in DEFAULTS.items()}
+"""The same in words."""
 EXPRESSION = "an expression or a number"
 TENSOR = "an expression or a number, or a tensor [[xx, xy], [xy, yy]] of these"
 WORD = f"a text of {MOST_CHARACTERS} characters at most"
@@ -39,12 +56,11 @@ PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
 MATERIAL = "material.NAME"
 """The sections of the materials."""
-TYPES = {
-    "contact": ("obstacle", "upper", "coefficient", "external", "g"),
-    "dirichlet": ("value",),
-    "neumann": ("g",),
-    "robin": ("g", "coefficient", "external"),
+KINDS: dict[str, type[Condition]] = {
+    kind.__name__.lower(): kind for kind in (Contact, Dirichlet, Neumann, Robin)
 }
+"""What each type of a part makes of the section's other keys."""
+TYPES = {name: kind.names() for name, kind in KINDS.items()}
 """The keys that go with each type of a part."""
 
 QUANTITIES = {
@@ -89,12 +105,12 @@ KEYS = (
         'mesh = "signorini.msh"'),
     Key("data", "f", EXPRESSION, "0, or derived from `exact.u`", "The load.", 'f = "-3 + x*y"'),
     Key("data", "g", EXPRESSION, "0, or derived from `exact.u`", "The flux κ∂ₙu on neumann edges.",
-        'g = "where(y > 0.5, 1, 0)"'),
+        'g = "where(y > 0.5, 1, 0)"', used_on="neumann"),
     Key("data", "obstacle", EXPRESSION, "0", "α: u stays above it on contact edges.",
-        'obstacle = "0.1*sin(2*pi*x) - 0.25"'),
+        'obstacle = "0.1*sin(2*pi*x) - 0.25"', used_on="contact"),
     Key("data", "dirichlet", EXPRESSION, "0, or derived from `exact.u`",
         "u_D: the value of u on dirichlet edges. It is to be continuous, and not below the "
-        "obstacle where the two parts meet.", 'dirichlet = "0.2*y"'),
+        "obstacle where the two parts meet.", 'dirichlet = "0.2*y"', used_on="dirichlet"),
     Key("data", "coefficient", TENSOR, "1", "κ, above 0 everywhere. It may jump. A tensor is "
         "symmetric, with eigenvalues above 0: [[\"2\", \"0.5\"], [\"0.5\", \"1\"]].",
         'coefficient = "where(x < 0, 1, 100)"'),
@@ -133,13 +149,14 @@ KEYS = (
         "where the error sits.", 'mode = "adaptive"'),
     Key("refine", "levels", "a whole number above 0", "1; if adaptive, as many as it takes",
         "Number of meshes, the coarsest included.", "levels = 5"),
-    Key("refine", "tolerance", "a number, 0 or above", "0", "Adaptive: stop when the certified "
-        "bound of ‖∇(u − u_h)‖ is below it.", "tolerance = 0.05", (not_negative, 0.0)),
-    Key("refine", "max_dofs", "a whole number above 0", "1000000", "Adaptive: stop before a mesh "
-        "with more degrees of freedom.", "max_dofs = 200000", (whole, 1_000_000)),
-    Key("refine", "fraction", "a number above 0, at most 1", "0.5", "Adaptive: the part of the "
-        "squared bound that the cells to be refined hold. Less takes more meshes, and fewer cells "
-        "for the same bound.", "fraction = 0.3", (part, 0.5)),
+    Key("refine", "tolerance", "a number, 0 or above", USUAL["tolerance"],
+        "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it.",
+        "tolerance = 0.05", not_negative),
+    Key("refine", "max_dofs", "a whole number above 0", USUAL["max_dofs"],
+        "Adaptive: stop before a mesh with more degrees of freedom.", "max_dofs = 200000", whole),
+    Key("refine", "fraction", "a number above 0, at most 1", USUAL["fraction"],
+        "Adaptive: the part of the squared bound that the cells to be refined hold. Less takes "
+        "more meshes, and fewer cells for the same bound.", "fraction = 0.3", part),
     Key("time", "end", "a number above 0", "", "The last time; the first is 0. Needed.",
         "end = 36000"),
     Key("time", "steps", "a whole number above 0", "", "Steps of equal length. Needed.",
@@ -191,8 +208,12 @@ ABOUT = {
 SECTIONS = tuple(name.split(".")[0] for name in ABOUT if name)
 
 
-ADAPTIVE = {key.name: key.argument for key in KEYS if key.argument is not None}
-"""The keys of [refine] that only adaptive refinement has."""
+ADAPTIVE = {
+    key.name: (key.argument, DEFAULTS[key.name]) for key in KEYS if key.argument is not None
+}
+"""The keys that only adaptive refinement has: how each is read, and what it is when left out."""
+EXPRESSIONS = {f"{key.section}.{key.name}": key for key in KEYS if key.is_expression}
+"""The keys whose values are expressions."""
 
 
 def allowed(section: str) -> tuple[str, ...]:

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ..fem.conditions import Condition
 from ..fem.space import facet_measures
 from ..mesh.domain import Domain
 from .problemfile import ProblemFile
+from .reference import EXPRESSIONS, KINDS
 from .screen import WIDTH
 
 INDENT = 11
@@ -34,36 +36,27 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
     extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
 
-    def data(key: str, derived: str = "") -> str:
-        left_out = f"{derived} of exact.u".strip() if derived and "exact.u" in said else "0"
-        return _short(said.get(f"data.{key}", left_out))
-
     materials = {name: case.said[f"material.{name}"] for name in case.materials}
     own_kappa = any("coefficient" in material for material in materials.values())
     kappa = "κ" if "data.coefficient" in said or own_kappa else ""
-    gain = f" + ({data('reaction')}) u" if "data.reaction" in said else ""
+    gain = f" + ({_short(said['data.reaction'])}) u" if "data.reaction" in said else ""
     if not gain and any("reaction" in material for material in materials.values()):
         gain = " + c u"
     usual = _short(said.get("data.coefficient", 1))
-    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {usual}"
+    main = "that of exact.u" if "exact.u" in said else "0"
+    load = _short(said.get("data.f", main))
+    equation = f"−∇·(κ∇u){gain} = {load}, κ = {usual}"
     rows = {
         "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}{unit}",
-        "equation": equation if kappa else f"−Δu{gain} = {data('f', 'that')}",
+        "equation": equation if kappa else f"−Δu{gain} = {load}",
     }
     for name, material in materials.items():
         tags = domain.materials
         number = np.count_nonzero(tags.where(name)[: mesh.topology.index_map(tdim).size_local])
         own = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
         rows[name] = f"{', '.join(own) or 'no data of its own'}; {comm.allreduce(number)} cells"
-    conditions = {
-        "dirichlet": f"u = {data('dirichlet', 'that')}",
-        "neumann": f"{kappa}∂ₙu = {data('g', 'that')}",
-        "contact": f"u ≥ {data('obstacle')}, {kappa}∂ₙu ≥ 0, one of them an equality",
-    }
-    for name, part in case.said.items():
-        if name.startswith("boundary."):
-            conditions[name.removeprefix("boundary.")] = _condition(part, kappa, "exact.u" in said)
-    for name, condition in conditions.items():
+    for name, (kind, given) in _conditions(said).items():
+        condition = kind.in_words({key: _short(v) for key, v in given.items()}, main, kappa)
         measures = facet_measures(mesh, domain.facets(domain.parts[name]))[1]
         number = comm.allreduce(len(measures))
         if number > 0:
@@ -94,34 +87,18 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     )
 
 
-def _condition(part: Mapping[str, Any], kappa: str, known: bool) -> str:
-    """What holds on a part that has a section."""
-
-    def data(key: str, derived: bool = False) -> str:
-        return _short(part.get(key, "that of exact.u" if derived and known else "0"))
-
-    def factor(key: str) -> str:
-        """A number as it is, anything else in parentheses."""
-        text = data(key)
-        return text if text.replace(".", "", 1).isdigit() else f"({text})"
-
-    kind, loss = part["type"], part.get("coefficient", 0) != 0
-    flux = f"{kappa}∂ₙu"
-    if loss:
-        flux += f" + {factor('coefficient')} (u − {factor('external')})"
-    if kind == "dirichlet":
-        return f"u = {data('value', True)}"
-    if kind != "contact":
-        return f"{flux} = {data('g', True)}"
-    gain = f" − {factor('g')}" if part.get("g", 0) != 0 else ""
-    if "upper" not in part:
-        return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
-    if "obstacle" not in part:
-        return f"u ≤ {data('upper')}, {flux}{gain} ≤ 0, one of them an equality"
-    return (
-        f"{data('obstacle')} ≤ u ≤ {data('upper')}, {flux}{gain} ≥ 0 on the lower bound, ≤ 0 on "
-        "the upper, 0 between them"
-    )
+def _conditions(said: Mapping[str, Any]) -> dict[str, tuple[type[Condition], dict[str, Any]]]:
+    """The kind of condition on each part, and what was written for its data, by name."""
+    found = {}
+    for name in ("dirichlet", "neumann", "contact"):
+        (key,) = (key for key, told in EXPRESSIONS.items() if told.used_on == name)
+        main = KINDS[name].names()[0]
+        found[name] = KINDS[name], {main: said[key]} if key in said else {}
+    for key, part in said.items():
+        if key.startswith("boundary."):
+            given = {datum: value for datum, value in part.items() if datum != "type"}
+            found[key.removeprefix("boundary.")] = KINDS[part["type"]], given
+    return found
 
 
 def _short(value: object) -> str:

@@ -7,7 +7,7 @@ condition for what it adds, and none for its kind; so one more kind is one more 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Self, TypeAlias
 
@@ -106,6 +106,18 @@ class Condition:
         """What an exact solution says of the main datum, where the user does not."""
         return None
 
+    @classmethod
+    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+        """Say what holds on the part, with data as they were written.
+
+        Args:
+            said: What was written for each datum that is given, by name.
+            main: What stands for the main datum where it is not given and may be derived.
+            kappa: What stands before ∂ₙu.
+        """
+        given = {cls.names()[0]: main, **said}
+        return f"{cls.__name__}: " + ", ".join(f"{name} = {text}" for name, text in given.items())
+
     @property
     def main(self) -> Any:
         """Its main datum."""
@@ -155,6 +167,11 @@ class Dirichlet(Condition):
 
     value: Data | None = None
 
+    @classmethod
+    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+        """Say it as an equation."""
+        return f"u = {said.get('value', main)}"
+
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
         return given.exact
 
@@ -173,6 +190,11 @@ class Neumann(Condition):
     """
 
     g: Data | None = None
+
+    @classmethod
+    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+        """Say it as an equation."""
+        return f"{kappa}∂ₙu = {said.get('g', main)}"
 
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
         return given.flux
@@ -196,6 +218,11 @@ class Robin(Condition):
     g: Data | None = None
     coefficient: Data = field(default=0.0, kw_only=True)
     external: Data = field(default=0.0, kw_only=True)
+
+    @classmethod
+    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+        """Say it as an equation."""
+        return f"{_left_in_words(said, kappa)} = {said.get('g', main)}"
 
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
         if given.exact is None:
@@ -234,6 +261,21 @@ class Contact(Condition):
     external: Data = field(default=0.0, kw_only=True)
     g: Data = field(default=0.0, kw_only=True)
 
+    @classmethod
+    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+        """Say it as inequalities; nothing of it is derived."""
+        left = _left_in_words(said, kappa)
+        if _matters(said, "g"):
+            left += f" − {_as_factor(said['g'])}"
+        if "upper" not in said:
+            return f"u ≥ {said.get('obstacle', '0')}, {left} ≥ 0, one of them an equality"
+        if "obstacle" not in said:
+            return f"u ≤ {said['upper']}, {left} ≤ 0, one of them an equality"
+        return (
+            f"{said['obstacle']} ≤ u ≤ {said['upper']}, {left} ≥ 0 on the lower bound, ≤ 0 on the"
+            " upper, 0 between them"
+        )
+
     @property
     def optional(self) -> bool:
         """Not if there is no α."""
@@ -262,6 +304,25 @@ def _known(condition: Any) -> Any:
     if number(condition.coefficient) == 0.0:
         return condition.g
     return condition.g + condition.coefficient * condition.external
+
+
+def _left_in_words(said: Mapping[str, str], kappa: str) -> str:
+    """Write κ∂ₙu + b (u − u_ext)."""
+    flux = f"{kappa}∂ₙu"
+    if not _matters(said, "coefficient"):
+        return flux
+    b, external = (_as_factor(said.get(name, "0")) for name in ("coefficient", "external"))
+    return f"{flux} + {b} (u − {external})"
+
+
+def _matters(said: Mapping[str, str], name: str) -> bool:
+    """Whether a datum is given and not written as the number 0."""
+    return said.get(name, "0") not in ("0", "0.0")
+
+
+def _as_factor(text: str) -> str:
+    """A number as it is, anything else in parentheses."""
+    return text if text.replace(".", "", 1).isdigit() else f"({text})"
 
 
 def facets_of(domain: Domain, conditions: Sequence[Condition]) -> Int32Array:

@@ -53,8 +53,9 @@ def balance(domain: Domain, parent: Int32Array) -> Refined:
         materials = Materials(materials.numbers, of_cells)
     parents = Exchange(comm, rank, known[:, 0])
     tags = tagged(mesh, known[:, 1:])
-    coarser = domain.coarser and (domain.coarser[0], parents.place, parents)
-    moved = Domain(mesh, tags, parts=domain.parts, materials=materials, coarser=coarser)
+    *before_it, last = domain.descent
+    descent = (*before_it, last._replace(parent=parents.place, exchange=parents))
+    moved = Domain(mesh, tags, parts=domain.parts, materials=materials, descent=descent)
     return moved, parents.place, parents
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import itertools
 import time
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import basix.ufl
 import numpy as np
@@ -32,7 +33,7 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
-from ..errors import InputError, on_root, raise_together
+from ..errors import InputError, naming, on_root, raise_together
 from . import gmshmesh
 from .exchange import Exchange
 from .materials import Materials
@@ -43,8 +44,30 @@ from .polygon import check_labels, check_loops, circle, coordinates, cut
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
 """Names that parts of a boundary have by themselves, and their values in facet tags."""
+USUAL = ("contact", "dirichlet")
+"""Parts that there must be where no part has a name of its own: they hold the solution."""
 REST = NEUMANN
 """The part of the exterior facets that nobody names: the weak form's natural condition."""
+
+
+class Refinement(NamedTuple):
+    """From a mesh to one that was made from it.
+
+    Attributes:
+        mesh: The coarse one, as long as anyone else needs it.
+        parent: Row of the coarse cell that holds each cell, shape (cells,).
+        exchange: What fetches these rows from other ranks, if cells have moved.
+    """
+
+    mesh: weakref.ref[Mesh]
+    parent: Int32Array | IndexArray
+    exchange: Exchange | None = None
+
+    def carry(self, values: npt.NDArray) -> npt.NDArray:
+        """Give the fine cells what their parents have, of the coarse cells in order; collective."""
+        rows = values if self.exchange is None else self.exchange.fetch(values)
+        found: npt.NDArray = rows[self.parent]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +79,7 @@ class Domain:
         tags: Facet tags; each exterior facet has the value of one part.
         parts: The parts' names, and their values in the tags.
         materials: What the cells consist of.
-        coarser: What it was refined from, the cell there that holds each cell, and what fetches
-            these cells from other ranks, as `balance.balance` returns them.
+        descent: From the coarsest mesh to this one, a step for each refinement.
         seconds: Wall time it took to triangulate or read, and to share out; 0 where it was there.
     """
 
@@ -66,7 +88,7 @@ class Domain:
     seconds: float = 0.0
     parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
     materials: Materials = field(default_factory=Materials)
-    coarser: tuple[Domain, Int32Array | IndexArray, Exchange | None] | None = None
+    descent: tuple[Refinement, ...] = ()
 
     def __repr__(self) -> str:
         """A line; the facets are those of this rank."""
@@ -113,21 +135,18 @@ class Domain:
         V = function.function_space
         if V.mesh is self.mesh:
             return function
-        if self.coarser is None or not is_by_cells(function):
+        above = [i for i, step in enumerate(self.descent) if step.mesh() is V.mesh]
+        if not above or not is_by_cells(function):
             raise InputError(
                 "data given as a dolfinx Function live on one mesh only, unless they are of degree"
                 " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
             )
         if function not in self._own:
-            coarse, parents, exchange = self.coarser
-            above = coarse.own(function)
+            values = function.x.array[V.dofmap.list[:, 0]]
+            for step in self.descent[above[0] :]:
+                values = step.carry(values)
             fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
-            at = (space.dofmap.list[:, 0] for space in (fine.function_space, above.function_space))
-            here, there = at
-            values = above.x.array[there]
-            if exchange is not None:
-                values = exchange.fetch(values)
-            fine.x.array[here[: len(parents)]] = values[parents]
+            fine.x.array[fine.function_space.dofmap.list[: len(values), 0]] = values
             self._own[function] = fine
         return self._own[function]
 
@@ -168,63 +187,125 @@ class Domain:
             InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
-        fdim = mesh.topology.dim - 1
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
         parts = numbered(others)
-        needed = {parts[name] for name, own in given.items() if own is not None} - {REST}
+        needed = {name for name, own in given.items() if own is not None} - {"neumann"}
         if not others:
-            needed |= {CONTACT, DIRICHLET}
-        wanted: dict[int, Int32Array] = {}
-        for name, own in given.items():
-            usual: list[int] = [PARTS[name]] if own is None and parts[name] in needed else []
-            numbers = np.asarray(usual if own is None else own, dtype=np.int32)
-            wanted[parts[name]] = np.unique(np.atleast_1d(numbers))
-        called = {value: name for name, value in parts.items()}
-        for a, b in itertools.combinations(wanted, 2):
-            if len(both := np.intersect1d(wanted[a], wanted[b])):
-                raise InputError(
-                    f"the facet value {both[0]} stands for {called[a]} and for {called[b]}: "
-                    "a value can stand for one part only"
-                )
+            needed |= set(USUAL)
+        wanted = _wanted(given, parts, needed)
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
         exterior = _exterior(mesh)
-        values = np.full(_count(mesh, fdim), REST, dtype=np.int32)
-        inside = np.ones(len(values), dtype=bool)
-        inside[exterior] = False
-        complaint = None
-        owned = mesh.topology.index_map(fdim).size_local
-        for part, numbers in wanted.items():
-            chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]
-            chosen = chosen[chosen < owned]
-            values[chosen] = part
-            if np.any(inside[chosen]):
-                complaint = (
-                    f"{np.count_nonzero(inside[chosen])} facets tagged {called[part]} lie "
-                    "inside the domain: only exterior facets can be tagged"
-                )
-        raise_together(mesh.comm, complaint)
-        at = exterior[exterior < owned]
-        mine = set(facet_tags.values[np.isin(facet_tags.indices, at)].tolist())
-        there = set().union(*mesh.comm.allgather(mine))
-        known = {0}
-        for part, numbers in wanted.items():
-            known.update(int(value) for value in numbers)
-            missing = [int(value) for value in numbers if value not in there]
-            if part in needed and (missing or not len(numbers)):
-                raise InputError(
-                    f"no exterior facet is tagged {called[part]} (value {_list(missing)}): the"
-                    f" values there are {_list(sorted(there))}"
-                )
-        if (neumann is not None or others) and (left := sorted(there - known)):
-            words = [f"{called[part]} {_list(numbers)}" for part, numbers in wanted.items()]
+        values = _values(mesh, facet_tags, exterior, wanted, parts)
+        known = {int(value) for numbers in wanted.values() for value in numbers}
+        there = _insist_on(mesh, facet_tags, exterior, wanted, needed)
+        if (neumann is not None or others) and (left := sorted(there - known - {0})):
+            words = [f"{part} {_list(numbers)}" for part, numbers in wanted.items()]
             words[0] = words[0].replace(" ", " is ", 1)
             raise InputError(
                 f"exterior facets are tagged {_list(left)}, which stands for nothing:"
                 f" {', '.join(words[:-1])} and {words[-1]}"
             )
         made = Materials.from_tags(mesh, cell_tags, materials or {})
-        tags = meshtags(mesh, fdim, exterior, values[exterior])
+        tags = meshtags(mesh, mesh.topology.dim - 1, exterior, values[exterior])
         return cls(mesh, tags, parts=parts, materials=made)
+
+
+def _wanted(
+    given: Mapping[str, int | Sequence[int] | None], parts: Mapping[str, int], needed: set[str]
+) -> dict[str, Int32Array]:
+    """The values in a user's facet tags that stand for each part, ascending, by name.
+
+    Args:
+        given: What the user says of them.
+        parts: The values of our own.
+        needed: The parts that there must be.
+
+    Raises:
+        InputError: A value stands for two parts.
+    """
+    wanted = {}
+    for name, own in given.items():
+        usual = [parts[name]] if own is None and name in needed else []
+        numbers = np.asarray(usual if own is None else own, dtype=np.int32)
+        wanted[name] = np.unique(np.atleast_1d(numbers))
+    for a, b in itertools.combinations(wanted, 2):
+        if len(both := np.intersect1d(wanted[a], wanted[b])):
+            raise InputError(
+                f"the facet value {both[0]} stands for {a} and for {b}: "
+                "a value can stand for one part only"
+            )
+    return wanted
+
+
+def _values(
+    mesh: Mesh,
+    facet_tags: MeshTags,
+    exterior: Int32Array,
+    wanted: Mapping[str, Int32Array],
+    parts: Mapping[str, int],
+) -> Int32Array:
+    """The part that each local facet belongs to, shape (facets,); collective.
+
+    Args:
+        mesh: The user's.
+        facet_tags: The user's.
+        exterior: Local indices of the exterior facets.
+        wanted: From `_wanted`.
+        parts: The values of our own.
+
+    Raises:
+        InputError: A tag of one of the parts is on a facet inside.
+    """
+    fdim = mesh.topology.dim - 1
+    values = np.full(_count(mesh, fdim), REST, dtype=np.int32)
+    inside = np.ones(len(values), dtype=bool)
+    inside[exterior] = False
+    complaint = None
+    owned = mesh.topology.index_map(fdim).size_local
+    for name, numbers in wanted.items():
+        chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]
+        chosen = chosen[chosen < owned]
+        values[chosen] = parts[name]
+        if np.any(inside[chosen]):
+            complaint = (
+                f"{np.count_nonzero(inside[chosen])} facets tagged {name} lie "
+                "inside the domain: only exterior facets can be tagged"
+            )
+    raise_together(mesh.comm, complaint)
+    return values
+
+
+def _insist_on(
+    mesh: Mesh,
+    facet_tags: MeshTags,
+    exterior: Int32Array,
+    wanted: Mapping[str, Int32Array],
+    needed: set[str],
+) -> set[int]:
+    """Insist on the values of the parts that there must be; collective.
+
+    Args:
+        mesh: The user's.
+        facet_tags: The user's.
+        exterior: Local indices of the exterior facets.
+        wanted: From `_wanted`.
+        needed: The parts that there must be.
+
+    Returns:
+        The values of exterior facets, of all ranks.
+    """
+    owned = mesh.topology.index_map(mesh.topology.dim - 1).size_local
+    at = exterior[exterior < owned]
+    mine = set(facet_tags.values[np.isin(facet_tags.indices, at)].tolist())
+    there: set[int] = set().union(*mesh.comm.allgather(mine))
+    for name, numbers in wanted.items():
+        missing = [int(value) for value in numbers if value not in there]
+        if name in needed and (missing or not len(numbers)):
+            raise InputError(
+                f"no exterior facet is tagged {name} (value {_list(missing)}): the"
+                f" values there are {_list(sorted(there))}"
+            )
+    return there
 
 
 def is_by_cells(function: object) -> bool:
@@ -361,10 +442,8 @@ class Polygon:
         polygons = {name: coordinates(polygon) for name, polygon in self.materials.items()}
         object.__setattr__(self, "materials", polygons)
         for name, polygon in polygons.items():
-            try:
+            with naming(f"the material {name}"):
                 check_loops([polygon])
-            except InputError as error:
-                raise InputError(f"the material {name}: {error}") from None
         if any(hole.holes for hole in self.holes):
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
@@ -376,7 +455,7 @@ class Polygon:
         if self.names:
             return
         labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
-        for part in ("contact", "dirichlet"):
+        for part in USUAL:
             if part not in labels:
                 raise InputError(
                     f"no edge is labelled {part!r}: the boundary needs a contact part and a "
@@ -442,7 +521,9 @@ def read_gmsh(
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
     parts, numbers = numbered(names), numbered_materials(materials)
-    what = Path(path), parts, not names, numbers
+    own = [name for name in parts if name not in PARTS]
+    needed, holding = (own, ()) if names else (USUAL, USUAL)
+    what = Path(path), parts, needed, holding, numbers
     return _distribute(comm, parts, numbers, gmshmesh.read, *what)
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
+from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError
 from .domain import Domain, Polygon, _distribute
 from .gmshmesh import Triangulation
+from .polygon import inside
 
 
 def structured(
@@ -76,8 +77,11 @@ def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -
     triangles = np.stack([corner, right, across, corner, across, up], axis=1).reshape(-1, 3)
     x, y = np.meshgrid(np.arange(columns + 1), np.arange(rows + 1))
     points = low + np.stack([x.ravel(), y.ravel()], axis=1) * ((high - low) / number)
-    inside = _contains(starts, ends, points[triangles].mean(axis=1))
-    used, triangles = np.unique(triangles[inside], return_inverse=True)
+    middles = points[triangles].mean(axis=1)
+    within = inside(middles, polygon.vertices)
+    for hole in polygon.holes:
+        within &= ~inside(middles, hole.vertices)
+    used, triangles = np.unique(triangles[within], return_inverse=True)
     points, triangles = points[used], triangles.reshape(-1, 3)
     facets = _boundary(triangles)
     edge = _edge_of(starts, ends, points[facets].mean(axis=1))
@@ -106,14 +110,6 @@ def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, Int32Array]:
     ends = np.concatenate([np.roll(loop.vertices, -1, axis=0) for loop in loops])
     names = [name for loop in loops for name in loop.boundary]
     return starts, ends, np.array([polygon.parts[name] for name in names], dtype=np.int32)
-
-
-def _contains(starts: FloatArray, ends: FloatArray, points: FloatArray) -> BoolArray:
-    """Which points lie inside: a level ray to the right meets the edges oddly often."""
-    spans = (starts[:, 1] > points[:, None, 1]) != (ends[:, 1] > points[:, None, 1])
-    beyond = np.maximum(starts[:, 0], ends[:, 0]) > points[:, None, 0]
-    inside: BoolArray = np.count_nonzero(spans & beyond, axis=1) % 2 == 1
-    return inside
 
 
 def _boundary(triangles: Int64Array) -> Int64Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
-from ..errors import InputError
+from ..errors import InputError, naming
 from . import mshfile
 from .lines import arranged, sorted_out
 from .mshfile import KINDS, MshFile
@@ -124,42 +124,9 @@ def triangulate(
         numbers: The materials' numbers.
     """
     loops, labels, inner = arranged(loops, labels, list(polygons.values()))
-    lengths = [np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1) for loop in loops]
-    lengths += [np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)]
-    counts = [np.maximum(1, np.ceil(length / size - 1e-9)) for length in lengths]
-    triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
-    if sum(map(np.sum, counts)) > _MOST_FACETS or triangles > _MOST_TRIANGLES:
-        raise InputError(
-            f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
-        )
-    facets = [length / count for length, count in zip(lengths, counts)]
-    ends = [np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in loops] + [inner]
-    shortest = min(each.min(initial=np.inf) for each in facets)
-    x, edges = _numbered(np.concatenate(ends))
-    near = _sizes(x, edges, np.concatenate(facets))
-    near_ends = near[edges]
-    graded = _graded(np.concatenate(lengths), np.concatenate(facets), near_ends)
-    if graded > _MOST_GRADED:
-        raise InputError(
-            f"an edge has facets of {shortest:.3g} beside much longer edges: those that grow from"
-            f" there along these would be about {graded:.1e}, and {_MOST_GRADED:g} are allowed;"
-            " longer edges are needed, or a mesh file"
-        )
+    outline = _outline(loops, inner, size)
     with _session() as gmsh:
-        geo = gmsh.model.geo
-        points = [geo.addPoint(*at, 0.0, h) for at, h in zip(x, near)]
-        curves = [geo.addLine(points[a], points[b]) for a, b in edges]
-        even = near_ends.min(axis=1) > _UNEVEN * np.concatenate(facets)
-        for i in np.flatnonzero(even):
-            geo.mesh.setTransfiniteCurve(curves[i], int(np.concatenate(counts)[i]) + 1)
-        *rings, within = np.split(np.array(curves), np.cumsum([len(loop) for loop in loops]))
-        surface = geo.addPlaneSurface([geo.addCurveLoop(ring.tolist()) for ring in rings])
-        geo.synchronize()
-        if len(within):
-            gmsh.model.mesh.embed(1, within.tolist(), 2, surface)
-        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
-        if shortest < _UNEVEN * size:
-            _widen_inwards(gmsh, curves, surface, size)
+        curves = _draw(gmsh, outline, [len(loop) for loop in loops], size)
         try:
             gmsh.model.mesh.generate(2)
         except Exception as error:
@@ -177,6 +144,87 @@ def triangulate(
         return raw
     middles = raw.points[raw.triangles].mean(axis=1)
     return raw._replace(materials=sorted_out(middles, polygons, numbers))
+
+
+class _Outline(NamedTuple):
+    """The lines that a mesh follows, one loop after the other and then those inside.
+
+    Attributes:
+        x: Their ends, each once, shape (points, 2).
+        near: Facet length wanted at each of these, shape (points,).
+        edges: The ends' numbers, shape (lines, 2).
+        counts: How many facets each line is cut into, where they are equal, shape (lines,).
+        facets: How long these are, shape (lines,).
+    """
+
+    x: FloatArray
+    near: FloatArray
+    edges: IndexArray
+    counts: FloatArray
+    facets: FloatArray
+
+
+def _outline(loops: Sequence[FloatArray], inner: FloatArray, size: float) -> _Outline:
+    """Find how finely lines are to be cut.
+
+    Args:
+        loops: Vertices of the polygon and of each hole, shapes (n, 2).
+        inner: Ends of the lines inside, shape (m, 2, 2).
+        size: Facet length wanted.
+
+    Raises:
+        InputError: There would be too many facets or triangles.
+    """
+    ends = np.concatenate(
+        [*(np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in loops), inner]
+    )
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    counts = np.maximum(1, np.ceil(lengths / size - 1e-9))
+    triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
+    if counts.sum() > _MOST_FACETS or triangles > _MOST_TRIANGLES:
+        raise InputError(
+            f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
+        )
+    facets = lengths / counts
+    x, edges = _numbered(ends)
+    near = _sizes(x, edges, facets)
+    graded = _graded(lengths, facets, near[edges])
+    if graded > _MOST_GRADED:
+        raise InputError(
+            f"an edge has facets of {facets.min():.3g} beside much longer edges: those that grow"
+            f" from there along these would be about {graded:.1e}, and {_MOST_GRADED:g} are"
+            " allowed; longer edges are needed, or a mesh file"
+        )
+    return _Outline(x, near, edges, counts, facets)
+
+
+def _draw(gmsh: Any, outline: _Outline, loops: Sequence[int], size: float) -> list[int]:
+    """Tell gmsh the outline, and how fine the mesh is to be.
+
+    Args:
+        gmsh: From `_session`.
+        outline: The lines.
+        loops: How many of them each loop has.
+        size: Facet length wanted.
+
+    Returns:
+        The tags of the lines.
+    """
+    geo, edges = gmsh.model.geo, outline.edges
+    points = [geo.addPoint(*at, 0.0, h) for at, h in zip(outline.x, outline.near, strict=True)]
+    curves = [geo.addLine(points[a], points[b]) for a, b in edges]
+    even = outline.near[edges].min(axis=1) > _UNEVEN * outline.facets
+    for i in np.flatnonzero(even):
+        geo.mesh.setTransfiniteCurve(curves[i], int(outline.counts[i]) + 1)
+    *rings, within = np.split(np.array(curves), np.cumsum(loops))
+    surface = geo.addPlaneSurface([geo.addCurveLoop(ring.tolist()) for ring in rings])
+    geo.synchronize()
+    if len(within):
+        gmsh.model.mesh.embed(1, within.tolist(), 2, surface)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    if outline.facets.min() < _UNEVEN * size:
+        _widen_inwards(gmsh, curves, surface, size)
+    return curves
 
 
 def _numbered(ends: FloatArray) -> tuple[FloatArray, IndexArray]:
@@ -212,8 +260,9 @@ def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
 
 def read(
     path: Path,
-    parts: dict[str, int],
-    usual: bool = True,
+    parts: Mapping[str, int],
+    needed: Sequence[str],
+    holding: Collection[str],
     materials: Mapping[str, int] = MappingProxyType({}),
 ) -> Triangulation:
     """Read a planar triangle mesh with named physical curves, and perhaps surfaces.
@@ -221,11 +270,27 @@ def read(
     Args:
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
-        usual: Whether there must be a contact and a dirichlet curve.
+        needed: Names of which there must be a curve.
+        holding: Names one of which each piece of the mesh must have facets of; none if it takes
+            the conditions to say what holds a piece.
         materials: Numbers of the physical surfaces that are asked for, by name.
+
+    Raises:
+        InputError: The file cannot be read, or is no such mesh; the message begins with its path.
     """
-    file = mshfile.load(path)
-    _check_cells(file, path)
+    with naming(path):
+        return _read(mshfile.load(path), parts, needed, holding, materials)
+
+
+def _read(
+    file: MshFile,
+    parts: Mapping[str, int],
+    needed: Sequence[str],
+    holding: Collection[str],
+    materials: Mapping[str, int],
+) -> Triangulation:
+    """Take from a file what `read` returns."""
+    _check_cells(file)
     names = [(tag, file.names.get((1, tag), "")) for tag in file.groups(1)]
     found: dict[str, list[Int64Array]] = {name: [] for name in parts}
     others: dict[str, list[Int64Array]] = {}
@@ -234,25 +299,24 @@ def read(
         key = key if key in parts else key.lower()
         group = found[key] if key in parts else others.setdefault(name or f"{tag}", [])
         group.append(file.elements(_LINE, tag))
-    for needed in ("contact", "dirichlet") if usual else tuple(parts)[3:]:
-        if not sum(map(len, found[needed])):
+    for each in needed:
+        if not sum(map(len, found[each])):
             there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
             raise InputError(
-                f"{path}: no physical curve is named {needed!r}; the physical curves there "
-                f"are: {there}"
+                f"no physical curve is named {each!r}; the physical curves there are: {there}"
             )
     facets = np.concatenate([part for key in parts for part in found[key]])
     labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])
     triangles = file.elements(_TRIANGLE)
     raw = _compact(file.tags, file.points, triangles, facets, labels)
     if materials:
-        raw = raw._replace(materials=_of_materials(file, path, materials))
-    _check_names(triangles, facets, others, path, tuple(parts))
-    _check_facets(raw, path, {label: name for name, label in parts.items()})
+        raw = raw._replace(materials=_of_materials(file, materials))
+    _check_names(triangles, facets, others, tuple(parts))
+    _check_facets(raw, {label: name for name, label in parts.items()}, holding)
     return raw
 
 
-def _of_materials(file: MshFile, path: Path, materials: Mapping[str, int]) -> Int32Array:
+def _of_materials(file: MshFile, materials: Mapping[str, int]) -> Int32Array:
     """The number of the physical surface that each triangle lies in, or 0, shape (triangles,).
 
     Raises:
@@ -268,7 +332,7 @@ def _of_materials(file: MshFile, path: Path, materials: Mapping[str, int]) -> In
         here = [name for name in materials if called[name] & block.groups]
         if len(here) > 1 and len(block.nodes):
             raise InputError(
-                f"{path}: {len(block.nodes)} triangles lie in the physical surfaces {here[0]!r} and"
+                f"{len(block.nodes)} triangles lie in the physical surfaces {here[0]!r} and"
                 f" {here[1]!r}: a cell consists of one material"
             )
         found.append(np.full(len(block.nodes), materials[here[0]] if here else 0, np.int32))
@@ -277,7 +341,7 @@ def _of_materials(file: MshFile, path: Path, materials: Mapping[str, int]) -> In
         if number not in numbers:
             there = [each for (dim, _), each in sorted(file.names.items()) if dim == 2]
             raise InputError(
-                f"{path}: no physical surface with triangles is named {name!r}; the names there"
+                f"no physical surface with triangles is named {name!r}; the names there"
                 f" are: {', '.join(there) or 'none'}"
             )
     return numbers
@@ -287,7 +351,6 @@ def _check_names(
     triangles: Int64Array,
     labelled: Int64Array,
     others: dict[str, list[Int64Array]],
-    path: Path,
     allowed: Sequence[str],
 ) -> None:
     """Refuse physical curves of other names where they would become Neumann facets unasked.
@@ -298,7 +361,6 @@ def _check_names(
         triangles: Node tags, shape (triangles, 3).
         labelled: Node tags of the facets of allowed names, shape (facets, 2).
         others: Node tags of the facets of each other name.
-        path: For the message.
         allowed: The names.
     """
     curves = {name: np.concatenate(group) for name, group in others.items() if group}
@@ -322,37 +384,37 @@ def _check_names(
             )
             hint = f"did you mean {near[0]}? Allowed there" if near else "allowed there"
             raise InputError(
-                f"{path}: {what} has {number} facets on the boundary; {hint} are"
+                f"{what} has {number} facets on the boundary; {hint} are"
                 f" {', '.join(allowed)}; a curve without a physical group is neumann"
             )
 
 
-def _check_cells(file: MshFile, path: Path) -> None:
+def _check_cells(file: MshFile) -> None:
     """Insist on triangles in the x-y plane, with straight sides, and nothing else."""
     kinds = sorted({block.kind for block in file.blocks if len(block.nodes)})
     properties = [(kind, *KINDS[kind][:2]) for kind in kinds]
     wrong = [name for _, name, dim in properties if dim == 3]
     if wrong:
-        raise InputError(f"{path}: a mesh in three dimensions ({wrong[0]}): a planar one is needed")
+        raise InputError(f"a mesh in three dimensions ({wrong[0]}): a planar one is needed")
     plane = [(kind, name) for kind, name, dim in properties if dim == 2]
     if not plane:
         raise InputError(
-            f"{path}: no triangles: gmsh saves what has a physical group, so that the surface "
+            "no triangles: gmsh saves what has a physical group, so that the surface "
             "needs one as soon as the curves have one"
         )
     lines = [(kind, name) for kind, name, dim in properties if dim == 1]
     for kind, name in plane + lines:
         if kind not in (_TRIANGLE, _LINE):
             raise InputError(
-                f"{path}: it contains cells of the kind {name!r}: only straight-sided triangles "
+                f"it contains cells of the kind {name!r}: only straight-sided triangles "
                 "are possible"
             )
     used = np.concatenate([block.nodes.ravel() for block in file.blocks])
     if np.ptp(file.points[np.searchsorted(file.tags, used), 2]) > 0:
-        raise InputError(f"{path}: the mesh does not lie in the x-y plane: z takes several values")
+        raise InputError("the mesh does not lie in the x-y plane: z takes several values")
 
 
-def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None:
+def _check_facets(raw: Triangulation, names: dict[int, str], holding: Collection[str]) -> None:
     """Insist on labels of exterior facets, one each, and on something that holds every piece."""
     count = len(raw.points)
     u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
@@ -360,7 +422,7 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
     flat = np.flatnonzero(~(area > 1e-14 * ((u**2).sum(axis=1) + (v**2).sum(axis=1))))
     if len(flat):
         x, y = raw.points[raw.triangles[flat[0], 0]]
-        raise InputError(f"{path}: the triangle at ({x:g}, {y:g}) has no area")
+        raise InputError(f"the triangle at ({x:g}, {y:g}) has no area")
 
     def key(ends: Int64Array) -> Int64Array:
         return ends.min(axis=-1) * count + ends.max(axis=-1)
@@ -379,31 +441,33 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
     for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
         if len(bad):
             name = names[int(raw.labels[bad[0]])]
-            raise InputError(f"{path}: {facet(bad[0])} is labelled {name} but {fault}")
+            raise InputError(f"{facet(bad[0])} is labelled {name} but {fault}")
     order = np.lexsort((raw.labels, labelled))
     one, two = order[:-1], order[1:]
     twice = np.flatnonzero((labelled[one] == labelled[two]) & (raw.labels[one] != raw.labels[two]))
     if len(twice):
         i, j = one[twice[0]], two[twice[0]]
         raise InputError(
-            f"{path}: {facet(i)} belongs to {names[int(raw.labels[i])]} and to "
+            f"{facet(i)} belongs to {names[int(raw.labels[i])]} and to "
             f"{names[int(raw.labels[j])]}: only one is possible"
         )
     if cells.max() > 2:
-        raise InputError(f"{path}: {cells.max()} triangles meet in one facet: at most 2 can")
+        raise InputError(f"{cells.max()} triangles meet in one facet: at most 2 can")
     piece = pieces(where, len(edges))
     if (found := overlap(raw.points, raw.triangles, where, cells, piece)) is not None:
-        raise InputError(f"{path}: {found}")
-    holding = [number for number, name in names.items() if name in ("dirichlet", "contact")]
+        raise InputError(found)
+    if not holding:
+        return
     fixed = np.zeros(len(edges), dtype=bool)
-    fixed[position[np.isin(raw.labels, holding)]] = True
+    holds = [number for number, name in names.items() if name in holding]
+    fixed[position[np.isin(raw.labels, holds)]] = True
     held = np.zeros(len(raw.triangles), dtype=bool)
     held[piece[fixed[where].any(axis=1)]] = True
     loose = np.flatnonzero(~held[piece])
     if len(loose):
         x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
         raise InputError(
-            f"{path}: the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
+            f"the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
             "Dirichlet facet and no contact facet"
         )
 

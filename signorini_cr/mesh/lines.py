@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import InputError
+from .polygon import inside
 
 NEAR = 1e-12
 """How close, in parts of the extent, points are the same, and points are on a line."""
@@ -103,17 +104,6 @@ def _through(edge: IndexArray, x: FloatArray, near: float) -> IndexArray:
     found = np.flatnonzero(on & (t > 0) & (t < 1))
     found = found[(found != edge[0]) & (found != edge[1])]
     return np.concatenate([edge[:1], found[np.argsort(t[found])], edge[1:]])
-
-
-def inside(points: FloatArray, loop: FloatArray) -> BoolArray:
-    """Whether points, not on the loop, lie inside: a ray to the right crosses it oddly often."""
-    found = np.zeros(len(points), dtype=bool)
-    for a, b in zip(loop, np.roll(loop, -1, axis=0), strict=True):
-        spans = (a[1] > points[:, 1]) != (b[1] > points[:, 1])
-        if spans.any():
-            hit = a[0] + (points[spans, 1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
-            found[spans] ^= hit > points[spans, 0]
-    return found
 
 
 def sorted_out(

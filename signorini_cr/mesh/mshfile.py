@@ -244,11 +244,11 @@ def load(path: Path) -> MshFile:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(f"cannot be read: {error.strerror}") from error
     try:
         return _Reader(data).read()
     except _Damaged as fault:
-        raise InputError(f"{path}: {fault}") from None
+        raise InputError(str(fault)) from None
 
 
 class _Reader:

@@ -14,6 +14,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from ..arrays import BoolArray, FloatArray, Int64Array
 
@@ -194,19 +196,17 @@ def _side(ends: FloatArray) -> str:
 
 
 def pieces(sides: npt.NDArray[np.integer], edges: int) -> Int64Array:
-    """Number of the piece of every cell: the lowest cell it is connected with.
+    """Number the piece of every cell by the lowest cell it is connected with, shape (cells,).
 
     Args:
         sides: What connects cells, edges as a rule, of every cell, shape (cells, n).
         edges: How many of them there are.
     """
-    piece = np.arange(len(sides))
-    while True:
-        lowest = np.full(edges, len(sides))
-        np.minimum.at(lowest, sides, piece[:, None])
-        new = np.minimum(piece, lowest[sides].min(axis=1, initial=len(sides)))
-        np.minimum.at(new, piece, new.copy())
-        new = new[new]
-        if np.array_equal(new, piece):
-            return piece
-        piece = new
+    cells, per_cell = sides.shape
+    # rows are cells and, without entries of their own, what connects them
+    starts = np.append(per_cell * np.arange(cells + 1), np.full(edges, sides.size))
+    entries = np.ones(sides.size, dtype=np.int8), cells + sides.ravel(), starts
+    joined = csr_array(entries, shape=(cells + edges, cells + edges))
+    _, label = connected_components(joined, directed=False)
+    _, lowest, which = np.unique(label[:cells], return_index=True, return_inverse=True)
+    return lowest[which]

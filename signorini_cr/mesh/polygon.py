@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray
-from ..errors import InputError
+from ..arrays import BoolArray, FloatArray
+from ..errors import InputError, naming
 
 FARTHEST = 1e100
 """Largest coordinate: areas, and products of them, stay finite."""
@@ -81,10 +81,8 @@ def cut(
     for edge, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
         piece = start[None]
         if edge in arcs:
-            try:
+            with naming(f"the arc of edge {edge}"):
                 piece = _arc(start, _one(arcs[edge]), end, size)
-            except InputError as error:
-                raise InputError(f"the arc of edge {edge}: {error}") from None
         pieces.append(piece)
     edges = [edge for edge, piece in enumerate(pieces) for _ in piece]
     return np.concatenate(pieces), tuple(boundary[edge] for edge in edges), tuple(edges)
@@ -195,10 +193,10 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
         if crossing.any():
             raise InputError(f"{edge(i)} crosses {edge(int(crossing.argmax()))}")
     for k in range(1, len(loops)):
-        if not _inside(loops[k][0], loops[0]):
+        if not inside(loops[k][:1], loops[0]).any():
             raise InputError(f"hole {k - 1} lies outside the polygon")
         for j in range(1, len(loops)):
-            if j != k and _inside(loops[k][0], loops[j]):
+            if j != k and inside(loops[k][:1], loops[j]).any():
                 raise InputError(f"hole {k - 1} lies inside hole {j - 1}")
 
 
@@ -212,10 +210,17 @@ def _side(a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
     return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
 
-def _inside(x: FloatArray, loop: FloatArray) -> bool:
-    """Whether a point, not on the loop, lies inside: a ray to the right crosses it oddly often."""
-    a, b = loop, np.roll(loop, -1, axis=0)
-    spans = (a[:, 1] > x[1]) != (b[:, 1] > x[1])
-    a, b = a[spans], b[spans]
-    hit = a[:, 0] + (x[1] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-    return bool(np.count_nonzero(hit > x[0]) % 2)
+def inside(points: FloatArray, loop: FloatArray) -> BoolArray:
+    """Tell which points, not on the loop, lie inside: a ray to the right crosses it oddly often.
+
+    Args:
+        points: Shape (n, 2).
+        loop: Vertices of a polygon, shape (m, 2).
+    """
+    found = np.zeros(len(points), dtype=bool)
+    for a, b in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+        spans = (a[1] > points[:, 1]) != (b[1] > points[:, 1])
+        if spans.any():
+            hit = a[0] + (points[spans, 1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
+            found[spans] ^= hit > points[spans, 0]
+    return found

@@ -5,6 +5,7 @@ Both keep the children of a cell on its rank and carry boundary parts and materi
 
 from __future__ import annotations
 
+import weakref
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from dolfinx.mesh import refine as split
 from .. import compat
 from ..arrays import Int32Array
 from ..errors import InputError
-from .domain import Domain
+from .domain import Domain, Refinement
 
 
 def refine(domain: Domain) -> tuple[Domain, Int32Array]:
@@ -153,9 +154,8 @@ def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
 def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
     """The fine domain: its cells consist of what their parents do."""
     materials = domain.materials.of_children(parent)
-    return Domain(
-        fine, tags, parts=domain.parts, materials=materials, coarser=(domain, parent, None)
-    )
+    descent = (*domain.descent, Refinement(weakref.ref(domain.mesh), parent))
+    return Domain(fine, tags, parts=domain.parts, materials=materials, descent=descent)
 
 
 def _count(index_map: Any) -> int:
@@ -312,8 +312,46 @@ def _give_facets(
         vertices: The fine vertices.
         m: Those in the middle of the coarse cells' facets, shape (cells, 3).
     """
-    cells = len(corners)
-    count = coarse.topology.index_map(1).size_local
+    ends = _ends(coarse, vertices, m)
+    of_cells, around, offsets = _neighbours(coarse, corners, facets)
+    number = cpp.common.IndexMap(coarse.comm, len(ends))
+    compat.set_facets(topology, number, of_cells, ends, around, offsets)
+
+
+def _ends(coarse: Mesh, vertices: _Vertices, m: Int32Array) -> Int32Array:
+    """The vertices of the fine facets, the smaller number first, shape (fine facets, 2).
+
+    Args:
+        coarse: The coarse mesh.
+        vertices: The fine vertices.
+        m: As for `_give_facets`.
+    """
+    halves = 2 * coarse.topology.index_map(1).size_local
+    ends = np.empty((halves + m.size, 2), dtype=np.int32)
+    old = coarse.topology.connectivity(1, 0).array.reshape(-1, 2)
+    for i, choose in enumerate((np.minimum, np.maximum)):
+        corner = vertices.corner[choose(old[:, 0], old[:, 1])]
+        _ascending(corner, vertices.middle, ends[i:halves:2])
+    inner = ends[halves:].reshape(-1, 3, 2)
+    for k in range(3):
+        _ascending(m[:, (k + 1) % 3], m[:, (k + 2) % 3], inner[:, k])
+    return ends
+
+
+def _neighbours(
+    coarse: Mesh, corners: Int32Array, facets: Int32Array
+) -> tuple[Int32Array, Int32Array, Int32Array]:
+    """The fine facets of the children, shape (4 cells, 3), and the children at each fine facet.
+
+    Args:
+        coarse: The coarse mesh.
+        corners: As for `_give_facets`.
+        facets: As for `_give_facets`.
+
+    Returns:
+        The former; the latter one facet after the other, and where each facet's begin.
+    """
+    cells, count = len(corners), coarse.topology.index_map(1).size_local
     c = np.arange(cells, dtype=np.int32)
     around = coarse.topology.connectivity(1, 2)
     start, first = around.offsets, around.array[around.offsets[:-1]]
@@ -331,31 +369,14 @@ def _give_facets(
             halves[links + half * number[f]] = 4 * c + k
         of_cells[:, j, j] = of_cells[:, 3, j]
 
-    ends = np.empty((2 * count + 3 * cells, 2), dtype=np.int32)
-    old = coarse.topology.connectivity(1, 0).array.reshape(-1, 2)
-    for i, choose in enumerate((np.minimum, np.maximum)):
-        corner = vertices.corner[choose(old[:, 0], old[:, 1])]
-        _ascending(corner, vertices.middle, ends[i : 2 * count : 2])
-    inner = ends[2 * count :].reshape(cells, 3, 2)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        _ascending(m[:, i], m[:, j], inner[:, k])
-
     pairs = np.empty((cells, 3, 2), dtype=np.int32)
     pairs[:, :, 0] = 4 * c[:, None] + np.arange(3, dtype=np.int32)
     pairs[:, :, 1] = 4 * c[:, None] + 3
-    offsets = np.empty(len(ends) + 1, dtype=np.int32)
+    offsets = np.empty(2 * count + 3 * cells + 1, dtype=np.int32)
     offsets[0 : 2 * count + 1 : 2] = 2 * start
     offsets[1 : 2 * count : 2] = 2 * start[:-1] + number
     offsets[2 * count :] = len(halves) + 2 * np.arange(3 * cells + 1, dtype=np.int32)
-    compat.set_facets(
-        topology,
-        cpp.common.IndexMap(coarse.comm, len(ends)),
-        of_cells.reshape(-1, 3),
-        ends,
-        np.concatenate([halves, pairs.reshape(-1)]),
-        offsets,
-    )
+    return of_cells.reshape(-1, 3), np.concatenate([halves, pairs.reshape(-1)]), offsets
 
 
 def _ascending(a: Int32Array, b: Int32Array, pairs: Int32Array) -> None:

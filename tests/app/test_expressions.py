@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 import time
 from fractions import Fraction
 
@@ -11,6 +12,7 @@ import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 
+from signorini_cr.app.cli import room_for_recursion
 from signorini_cr.app.expressions import DEEPEST, LARGEST, LONGEST_CHAIN, check_name, parse
 from signorini_cr.errors import InputError
 
@@ -227,8 +229,19 @@ def test_a_long_sum_is_not_deep_but_may_be_too_large() -> None:
 )
 def test_ufl_takes_what_is_long_or_deep(text: str) -> None:
     square = mesh.create_unit_square(MPI.COMM_WORLD, 1, 1)
+    before = sys.getrecursionlimit()
     value = parse(text).ufl(ufl.SpatialCoordinate(square))
-    fem.form(ufl.inner(ufl.grad(value), ufl.grad(value)) * ufl.dx(square, degree=1))
+    assert sys.getrecursionlimit() == before
+    with room_for_recursion():  # as the command leaves it
+        fem.form(ufl.inner(ufl.grad(value), ufl.grad(value)) * ufl.dx(square, degree=1))
+    assert sys.getrecursionlimit() == before
+
+
+def test_data_that_nobody_differentiates_need_no_room_for_recursion() -> None:
+    square = mesh.create_unit_square(MPI.COMM_WORLD, 1, 1)
+    for text in ("sin(" * 100 + "x" + ")" * 100, "+".join(["x*y"] * 1100)):
+        value = parse(text).ufl(ufl.SpatialCoordinate(square))
+        fem.form(value * ufl.dx(square, degree=1))
 
 
 def test_what_is_too_deep_for_ufl() -> None:

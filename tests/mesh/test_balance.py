@@ -1,5 +1,7 @@
 """Adaptive meshes shared out anew: the same cells, parents on other ranks, the same solutions."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -117,6 +119,22 @@ def test_what_cells_have_moves_with_them():
         values = own.x.array[own.function_space.dofmap.list[:, 0]]
         tables.append(together(np.column_stack([corners(domain).reshape(-1, 6), values])))
     assert np.array_equal(*tables)
+
+
+def test_a_refined_domain_keeps_no_coarser_mesh_alive():
+    """But carries down to it what is constant on the cells of any of them."""
+    first = SQUARE.mesh(0.5)
+    second, _ = refine_marked(first, [0])
+    of_cells = fem.Function(fem.functionspace(second.mesh, ("DG", 0)))
+    of_cells.x.array[:] = 3.0
+    third, _ = refine_marked(second, [0])
+    assert np.all(third.own(of_cells).x.array == 3.0)
+    left = [weakref.ref(each) for each in (first, first.mesh, second)]
+    of_second = weakref.ref(second.mesh)
+    del first, second
+    gc.collect()
+    assert [each() for each in left] == [None, None, None]
+    assert of_second() is of_cells.function_space.mesh
 
 
 def solved(limit: float, monkeypatch: pytest.MonkeyPatch, **more) -> list[Solution]:

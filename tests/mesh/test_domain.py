@@ -452,12 +452,17 @@ def test_missing_files_and_folders(shared_tmp_path: Path):
     assert "directory" in fails_alike(read_gmsh, shared_tmp_path)
 
 
-def write_text_mesh(path: Path, nodes: list[str], elements: list[str]) -> None:
-    """A gmsh file with curves 1, contact, and 2, Dirichlet; elements get their numbers here."""
+def write_text_mesh(
+    path: Path,
+    nodes: list[str],
+    elements: list[str],
+    names: tuple[str, str] = ("contact", "dirichlet"),
+) -> None:
+    """A gmsh file with two curves of such names; elements get their numbers here."""
     numbered = [f"{i} {element}" for i, element in enumerate(elements, start=1)]
     sections = {
         "MeshFormat": ["2.2 0 8"],
-        "PhysicalNames": ["2", '1 1 "contact"', '1 2 "dirichlet"'],
+        "PhysicalNames": ["2", *(f'1 {i} "{name}"' for i, name in enumerate(names, 1))],
         "Nodes": [f"{len(nodes)}", *nodes],
         "Elements": [f"{len(numbered)}", *numbered],
     }
@@ -471,6 +476,17 @@ def test_pieces_without_dirichlet_facets(shared_tmp_path: Path):
     elements = ["1 2 1 1 1 2", "1 2 2 2 2 3", "2 2 3 3 1 2 3", "2 2 3 3 4 5 6"]
     write_text_mesh(path, nodes, elements)
     assert "the one around (2.33333, 0.333333) has no Dirichlet" in fails_alike(read_gmsh, path)
+
+
+def test_pieces_of_a_mesh_whose_curves_have_names_of_their_own(shared_tmp_path: Path):
+    """What holds them, the conditions say; `vi.pieces` asks these."""
+    path = shared_tmp_path / "own.msh"
+    nodes = ["1 0 0 0", "2 1 0 0", "3 0 1 0", "4 2 0 0", "5 3 0 0", "6 2 1 0"]
+    elements = ["1 2 1 1 1 2", "1 2 2 2 4 5", "2 2 3 3 1 2 3", "2 2 3 3 4 5 6"]
+    write_text_mesh(path, nodes, elements, ("floor", "walls"))
+    domain = read_gmsh(path, names=["floor", "walls"])
+    found = [COMM.allreduce(len(domain.facets(part))) for part in domain.parts.values()]
+    assert found == [0, 0, 4, 1, 1]
 
 
 @pytest.mark.parametrize("stray", [2, 9], ids=["among the nodes", "behind them"])
