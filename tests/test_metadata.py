@@ -1,6 +1,7 @@
 """What is told of the program in several files is the same in all of them."""
 
 import re
+import runpy
 
 import pytest
 from helpers import ROOT
@@ -24,3 +25,44 @@ def test_the_recipe_asks_for_what_the_environment_has():
         return {line.strip(" -") for line in block[1].splitlines() if "python >" not in line}
 
     assert packages("conda/recipe.yaml", "run") <= packages("environment.yml", "dependencies")
+
+
+def slugs(text):
+    """The anchors that GitHub gives to the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    found = []
+    for heading in re.findall(r"^#+ +(.*?) *#*$", text, re.MULTILINE):
+        words = re.sub(r"!?\[([^]]*)\]\([^)]*\)", r"\1", heading)
+        slug = re.sub(r"[^\w\- ]", "", words.lower()).replace(" ", "-")
+        again = sum(re.fullmatch(re.escape(slug) + r"(-\d+)?", each) is not None for each in found)
+        found.append(f"{slug}-{again}" if again else slug)
+    return set(found)
+
+
+def test_slugs_are_those_of_github():
+    text = "# How to …\n## … give *data*?\n```\n# no\n```\n## A `b_c` κ\n## A [b](c)\n## A b\n"
+    assert slugs(text) == {"how-to-", "-give-data", "a-b_c-κ", "a-b", "a-b-1"}
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("file", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"])
+def test_links_lead_somewhere(file):
+    text = (ROOT / file).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)", text)
+    assert links
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = ROOT / (path or file)
+        assert target.exists(), link
+        if anchor:
+            assert anchor in slugs(target.read_text(encoding="utf-8")), link
+
+
+@pytest.mark.serial
+def test_the_long_description_does_without_the_folder():
+    without = runpy.run_path(str(ROOT / "setup.py"))["without_its_folder"]
+    text = without((ROOT / "README.md").read_text(encoding="utf-8"))
+    assert "](https://" in text and not re.search(r"\]\((?!https://)", text) and "![" not in text
+    assert "a b c" == without("a [b](docs/b.md#x) c")
