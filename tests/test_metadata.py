@@ -1,5 +1,6 @@
 """What is told of the program in several files is the same in all of them."""
 
+import importlib
 import re
 import runpy
 
@@ -66,3 +67,33 @@ def test_the_long_description_does_without_the_folder():
     text = without((ROOT / "README.md").read_text(encoding="utf-8"))
     assert "](https://" in text and not re.search(r"\]\((?!https://)", text) and "![" not in text
     assert "a b c" == without("a [b](docs/b.md#x) c")
+
+
+@pytest.mark.serial
+def test_formulas_lead_to_functions():
+    """Those that the certificate's page names exist, and another page tells of each."""
+    docs = ROOT / "docs"
+    names = re.findall(
+        r"\{py:\w+\}`(?:[^`<]*<)?([\w.]+)>?`", (docs / "certificate.md").read_text(encoding="utf-8")
+    )
+    assert len(names) > 30
+    told = "".join((docs / page).read_text(encoding="utf-8") for page in ("inside.md", "python.md"))
+    for name in names:
+        assert re.search(rf":: {re.escape(name)}$", told, re.MULTILINE), name
+        thing = signorini_cr
+        for part in name.split(".")[1:]:
+            module = f"{thing.__name__}.{part}"
+            thing = getattr(thing, part, None) or importlib.import_module(module)
+        assert thing.__doc__, name
+
+
+@pytest.mark.serial
+def test_formulas_keep_their_numbers():
+    """(1) to (6) are what code and other pages call them; what is referred to has a label."""
+    text = (ROOT / "docs" / "certificate.md").read_text(encoding="utf-8")
+    labels = re.findall(r"^\$\$ \(([\w-]+)\)$", text, re.MULTILINE)
+    assert [label.removeprefix("certificate-") for label in labels[:6]] == [
+        "problem", "residual", "gap", "bound", "conforming", "energy",
+    ]  # fmt: skip
+    assert set(re.findall(r"\{eq\}`([\w-]+)`", text)) <= set(labels)
+    assert len(labels) == len(set(labels))
