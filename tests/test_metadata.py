@@ -97,3 +97,22 @@ def test_formulas_keep_their_numbers():
     ]  # fmt: skip
     assert set(re.findall(r"\{eq\}`([\w-]+)`", text)) <= set(labels)
     assert len(labels) == len(set(labels))
+
+
+@pytest.mark.serial
+def test_what_is_cited_is_in_the_bibliography():
+    """Names with a year have an entry with both, and so have methods named after somebody."""
+    entries = (ROOT / "docs" / "bibliography.md").read_text(encoding="utf-8").splitlines()
+    name = r"[A-Z][a-zäöüé]+"
+    pattern = rf"((?:{name}, )*{name}(?:,? (?:and|&) {name})?),? \(?((?:19|20)\d\d)\b"
+    pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "applications").glob("*.md")]
+    texts = {page.stem: " ".join(page.read_text(encoding="utf-8").split()) for page in pages}
+    texts.pop("bibliography")
+    cited = {found for text in texts.values() for found in re.findall(pattern, text)}
+    assert ("Payne & Weinberger", "1960") in cited and len(cited) >= 5
+    for names, year in cited:
+        people = re.findall(name, names)
+        assert any(all(word in entry for word in (*people, year)) for entry in entries), names
+    for person in ("Marini", "Dörfler"):
+        assert any(person in text for text in texts.values())
+        assert any(f". {person}: " in entry for entry in entries), person
