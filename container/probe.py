@@ -1,4 +1,4 @@
-"""Exit with 0 where this Python can run signorini_cr: DOLFINx >= 0.9, gmsh, petsc4py of float64.
+"""Exit with 0 where this Python can run signorini_cr: DOLFINx, real petsc4py, gmsh, SciPy.
 
 Prints the folders Python imports from, one a line: as long as none of them changes, neither does
 the answer.
@@ -16,7 +16,7 @@ sys.stdout.flush()
 
 if sys.version_info < (3, 11):  # noqa: UP036 (the active Python may be any)
     sys.exit(1)
-if not all(importlib.util.find_spec(name) for name in ("dolfinx", "petsc4py", "gmsh")):
+if not all(importlib.util.find_spec(name) for name in ("dolfinx", "petsc4py", "gmsh", "scipy")):
     sys.exit(1)
 
 try:

@@ -48,7 +48,7 @@ diameter of a triangle, and rates are those between a level and the one before i
 
 | statement | seen in |
 |---|---|
-| Theorem 3.1, h^{{3/4}}: the rates seen lie above this floor | [there](#{theorem_31}) |
+| Theorem 3.1, $h^{{3/4}}$: the rates seen lie above this floor | [there](#{theorem_31}) |
 | Theorems 3.2 and 3.3, finitely many critical points | [there](#{theorem_32_33}) |
 | Theorem 3.4, infinitely many critical points | [there](#{theorem_34}) |
 | outside the theory: u not in H² | [there](#{outside}) |

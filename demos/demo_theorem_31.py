@@ -19,7 +19,7 @@
 import numpy as np
 from study import Study, column, levels_wanted, loglog, orders, run
 
-study = Study("demo_theorem_31", "Theorem 3.1: at least h^{3/4} for u in H²")
+study = Study("demo_theorem_31", "Theorem 3.1: a rate of at least 3/4 for u in H²")
 levels = levels_wanted(8)
 names = ("S1", "A", "B", "C", "C2", "I")
 label = {"C": "C, $s=7/2$", "C2": "C, $s=11/2$"}
@@ -51,7 +51,7 @@ study.table(
     {"h": ("{:.5f}", h)} | {name: ("{:.3f}", orders(rows, "l2")) for name, rows in results.items()},
 )
 study.table(
-    "‖u − u_h‖_h / h^{3/4}: bounded, as (3.1) says, and falling",
+    "$‖u − u_h‖_h / h^{3/4}$: bounded, as (3.1) says, and falling",
     {"h": ("{:.5f}", h)} | {name: ("{:.4f}", values) for name, values in scaled.items()},
 )
 

@@ -35,7 +35,7 @@ results = {
 
 # %% [markdown]
 # ## Tables
-# Under (3.3) the column e/h settles; e/(h|log h|^{1/4}), which (3.2) bounds, then falls slowly.
+# Under (3.3) the column e/h settles; $e/(h|\log h|^{1/4})$, which (3.2) bounds, then falls slowly.
 
 # %%
 for family, where in families.items():
@@ -47,7 +47,7 @@ for family, where in families.items():
             f"{name}: e": ("{:.3e}", error),
             f"{name}: rate": ("{:.3f}", orders(results[name, family], "h1")),
             f"{name}: e/h": ("{:.4f}", error / h),
-            f"{name}: e/(h|log h|^{{1/4}})": ("{:.4f}", error / (h * abs(np.log(h)) ** 0.25)),
+            f"{name}: $e/(h|\\log h|^{{1/4}})$": ("{:.4f}", error / (h * abs(np.log(h)) ** 0.25)),
         }
     study.table(f"e = ‖u − u_h‖_h, critical point {where}", table)
 study.table(

@@ -195,9 +195,9 @@ class Study:
         self.tell(f"\n{title}\n{'=' * len(title)}")
 
     def tell(self, text: str) -> None:
-        """Print on rank 0, and keep nothing."""
+        """Print on rank 0, formulas without their signs, and keep nothing."""
         if comm.rank == 0:
-            print(text, flush=True)
+            print(_plain(text), flush=True)
 
     def say(self, text: str) -> None:
         """Add a paragraph."""
@@ -227,7 +227,8 @@ class Study:
             for row in (rows[0], rule, *rows[1:])
         ]
         self.parts.append("\n".join([f"{caption}\n", *markdown]))
-        self.tell("\n".join(["", caption, *("  ".join(row) for row in rows)]))
+        printed = [[_plain(cell).rjust(len(cell)) for cell in row] for row in rows]
+        self.tell("\n".join(["", caption, *("  ".join(row) for row in printed)]))
 
     def picture(
         self,
@@ -269,6 +270,11 @@ class Study:
         page = "\n\n".join([f"## {self.title}", *self.parts]) + "\n"
         on_root(comm, lambda: path.write_text(page, encoding="utf-8"))
         self.tell(f"\nwritten: {path} and the pictures it shows")
+
+
+def _plain(text: str) -> str:
+    """Formulas as one can read them where nothing sets them."""
+    return text.replace("$", "").replace("\\", "")
 
 
 def _cell(form: str, value: object) -> str:

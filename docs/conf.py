@@ -1,6 +1,7 @@
 """The documentation site: `make docs` builds it from this folder's Markdown and the docstrings."""
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -11,9 +12,19 @@ author = "The signorini_cr authors"
 text = (ROOT / "signorini_cr" / "__init__.py").read_text()
 version = release = re.findall(r'^__version__ = "(.*)"', text, re.M)[0]
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
 exclude_patterns = ["_build"]
 html_theme = "furo"
+# Formulas are drawn by a file of the site's own: it is to be read without a network.
+mathjax = Path(find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
+html_static_path = [str(mathjax / "tex-svg.js")]
+mathjax_path = "tex-svg.js"
 html_title = "signorini_cr"
 # Debian's Sphinx and pip's spell some things differently; words in code are left as they are.
 smartquotes = False

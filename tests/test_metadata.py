@@ -1,6 +1,8 @@
 """What is told of the program in several files is the same in all of them."""
 
+import importlib
 import re
+import runpy
 
 import pytest
 from helpers import ROOT
@@ -24,3 +26,93 @@ def test_the_recipe_asks_for_what_the_environment_has():
         return {line.strip(" -") for line in block[1].splitlines() if "python >" not in line}
 
     assert packages("conda/recipe.yaml", "run") <= packages("environment.yml", "dependencies")
+
+
+def slugs(text):
+    """The anchors that GitHub gives to the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    found = []
+    for heading in re.findall(r"^#+ +(.*?) *#*$", text, re.MULTILINE):
+        words = re.sub(r"!?\[([^]]*)\]\([^)]*\)", r"\1", heading)
+        slug = re.sub(r"[^\w\- ]", "", words.lower()).replace(" ", "-")
+        again = sum(re.fullmatch(re.escape(slug) + r"(-\d+)?", each) is not None for each in found)
+        found.append(f"{slug}-{again}" if again else slug)
+    return set(found)
+
+
+def test_slugs_are_those_of_github():
+    text = "# How to …\n## … give *data*?\n```\n# no\n```\n## A `b_c` κ\n## A [b](c)\n## A b\n"
+    assert slugs(text) == {"how-to-", "-give-data", "a-b_c-κ", "a-b", "a-b-1"}
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("file", ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"])
+def test_links_lead_somewhere(file):
+    text = (ROOT / file).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)", text)
+    assert links
+    for link in links:
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = ROOT / (path or file)
+        assert target.exists(), link
+        if anchor:
+            assert anchor in slugs(target.read_text(encoding="utf-8")), link
+
+
+@pytest.mark.serial
+def test_the_long_description_does_without_the_folder():
+    without = runpy.run_path(str(ROOT / "setup.py"))["without_its_folder"]
+    text = without((ROOT / "README.md").read_text(encoding="utf-8"))
+    assert "](https://" in text and not re.search(r"\]\((?!https://)", text) and "![" not in text
+    assert "a b c" == without("a [b](docs/b.md#x) c")
+
+
+@pytest.mark.serial
+def test_formulas_lead_to_functions():
+    """Those that the certificate's page names exist, and another page tells of each."""
+    docs = ROOT / "docs"
+    names = re.findall(
+        r"\{py:\w+\}`(?:[^`<]*<)?([\w.]+)>?`", (docs / "certificate.md").read_text(encoding="utf-8")
+    )
+    assert len(names) > 30
+    told = "".join((docs / page).read_text(encoding="utf-8") for page in ("inside.md", "python.md"))
+    for name in names:
+        assert re.search(rf":: {re.escape(name)}$", told, re.MULTILINE), name
+        thing = signorini_cr
+        for part in name.split(".")[1:]:
+            module = f"{thing.__name__}.{part}"
+            thing = getattr(thing, part, None) or importlib.import_module(module)
+        assert thing.__doc__, name
+
+
+@pytest.mark.serial
+def test_formulas_keep_their_numbers():
+    """(1) to (6) are what code and other pages call them; what is referred to has a label."""
+    text = (ROOT / "docs" / "certificate.md").read_text(encoding="utf-8")
+    labels = re.findall(r"^\$\$ \(([\w-]+)\)$", text, re.MULTILINE)
+    assert [label.removeprefix("certificate-") for label in labels[:6]] == [
+        "problem", "residual", "gap", "bound", "conforming", "energy",
+    ]  # fmt: skip
+    assert set(re.findall(r"\{eq\}`([\w-]+)`", text)) <= set(labels)
+    assert len(labels) == len(set(labels))
+
+
+@pytest.mark.serial
+def test_what_is_cited_is_in_the_bibliography():
+    """Names with a year have an entry with both, and so have methods named after somebody."""
+    entries = (ROOT / "docs" / "bibliography.md").read_text(encoding="utf-8").splitlines()
+    name = r"[A-Z][a-zäöüé]+"
+    pattern = rf"((?:{name}, )*{name}(?:,? (?:and|&) {name})?),? \(?((?:19|20)\d\d)\b"
+    pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "applications").glob("*.md")]
+    texts = {page.stem: " ".join(page.read_text(encoding="utf-8").split()) for page in pages}
+    texts.pop("bibliography")
+    cited = {found for text in texts.values() for found in re.findall(pattern, text)}
+    assert ("Payne & Weinberger", "1960") in cited and len(cited) >= 5
+    for names, year in cited:
+        people = re.findall(name, names)
+        assert any(all(word in entry for word in (*people, year)) for entry in entries), names
+    for person in ("Marini", "Dörfler"):
+        assert any(person in text for text in texts.values())
+        assert any(f". {person}: " in entry for entry in entries), person
