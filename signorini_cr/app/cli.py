@@ -493,6 +493,7 @@ def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotCon
     if tolerance == 0.0 or not records:
         return None
     from ..errors import NotConverged
+    from ..rounding import at_most
 
     bound = records[-1]["bound_h1"]
     if bound is not None and bound <= tolerance:
@@ -503,7 +504,7 @@ def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotCon
         else f"max_dofs = {case.adaptive['max_dofs']}"
     )
     return NotConverged(
-        f"the certified bound is {bound:.3g}, above the tolerance of {tolerance:g}, and"
+        f"the certified bound is {at_most(bound)}, above the tolerance of {tolerance:g}, and"
         f" {limit} allows no further mesh",
         records[-1]["level"],
     )

@@ -23,6 +23,7 @@ from ..data.loads import NOTHING, Certain, Known, Segments, VolumeMoments, mean_
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
+from ..rounding import at_most, interval
 from .beyond import Beyond
 from .companion import Companion, Lifted, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
@@ -72,10 +73,8 @@ class Certificate:
         """A line."""
         if self.bound_h1 is None or self.energy is None:
             return f"<Certificate: no bound, {self.reason}>"
-        low, high = self.energy
-        return (
-            f"<Certificate: error at most {self.bound_h1:.3g}, energy in [{low:.9g}, {high:.9g}]>"
-        )
+        bound, energy = at_most(self.bound_h1), interval(*self.energy)
+        return f"<Certificate: error at most {bound}, energy in {energy}>"
 
     @cached_property
     def flux(self) -> fem.Function | None:

@@ -9,6 +9,7 @@ import numpy as np
 from .. import compat
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
+from ..rounding import at_most
 from ..solution import Solution
 from .canvas import chains, draw_lines, grouped, headline, log_ticks, plane_axes, save
 
@@ -68,7 +69,7 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
         bar = figure.colorbar(cells, cax=beside)
         log_ticks(bar.ax.yaxis)
         bar.set_label("density of the error", fontsize=12)
-        bound = f"bound {certificate.bound_h1:.3g} on {grouped(len(values))} cells"
+        bound = f"bound {at_most(certificate.bound_h1)} on {grouped(len(values))} cells"
         axes.set_title(headline(title, bound), fontsize=14)
         save(figure, path)
 

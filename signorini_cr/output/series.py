@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import on_root
+from ..rounding import at_most
 from .files import Writer, write_files, write_text
 from .report import FILES, plain
 from .tables import levels_csv
@@ -63,7 +64,7 @@ def row(record: Mapping[str, Any]) -> str:
         f"{record['length']:.3g}",
         f"{record['force']:.6g}",
         f"{record['energy']:.6g}",
-        "none" if bound is None else f"{bound:.3g}",
+        "none" if bound is None else at_most(bound),
     )
     return " ".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS.values(), strict=True))
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy.typing as npt
 
+from ..rounding import at_most, interval, rounded_up
 from .meanings import PRINTED
 from .units import PLAIN, Units
 
@@ -45,7 +45,7 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     """
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
-    facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {_rounded_up(record['bound_h1']):.3g}"]
+    facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {at_most(record['bound_h1'])}"]
     energy = record["energy_bounds"]
     if energy["lower"] is not None and energy["upper"] is not None:
         facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")
@@ -60,15 +60,10 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
 
 
 def _interval(lower: float, upper: float, measured: str = "") -> str:
-    """An interval that holds [lower, upper], with two digits of its width, and its unit."""
+    """An interval that holds [lower, upper], its unit, and its relative width."""
     width, size = upper - lower, max(abs(lower), abs(upper))
-    if not (0.0 < width < math.inf):
-        return f"[{lower!r}, {upper!r}]{measured}"
-    unit = 10.0 ** (math.floor(math.log10(max(width, 1e-15 * size))) - 1)
-    digits = max(math.ceil(math.log10(size / unit)), 1) + 1
-    low, high = math.floor(lower / unit) * unit, math.ceil(upper / unit) * unit
-    share = f"{_rounded_up(100 * width / size, 2):.2g} % wide"
-    return f"[{low:.{digits}g}, {high:.{digits}g}]{measured}, {share}"
+    wide = f", {at_most(100 * width / size, 2)} % wide" if width > 0.0 else ""
+    return f"{interval(lower, upper)}{measured}{wide}"
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:
@@ -80,14 +75,6 @@ def times(records: Sequence[Mapping[str, Any]]) -> str:
     }
     parts = ", ".join(f"{words} {seconds:.2g}" for words, seconds in each.items())
     return f"{sum(each.values()):.2g} s for all levels: {parts}"
-
-
-def _rounded_up(value: float, digits: int = 3) -> float:
-    """To so many digits, never below it."""
-    if not (value > 0 and math.isfinite(value)):
-        return value
-    unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
-    return math.ceil(value / unit) * unit
 
 
 def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None) -> str:
@@ -184,7 +171,7 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
             ("contact", 8, lambda r: _short(r["contact"]["length"])),
         ]
     if bound:
-        columns.append(("bound", 7, lambda r: _short(_rounded_up(r["bound_h1"]))))
+        columns.append(("bound", 7, lambda r: _short(rounded_up(r["bound_h1"]))))
     if bound and exact:
         # Eighty columns: the number of cells gives way, it is in levels.csv
         del columns[1]
