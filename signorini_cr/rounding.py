@@ -32,14 +32,15 @@ def interval(lower: float, upper: float) -> str:
     return f"[{_told(low)}, {_told(_rounded(_exact(upper), last, ROUND_CEILING))}]"
 
 
-def known(value: float, within: float | None, digits: int = 6) -> str:
-    """A figure with the digits that mean something, and two at least.
+def known(value: float, within: float | None, digits: int = 6, least: int = 2) -> str:
+    """A figure with the digits that mean something.
 
     Args:
         value: It.
         within: How wide the interval is that it is known to lie in; two digits of that are told.
             None if nothing is known about it.
         digits: The most there are.
+        least: And the least.
     """
     if not math.isfinite(value) or value == 0.0:
         return told(value)
@@ -47,7 +48,7 @@ def known(value: float, within: float | None, digits: int = 6) -> str:
     first = exact.adjusted()
     last = first - digits + 1
     if within is not None and 0.0 < within < math.inf:
-        last = max(last, min(_last(within), first - 1))
+        last = max(last, min(_last(within), first - least + 1))
     return _told(_rounded(exact, last, ROUND_HALF_EVEN))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Mapping
 from typing import Any
@@ -19,12 +20,15 @@ LONGEST = 50
 """Characters of an expression; what is longer is cut."""
 
 
-def statement(case: ProblemFile, domain: Domain) -> str:
-    """Say what is solved and where, two lines at most for each part of it; collective.
+def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
+    """Say what is solved and where; collective.
 
     Args:
         case: What the file says.
         domain: The coarsest mesh.
+
+    Returns:
+        A line by the name of what it is about.
     """
     mesh, said = domain.mesh, case.said
     unit = case.units.after("x")
@@ -35,20 +39,19 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
 
     def data(key: str, derived: str = "") -> str:
-        left_out = f"{derived} of exact.u".strip() if derived and "exact.u" in said else "0"
-        return _short(said.get(f"data.{key}", left_out))
+        return _short(said.get(f"data.{key}", derived if derived and "exact.u" in said else "0"))
 
     materials = {name: case.said[f"material.{name}"] for name in case.materials}
     own_kappa = any("coefficient" in material for material in materials.values())
     kappa = "κ" if "data.coefficient" in said or own_kappa else ""
-    gain = f" + ({data('reaction')}) u" if "data.reaction" in said else ""
+    gain = f" + {_factor(data('reaction'))} u" if "data.reaction" in said else ""
     if not gain and any("reaction" in material for material in materials.values()):
         gain = " + c u"
     usual = _short(said.get("data.coefficient", 1))
-    equation = f"−∇·(κ∇u){gain} = {data('f', 'that')}, κ = {usual}"
+    equation = f"−∇·(κ∇u){gain} = {data('f', 'f from exact.u')}, κ = {usual}"
     rows = {
         "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}{unit}",
-        "equation": equation if kappa else f"−Δu{gain} = {data('f', 'that')}",
+        "equation": equation if kappa else f"−Δu{gain} = {data('f', 'f from exact.u')}",
     }
     for name, material in materials.items():
         tags = domain.materials
@@ -56,8 +59,8 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         own = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
         rows[name] = f"{', '.join(own) or 'no data of its own'}; {comm.allreduce(number)} cells"
     conditions = {
-        "dirichlet": f"u = {data('dirichlet', 'that')}",
-        "neumann": f"{kappa}∂ₙu = {data('g', 'that')}",
+        "dirichlet": f"u = {data('dirichlet', 'exact.u')}",
+        "neumann": f"{kappa}∂ₙu = {data('g', 'g from exact.u')}",
         "contact": f"u ≥ {data('obstacle')}, {kappa}∂ₙu ≥ 0, one of them an equality",
     }
     for name, part in case.said.items():
@@ -80,6 +83,11 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     helpers = [key.removeprefix("define.") for key in said if key.startswith("define.")]
     if helpers:
         rows["where"] = ", ".join(f"{name} = {_short(said[f'define.{name}'])}" for name in helpers)
+    return rows
+
+
+def folded(rows: Mapping[str, str]) -> str:
+    """A statement for the screen, two lines at most for each part of it."""
     return "\n".join(
         textwrap.fill(
             text,
@@ -97,31 +105,44 @@ def statement(case: ProblemFile, domain: Domain) -> str:
 def _condition(part: Mapping[str, Any], kappa: str, known: bool) -> str:
     """What holds on a part that has a section."""
 
-    def data(key: str, derived: bool = False) -> str:
-        return _short(part.get(key, "that of exact.u" if derived and known else "0"))
-
-    def factor(key: str) -> str:
-        """A number as it is, anything else in parentheses."""
-        text = data(key)
-        return text if text.replace(".", "", 1).isdigit() else f"({text})"
+    def data(key: str, derived: str = "") -> str:
+        return _short(part.get(key, derived if derived and known else "0"))
 
     kind, loss = part["type"], part.get("coefficient", 0) != 0
     flux = f"{kappa}∂ₙu"
     if loss:
-        flux += f" + {factor('coefficient')} (u − {factor('external')})"
+        difference = _minus("u", data("external"))
+        difference = f"({difference})" if difference != "u" else "u"
+        flux += f" + {_factor(data('coefficient'))} {difference}"
     if kind == "dirichlet":
-        return f"u = {data('value', True)}"
+        return f"u = {data('value', 'exact.u')}"
     if kind != "contact":
-        return f"{flux} = {data('g', True)}"
-    gain = f" − {factor('g')}" if part.get("g", 0) != 0 else ""
+        return f"{flux} = {data('g', 'g from exact.u')}"
+    flux = _minus(flux, data("g"))
     if "upper" not in part:
-        return f"u ≥ {data('obstacle')}, {flux}{gain} ≥ 0, one of them an equality"
+        return f"u ≥ {data('obstacle')}, {flux} ≥ 0, one of them an equality"
     if "obstacle" not in part:
-        return f"u ≤ {data('upper')}, {flux}{gain} ≤ 0, one of them an equality"
+        return f"u ≤ {data('upper')}, {flux} ≤ 0, one of them an equality"
     return (
-        f"{data('obstacle')} ≤ u ≤ {data('upper')}, {flux}{gain} ≥ 0 on the lower bound, ≤ 0 on "
+        f"{data('obstacle')} ≤ u ≤ {data('upper')}, {flux} ≥ 0 on the lower bound, ≤ 0 on "
         "the upper, 0 between them"
     )
+
+
+def _factor(text: str) -> str:
+    """What can be multiplied as it is, else in parentheses."""
+    return text if re.fullmatch(r"[\w.]+", text) else f"({text})"
+
+
+def _minus(left: str, right: str) -> str:
+    """A difference as people write it: u − cold, u + 5 for u − (−5), u for u − 0."""
+    try:
+        number = float(right)
+    except ValueError:
+        return f"{left} − {_factor(right)}"
+    if number == 0.0:
+        return left
+    return f"{left} + {right.lstrip('- ')}" if number < 0.0 else f"{left} − {right}"
 
 
 def _short(value: object) -> str:

@@ -189,7 +189,7 @@ STEADY = 1e-12
 LIFT_SHARE = 1e-2
 """What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
 
-NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
+NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
 ADRIFT = "part of the domain has no way to Γ0"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
