@@ -1,12 +1,12 @@
 """The page of a run: complete, on its own, and fit for a narrow screen."""
 
 import html
-import json
 import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
 
+import browser
 import pytest
 from mpi4py import MPI
 
@@ -122,78 +122,16 @@ def test_the_page_of_a_run_in_time(page):
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-MEASURE = """<script>
-addEventListener("load", () => {
-  const shown = [...document.querySelectorAll("body *")].filter(
-    each => [...each.childNodes].some(node => node.nodeType == 3 && node.data.trim()));
-  const cells = [...document.querySelectorAll("th, td")].map(each => {
-    const range = document.createRange();
-    range.selectNodeContents(each);
-    return {text: range.getBoundingClientRect(), row: each.parentNode.rowIndex};
-  });
-  const gaps = cells.slice(1).map((each, i) => each.row == cells[i].row
-    ? each.text.left - cells[i].text.right : 99);
-  const pictures = [...document.images];
-  const small = pictures.map(each => each.clientWidth);
-  document.querySelectorAll("input").forEach(each => each.click());
-  const large = pictures.map(each => each.clientWidth);
-  const element = document.createElement("pre");
-  element.id = "measured";
-  element.textContent = JSON.stringify({
-    width: innerWidth,
-    page: document.documentElement.scrollWidth,
-    loaded: pictures.every(each => each.complete && each.naturalWidth > 500),
-    pictures: pictures.length,
-    fits: small.every(each => each <= innerWidth),
-    full: pictures.every((each, i) => large[i] == each.naturalWidth),
-    letters: Math.min(...shown.map(each => parseFloat(getComputedStyle(each).fontSize))),
-    gap: Math.min(...gaps),
-    requests: performance.getEntriesByType("resource").filter(
-      each => !each.name.startsWith("data:")).map(each => each.name),
-  });
-  document.body.append(element);
-});
-</script>"""
 
 
 @pytest.mark.slow
 @pytest.mark.serial
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here; make browser brings one")
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here; make browser has one")
 @pytest.mark.parametrize("more", ["", TIME], ids=["levels", "steps"])
 def test_a_browser_shows_it_on_a_phone_and_on_a_desk(more, page, tmp_path):
-    """In a frame of that width, as a window has a least one."""
-    path = page(FILE + more, "--levels", "2")
-    text = path.read_text(encoding="utf-8")
-    measured = tmp_path / "measured.html"
-    measured.write_text(text.replace("</head>", f"{MEASURE}</head>"), encoding="utf-8")
-    for width in (390, 1280):
-        found = shown(measured, width, tmp_path)
-        assert found["width"] == width
-        assert found["page"] <= width, "it runs out of the window"
-        assert found["pictures"] == 4 and found["loaded"] and found["fits"]
-        assert found["full"], "a picture that is touched has its full size"
-        assert found["letters"] >= 12
-        assert found["gap"] >= 8, "columns run together"
-        assert found["requests"] == []
-
-
-def shown(path, width, folder):
-    """What the browser measures in a frame of some width."""
-    frame = folder / f"frame-{width}.html"
-    frame.write_text(
-        f'<!DOCTYPE html><iframe src="{path.name}" width="{width}" height="800" '
-        'style="border:0"></iframe><script>addEventListener("load", () => setTimeout(() => '
-        "document.body.append(frames[0].document.getElementById('measured')), 200))</script>",
-        encoding="utf-8",
-    )
-    flags = (
-        "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
-        "--disable-background-networking --disable-component-update --disable-sync "
-        "--allow-file-access-from-files --window-size=1400,900 --virtual-time-budget=10000"
-    ).split()
-    command = [CHROMIUM, *flags, f"--user-data-dir={folder / f'profile-{width}'}", "--dump-dom"]
-    done = subprocess.run(
-        [*command, frame.as_uri()], capture_output=True, text=True, timeout=120, check=True
-    )
-    (found,) = re.findall('<pre id="measured">(.*?)</pre>', done.stdout)
-    return json.loads(html.unescape(found))
+    for frame in browser.frames(page(FILE + more, "--levels", "2")):
+        command = [CHROMIUM, *browser.FLAGS.split(), f"--user-data-dir={tmp_path / frame.stem}"]
+        done = subprocess.run(
+            [*command, frame.as_uri()], capture_output=True, text=True, timeout=120, check=True
+        )
+        assert browser.complaints(frame, done.stdout) == []
