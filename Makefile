@@ -7,7 +7,7 @@ limit = timeout --kill-after=20 1500
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
 .PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair coverage mutants ranks readers \
-    test-package test-wheels lint types clean purge
+    browser test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -70,6 +70,10 @@ ranks:
 readers:
 	$(run) $(limit) $(readers) tests/output/test_vtu.py tests/output/test_notebook.py
 	$(run) $(limit) mpirun -n 2 $(readers) tests/output/test_vtu.py
+
+# The pages of runs at the width of a phone and of a desk, in a browser
+browser:
+	./container/check-browser
 
 # sdist and wheel, built, installed and tried: on the DOLFINx that is there, and on that of pip
 test-package:

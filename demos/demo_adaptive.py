@@ -25,6 +25,7 @@ from study import Study, canvas, levels_wanted, name_curves
 from signorini_cr import Polygon, Problem, exact, plots, solve_adaptive, solve_levels
 from signorini_cr.output.errorplot import plot_error
 from signorini_cr.output.report import level_record, table_header, table_row
+from signorini_cr.rounding import at_most
 
 study = Study("demo_adaptive", "Meshes that adapt, and stop when the error is certified")
 # The limit for a quick look is that of the other demos: each level less is a factor of 4
@@ -130,7 +131,9 @@ study.picture(
 for (name, kind), rows in curves.items():
     late = rows[rows[:, 0] > 0.01 * max_dofs]
     slope = np.polyfit(*np.log(late).T, 1)[0]
-    study.tell(f"{name}, {kind}: bound {rows[-1, 1]:.3e} with {rows[-1, 0]:.0f}, slope {slope:.2f}")
+    study.tell(
+        f"{name}, {kind}: bound {at_most(rows[-1, 1])} with {rows[-1, 0]:.0f}, slope {slope:.2f}"
+    )
     if kind == "adaptive":
         assert abs(slope + 0.5) < 0.08, (name, slope)
     elif name == "L-shape":

@@ -22,6 +22,7 @@ from petsc4py import PETSc
 from study import COLOURS, Study, canvas, levels_wanted, name_curves
 
 from signorini_cr import exact, solve, solve_adaptive, solve_levels
+from signorini_cr.rounding import at_most, interval
 
 study = Study("demo_certificate", "Certified against true error")
 levels = levels_wanted(7)
@@ -55,7 +56,7 @@ for name in NAMES:
         study.tell(
             f"{name:3s} {kind:9s} {dofs[0]:.0f} … {dofs[-1]:.0f} dofs, error {error[-1]:.3e}, "
             f"bound/error {bound[0] / error[0]:.3f} … {bound[-1] / error[-1]:.3f}, "
-            f"J in [{low[-1]:.7f}, {high[-1]:.7f}]"
+            f"J in {interval(low[-1], high[-1])}"
         )
 
 # %% [markdown]
@@ -74,7 +75,8 @@ for tolerance in (1e-9, 1e-5, 1e-4, 1e-3, 1e-2, 0.1):
     stopped.append((residual, error, certificate.bound_h1, certificate.parts["solver"]))
     assert error <= certificate.bound_h1
     study.tell(
-        "residual {:.1e}: error {:.3e}, bound {:.3e}, of which solver {:.1e}".format(*stopped[-1])
+        f"residual {residual:.1e}: error {error:.3e}, bound {at_most(certificate.bound_h1)}, "
+        f"of which solver {certificate.parts['solver']:.1e}"
     )
 for name in ("snes_atol", "ksp_rtol"):
     options.delValue(name)

@@ -18,6 +18,7 @@ from study import comm, levels_wanted
 from signorini_cr import Solution, exact, plots, solve_adaptive, solve_levels
 from signorini_cr.errors import on_root
 from signorini_cr.output import canvas
+from signorini_cr.rounding import at_most
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +51,7 @@ def draw_bounds(axes: Axes, adaptive: Curve, uniform: Curve, points: Curve) -> N
     axes.set_xlim(0.6 * min(dofs), 1.8 * max(dofs))
     axes.set_ylim(0.4 * min(bounds), 1.4 * max(bounds))
     axes.set_xlabel("degrees of freedom", fontsize=13)
-    axes.set_title(f"the error is at most {adaptive[-1][1]:.2g}", fontsize=14)
+    axes.set_title(f"the error is at most {at_most(adaptive[-1][1], 2)}", fontsize=14)
     axes.tick_params(labelsize=11)
     axes.grid(which="major", alpha=0.3)
     canvas.log_ticks(axes.yaxis)

@@ -16,6 +16,7 @@ from .estimate.certificate import Certificate
 from .fem import fields
 from .fem.problem import Problem
 from .mesh.domain import Domain
+from .rounding import at_most
 from .shown import HTML
 from .vi.contact import Contact
 from .vi.level import Level
@@ -53,7 +54,7 @@ class Solution:
             f"{contact.number} facets in contact, force {contact.force:.6g}"
         )
         bound = known and known.bound_h1
-        return line + (">" if bound is None else f", error at most {bound:.3g}>")
+        return line + (">" if bound is None else f", error at most {at_most(bound)}>")
 
     def _repr_html_(self) -> str:
         """A table and a picture, for notebooks; of the certificate what has been made."""

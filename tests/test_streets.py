@@ -12,7 +12,18 @@ import signorini_cr
 
 PACKAGE = Path(signorini_cr.__file__).parent
 FLOORS = (
-    ("arrays", "errors", "jit", "compat", "options", "garbage", "memory", "shown", "__init__"),
+    (
+        "arrays",
+        "errors",
+        "jit",
+        "compat",
+        "options",
+        "garbage",
+        "memory",
+        "shown",
+        "rounding",
+        "__init__",
+    ),
     ("mesh",),
     ("fem",),
     ("data",),

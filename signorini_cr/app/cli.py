@@ -33,7 +33,6 @@ from .screen import Screen, wrapped
 if TYPE_CHECKING:
     from ..errors import NotConverged
     from ..mesh.domain import Domain
-    from ..output.units import Units
     from ..restart import Restart
     from ..solution import Solution
     from .problemfile import ProblemFile
@@ -225,15 +224,15 @@ def _solve_levels(
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged, naming
     from ..output import report as output
-    from ..output.tables import certified, legend, times
+    from ..output.tables import certified, facts, legend, times
     from ..restart import Restart
-    from .statement import statement
+    from .statement import folded, statement
 
     case, domain = _read(args, screen, comm)
     problem = statement(case, domain)
-    screen.line(f"{problem}\n")
+    screen.line(f"{folded(problem)}\n")
     if case.time is not None:
-        _solve_steps(args, screen, comm, folder, case, domain)
+        _solve_steps(args, screen, comm, folder, case, domain, problem)
         return
     element = args.element.upper()
     said = _said(args, case, comm)
@@ -276,7 +275,7 @@ def _solve_levels(
         screen.line("")
         screen.text(legend(records[0], case.units))
         screen.line("")
-        screen.text(_facts(records[-1], case.units))
+        screen.text(facts(records[-1], case.units))
         screen.text(certified(records[-1], case.units))
         screen.text(times(records))
         screen.text(f"written to {folder}: {', '.join(names)}")
@@ -291,18 +290,15 @@ def _solve_steps(
     folder: Path,
     case: ProblemFile,
     domain: Domain,
+    problem: dict[str, str],
 ) -> None:
     """Solve a problem in time; each step is safe in the folder before the next begins."""
     from ..errors import InputError, NotConverged, naming
     from ..output import report as output
     from ..output import series, strip
-    from ..output.tables import certified
+    from ..output.tables import certified, facts
 
-    for name, given in {
-        "--resume": args.resume,
-        "--max-time": args.max_time,
-        "--html": args.html,
-    }.items():
+    for name, given in {"--resume": args.resume, "--max-time": args.max_time}.items():
         if given:
             raise InputError(f"{name}: problems in time have no such option")
     if args.element.upper() != "CR":
@@ -334,11 +330,15 @@ def _solve_steps(
         report["times"] = records
         with naming("--out"):
             names = output.write_output(folder, report, solution, moments=moments)
+            if args.html:
+                names += _write_page(args, comm, folder, problem, report)
         screen.line("")
-        if units := series.legend(case.units):
-            screen.text(f"{units}\n")
-        screen.text(_facts(last, case.units))
+        screen.text(series.legend(case.units))
+        screen.line("")
+        screen.text(f"at the end {facts(last, case.units)}")
+        screen.text(series.certified(records))
         screen.text(f"the last step's own problem, {certified(last, case.units)}")
+        screen.text(series.times(records))
         screen.text(
             f"written to {folder}: {', '.join(names)}, times.csv, series.pvd and its fields"
         )
@@ -350,14 +350,14 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..errors import naming
     from ..output import plots
     from ..output.files import check_writable, write_files
-    from .statement import statement
+    from .statement import folded, statement
 
     folder, picture = _folder(args), "mesh.png"
     with naming("--out"):
         check_writable(folder, [picture], comm)
     case, domain = _read(args, screen, comm)
     screen.line(f"{args.file}: in order")
-    screen.line(statement(case, domain))
+    screen.line(folded(statement(case, domain)))
     if not plots.can_draw(comm):
         screen.text("not drawn: Matplotlib is not installed")
         return DONE
@@ -467,39 +467,20 @@ def _solutions(
 
 
 def _write_page(
-    args: argparse.Namespace, comm: Any, folder: Path, problem: str, report: Any
+    args: argparse.Namespace, comm: Any, folder: Path, problem: dict[str, str], report: Any
 ) -> list[str]:
     """The run as one page; collective."""
     from ..errors import on_root
     from ..output.files import write_files, write_text
     from ..output.page import run_page
-    from ..output.units import Units
 
     def make() -> str:
         source = args.file.read_text(encoding="utf-8")
-        fact = _facts(report["levels"][-1], Units.of(report))
-        return run_page(folder, source, report, args.words, problem, fact)
+        return run_page(folder, source, report, args.words, problem)
 
     name = "report.html"
     write_files(folder, {name: lambda path: on_root(comm, write_text, path, make)}, comm=comm)
     return [name]
-
-
-def _facts(record: dict[str, Any], units: Units) -> str:
-    """What happens on Γ1, in a sentence."""
-    contact = record["contact"]
-    line = (
-        f"contact on {contact['active']} of {contact['facets']} facets, length"
-        f" {contact['length']:.6g}{units.after('x')}, force {contact['force']:.6g}"
-        f"{units.after('force')}"
-    )
-    points = [
-        "(" + ", ".join(f"{value:.6g}" for value in point) + ")" for point in contact["transitions"]
-    ]
-    if points:
-        more = f" and {len(points) - 6} more" if len(points) > 6 else ""
-        line += f"; it begins or ends at {', '.join(points[:6])}{more}{units.after('x')}"
-    return line
 
 
 def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotConverged | None:
@@ -508,6 +489,7 @@ def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotCon
     if tolerance == 0.0 or not records:
         return None
     from ..errors import NotConverged
+    from ..rounding import at_most
 
     bound = records[-1]["bound_h1"]
     if bound is not None and bound <= tolerance:
@@ -518,7 +500,7 @@ def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotCon
         else f"max_dofs = {case.adaptive['max_dofs']}"
     )
     return NotConverged(
-        f"the certified bound is {bound:.3g}, above the tolerance of {tolerance:g}, and"
+        f"the certified bound is {at_most(bound)}, above the tolerance of {tolerance:g}, and"
         f" {limit} allows no further mesh",
         records[-1]["level"],
     )

@@ -90,7 +90,7 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
         if shown != word:
             parser.error(f"{shown}: this is no text in UTF-8, which DOLFINx needs")
     first = own[0] if own else ""
-    if first not in ("-h", "--help", "--version", *commands):
+    if first.split("=")[0] not in ("-h", "--help", "--version", *commands):
         near = difflib.get_close_matches(first, commands, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {' and '.join(commands)}"
         if not first or first.startswith("-"):
@@ -115,8 +115,10 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         prog="signorini-cr",
         description="Signorini problems with the Crouzeix-Raviart element.",
         epilog=f"{EXIT_NOTE} Runs alone or under mpirun -n N.",
+        add_help=False,
         **shared,
     )
+    _add_help(parser)
     parser.add_argument("--version", action="version", version=f"signorini-cr {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     solve = commands.add_parser(
@@ -132,15 +134,7 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         add_help=False,
         **shared,
     )
-    solve.add_argument(
-        "-h",
-        "--help",
-        action=_Help,
-        nargs="?",
-        metavar="columns",
-        help="show this help and exit; with the word columns, what every printed and written figure"
-        " means",
-    )
+    _add_help(solve)
     check = commands.add_parser(
         "check",
         help="validate a problem file and draw its mesh",
@@ -194,6 +188,18 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
     for each in (parser, solve, check):
         vars(each)["color"] = False  # messages are folded, which counts every character
     return parser, {"solve": solve, "check": check}
+
+
+def _add_help(parser: _Parser) -> None:
+    parser.add_argument(
+        "-h",
+        "--help",
+        action=_Help,
+        nargs="?",
+        metavar="columns",
+        help="show this help and exit; with the word columns, what every printed and written figure"
+        " means",
+    )
 
 
 def _directory(text: str) -> Path:

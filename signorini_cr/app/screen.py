@@ -82,7 +82,8 @@ class Screen:
 
     def _put(self, stream: TextIO, text: str) -> None:
         try:
-            stream.write(text)
+            # No-break spaces have done their work; not all terminals know them
+            stream.write(text.replace("\u00a0", " "))
             stream.flush()
         except OSError as error:  # the results are still wanted
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..fem.conditions import Condition
+from ..fem.conditions import Condition, as_factor
 from ..fem.space import facet_measures
 from ..mesh.domain import Domain
 from .problemfile import ProblemFile
@@ -21,12 +21,15 @@ LONGEST = 50
 """Characters of an expression; what is longer is cut."""
 
 
-def statement(case: ProblemFile, domain: Domain) -> str:
-    """Say what is solved and where, two lines at most for each part of it; collective.
+def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
+    """Say what is solved and where; collective.
 
     Args:
         case: What the file says.
         domain: The coarsest mesh.
+
+    Returns:
+        A line by the name of what it is about.
     """
     mesh, said = domain.mesh, case.said
     unit = case.units.after("x")
@@ -39,12 +42,11 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     materials = {name: case.said[f"material.{name}"] for name in case.materials}
     own_kappa = any("coefficient" in material for material in materials.values())
     kappa = "κ" if "data.coefficient" in said or own_kappa else ""
-    gain = f" + ({_short(said['data.reaction'])}) u" if "data.reaction" in said else ""
+    gain = f" + {as_factor(_short(said['data.reaction']))} u" if "data.reaction" in said else ""
     if not gain and any("reaction" in material for material in materials.values()):
         gain = " + c u"
-    usual = _short(said.get("data.coefficient", 1))
-    main = "that of exact.u" if "exact.u" in said else "0"
-    load = _short(said.get("data.f", main))
+    usual, exact = _short(said.get("data.coefficient", 1)), "exact.u" in said
+    load = _short(said.get("data.f", "f from exact.u" if exact else "0"))
     equation = f"−∇·(κ∇u){gain} = {load}, κ = {usual}"
     rows = {
         "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}{unit}",
@@ -56,7 +58,7 @@ def statement(case: ProblemFile, domain: Domain) -> str:
         own = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
         rows[name] = f"{', '.join(own) or 'no data of its own'}; {comm.allreduce(number)} cells"
     for name, (kind, given) in _conditions(said).items():
-        condition = kind.in_words({key: _short(v) for key, v in given.items()}, main, kappa)
+        condition = kind.in_words({key: _short(v) for key, v in given.items()}, exact, kappa)
         measures = facet_measures(mesh, domain.facets(domain.parts[name]))[1]
         number = comm.allreduce(len(measures))
         if number > 0:
@@ -73,6 +75,11 @@ def statement(case: ProblemFile, domain: Domain) -> str:
     helpers = [key.removeprefix("define.") for key in said if key.startswith("define.")]
     if helpers:
         rows["where"] = ", ".join(f"{name} = {_short(said[f'define.{name}'])}" for name in helpers)
+    return rows
+
+
+def folded(rows: Mapping[str, str]) -> str:
+    """A statement for the screen, two lines at most for each part of it."""
     return "\n".join(
         textwrap.fill(
             text,

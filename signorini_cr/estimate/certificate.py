@@ -23,6 +23,7 @@ from ..data.loads import NOTHING, Certain, Known, Segments, VolumeMoments, mean_
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
+from ..rounding import at_most, interval
 from .beyond import Beyond
 from .companion import Companion, Functional, Lifted, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
@@ -72,10 +73,8 @@ class Certificate:
         """A line."""
         if self.bound_h1 is None or self.energy is None:
             return f"<Certificate: no bound, {self.reason}>"
-        low, high = self.energy
-        return (
-            f"<Certificate: error at most {self.bound_h1:.3g}, energy in [{low:.9g}, {high:.9g}]>"
-        )
+        bound, energy = at_most(self.bound_h1), interval(*self.energy)
+        return f"<Certificate: error at most {bound}, energy in {energy}>"
 
     @cached_property
     def flux(self) -> fem.Function | None:
@@ -190,7 +189,7 @@ STEADY = 1e-12
 LIFT_SHARE = 1e-2
 """What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
 
-NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux (see certify, flux_from)"
+NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
 ADRIFT = "part of the domain has no way to Γ0"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 

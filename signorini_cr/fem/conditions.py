@@ -7,6 +7,7 @@ condition for what it adds, and none for its kind; so one more kind is one more 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Self, TypeAlias
@@ -107,15 +108,16 @@ class Condition:
         return None
 
     @classmethod
-    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+    def in_words(cls, said: Mapping[str, str], exact: bool, kappa: str) -> str:
         """Say what holds on the part, with data as they were written.
 
         Args:
             said: What was written for each datum that is given, by name.
-            main: What stands for the main datum where it is not given and may be derived.
+            exact: Whether an exact solution is known, which what is not given may follow from.
             kappa: What stands before ∂ₙu.
         """
-        given = {cls.names()[0]: main, **said}
+        first = cls.names()[0]
+        given = {first: _derived_in_words(first, exact), **said}
         return f"{cls.__name__}: " + ", ".join(f"{name} = {text}" for name, text in given.items())
 
     @property
@@ -168,9 +170,9 @@ class Dirichlet(Condition):
     value: Data | None = None
 
     @classmethod
-    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+    def in_words(cls, said: Mapping[str, str], exact: bool, kappa: str) -> str:
         """Say it as an equation."""
-        return f"u = {said.get('value', main)}"
+        return f"u = {said.get('value', 'exact.u' if exact else '0')}"
 
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
         return given.exact
@@ -192,9 +194,9 @@ class Neumann(Condition):
     g: Data | None = None
 
     @classmethod
-    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+    def in_words(cls, said: Mapping[str, str], exact: bool, kappa: str) -> str:
         """Say it as an equation."""
-        return f"{kappa}∂ₙu = {said.get('g', main)}"
+        return f"{kappa}∂ₙu = {said.get('g', _derived_in_words('g', exact))}"
 
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
         return given.flux
@@ -220,9 +222,9 @@ class Robin(Condition):
     external: Data = field(default=0.0, kw_only=True)
 
     @classmethod
-    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+    def in_words(cls, said: Mapping[str, str], exact: bool, kappa: str) -> str:
         """Say it as an equation."""
-        return f"{_left_in_words(said, kappa)} = {said.get('g', main)}"
+        return f"{_left_in_words(said, kappa)} = {said.get('g', _derived_in_words('g', exact))}"
 
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
         if given.exact is None:
@@ -262,11 +264,11 @@ class Contact(Condition):
     g: Data = field(default=0.0, kw_only=True)
 
     @classmethod
-    def in_words(cls, said: Mapping[str, str], main: str, kappa: str) -> str:
+    def in_words(cls, said: Mapping[str, str], exact: bool, kappa: str) -> str:
         """Say it as inequalities; nothing of it is derived."""
         left = _left_in_words(said, kappa)
         if _matters(said, "g"):
-            left += f" − {_as_factor(said['g'])}"
+            left = _difference(left, said["g"])
         if "upper" not in said:
             return f"u ≥ {said.get('obstacle', '0')}, {left} ≥ 0, one of them an equality"
         if "obstacle" not in said:
@@ -311,8 +313,9 @@ def _left_in_words(said: Mapping[str, str], kappa: str) -> str:
     flux = f"{kappa}∂ₙu"
     if not _matters(said, "coefficient"):
         return flux
-    b, external = (_as_factor(said.get(name, "0")) for name in ("coefficient", "external"))
-    return f"{flux} + {b} (u − {external})"
+    difference = _difference("u", said.get("external", "0"))
+    difference = f"({difference})" if difference != "u" else difference
+    return f"{flux} + {as_factor(said['coefficient'])} {difference}"
 
 
 def _matters(said: Mapping[str, str], name: str) -> bool:
@@ -320,9 +323,25 @@ def _matters(said: Mapping[str, str], name: str) -> bool:
     return said.get(name, "0") not in ("0", "0.0")
 
 
-def _as_factor(text: str) -> str:
-    """A number as it is, anything else in parentheses."""
-    return text if text.replace(".", "", 1).isdigit() else f"({text})"
+def _derived_in_words(name: str, exact: bool) -> str:
+    """Say what a datum is that is not given."""
+    return f"{name} from exact.u" if exact else "0"
+
+
+def as_factor(text: str) -> str:
+    """Write what can be multiplied as it is, anything else in parentheses."""
+    return text if re.fullmatch(r"[\w.]+", text) else f"({text})"
+
+
+def _difference(left: str, right: str) -> str:
+    """Write a difference as people do: u − cold, u + 5 for u − (−5), u for u − 0."""
+    try:
+        number = float(right)
+    except ValueError:
+        return f"{left} − {as_factor(right)}"
+    if number == 0.0:
+        return left
+    return f"{left} + {right.lstrip('- ')}" if number < 0.0 else f"{left} − {right}"
 
 
 def facets_of(domain: Domain, conditions: Sequence[Condition]) -> Int32Array:

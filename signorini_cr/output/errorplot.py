@@ -9,6 +9,7 @@ import numpy as np
 from .. import compat
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
+from ..rounding import at_most
 from ..solution import Solution
 from .canvas import chains, draw_lines, grouped, headline, log_ticks, plane_axes, save
 
@@ -34,6 +35,7 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
         raise InputError("pictures are of plane domains only")
     if certificate.bound_h1 is None or certificate.indicators is None:
         raise InputError(f"there is no bound to draw: {certificate.reason}")
+    bound = at_most(certificate.bound_h1)
     number = len(certificate.indicators)
     corners = mesh.geometry.x[compat.cell_nodes(mesh)[:number, :3], :2]
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -68,8 +70,8 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
         bar = figure.colorbar(cells, cax=beside)
         log_ticks(bar.ax.yaxis)
         bar.set_label("density of the error", fontsize=12)
-        bound = f"bound {certificate.bound_h1:.3g} on {grouped(len(values))} cells"
-        axes.set_title(headline(title, bound), fontsize=14)
+        known = f"bound {bound} on {grouped(len(values))} cells"
+        axes.set_title(headline(title, known), fontsize=14)
         save(figure, path)
 
     on_root(mesh.comm, draw)

@@ -49,6 +49,26 @@ PRINTED = {
 }
 """The columns of the printed table: a few words for the legend, and a sentence."""
 
+OF_STEPS = {
+    "step": ("", "From 1."),
+    "time": ("t at its end", "t at the end of the step."),
+    "newton": PRINTED["newton"],
+    "cg": PRINTED["cg"],
+    "active": PRINTED["active"],
+    "contact": PRINTED["contact"],
+    "force": ("∫_Γ1 λ_h", "Total contact force, ∫_Γ1 λ_h."),
+    "energy": (
+        "J(u_h) of the step's own problem",
+        "J(u_h) of the step's own problem, in which the steps before are data.",
+    ),
+    "bound": (
+        "certified, the H1 error of that problem is not above it",
+        "The error ‖∇_h(u − u_h)‖ of the step's own problem is not above this; none where there "
+        "is no bound. It says nothing of what the length of the steps does to u.",
+    ),
+}
+"""The columns of the table that is printed for a run in time."""
+
 REPORT = {
     "title": "As the problem file has it.",
     "element": '"CR" or "P1".',
@@ -146,6 +166,9 @@ STEP = {
 SECTIONS = {
     "Columns of the printed table and of levels.md": {
         name: meaning for name, (_, meaning) in PRINTED.items()
+    },
+    "Columns that are printed for [time], a line a step": {
+        name: meaning for name, (_, meaning) in OF_STEPS.items()
     },
     "Keys of report.json": REPORT,
     "Keys of a level in report.json; columns of levels.csv, with _ in the place of the dot": LEVEL,

@@ -6,6 +6,7 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
+from ..rounding import at_most, interval
 from . import plots
 from .canvas import as_png, grouped
 
@@ -37,8 +38,8 @@ def as_html(solution: Solution) -> str:
     elif certificate.bound_h1 is None or certificate.energy is None:
         rows["error bound"] = f"none: {certificate.reason}"
     else:
-        rows["error at most"] = f"{certificate.bound_h1:.3g}"
-        rows["energy J(u) in"] = "[{:.9g}, {:.9g}]".format(*certificate.energy)
+        rows["error at most"] = at_most(certificate.bound_h1)
+        rows["energy J(u) in"] = interval(*certificate.energy)
     left, right = 'style="text-align:left"', 'style="text-align:right"'
     table = "".join(
         f"<tr><th {left}>{escape(name)}</th><td {right}>{escape(value)}</td></tr>"

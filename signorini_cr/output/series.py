@@ -7,21 +7,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import on_root
+from ..rounding import at_most, known
 from .files import Writer, write_files, write_text
+from .meanings import OF_STEPS
 from .report import FILES, plain
-from .tables import levels_csv
-from .units import Units
+from .tables import Column, explained, levels_csv, rows_of
+from .units import GLUE, Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
     from ..solution import Solution
 
 TABLE, SERIES, FIELDS = "times.csv", "series.pvd", "step_*.vtu"
-WIDTHS = {
-    "step": 5, "time": 10, "newton": 6, "cg": 4, "active": 6, "contact": 8, "force": 12,
-    "energy": 12, "bound": 9,
-}  # fmt: skip
-"""The columns of the printed table."""
+COLUMNS: tuple[Column, ...] = (
+    ("step", 5, lambda r: str(r["step"])),
+    ("time", 10, lambda r: f"{r['time']:.5g}"),
+    ("newton", 6, lambda r: str(r["newton_iterations"])),
+    ("cg", 4, lambda r: str(r["linear_iterations"])),
+    ("active", 6, lambda r: str(r["active"])),
+    ("contact", 8, lambda r: f"{r['length']:.3g}"),
+    ("force", 12, lambda r: known(r["force"], None, 4)),
+    ("energy", 12, lambda r: known(r["energy"], None, 6)),
+    ("bound", 9, lambda r: "none" if r["bound_h1"] is None else at_most(r["bound_h1"])),
+)
+"""The printed table."""
+
+MEASURED = {"time": "time", "contact": "x", "force": "force"}
+"""The columns whose unit may be told."""
 
 
 def step_record(step: int, time: float, solution: Solution) -> dict[str, Any]:
@@ -48,31 +60,40 @@ def step_record(step: int, time: float, solution: Solution) -> dict[str, Any]:
 
 def header() -> str:
     """The head of the printed table."""
-    return " ".join(f"{name:>{width}}" for name, width in WIDTHS.items())
+    return " ".join(f"{name:>{width}}" for name, width, _ in COLUMNS)
 
 
 def row(record: Mapping[str, Any]) -> str:
     """A row of the printed table."""
-    bound = record["bound_h1"]
-    cells = (
-        str(record["step"]),
-        f"{record['time']:.5g}",
-        str(record["newton_iterations"]),
-        str(record["linear_iterations"]),
-        str(record["active"]),
-        f"{record['length']:.3g}",
-        f"{record['force']:.6g}",
-        f"{record['energy']:.6g}",
-        "none" if bound is None else f"{bound:.3g}",
-    )
-    return " ".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS.values(), strict=True))
+    return " ".join(f"{cell(record):>{width}}" for _, width, cell in COLUMNS)
+
+
+def table_rows(records: Sequence[Mapping[str, Any]], units: Units) -> list[list[str]]:
+    """The cells of the printed table, its head first, which has the units."""
+    return rows_of(COLUMNS, records, MEASURED, units)
 
 
 def legend(units: Units) -> str:
-    """What the printed columns are measured in, as far as that is told."""
-    columns = {"time": "time", "contact": "x", "force": "force"}
-    measured = {name: units.after(key) for name, key in columns.items()}
-    return ", ".join(f"{name} in{unit}" for name, unit in measured.items() if unit)
+    """What the printed columns mean, and what they are measured in, as far as that is told."""
+    return explained({name: OF_STEPS[name][0] for name, *_ in COLUMNS}, MEASURED, units)
+
+
+def certified(records: Sequence[Mapping[str, Any]]) -> str:
+    """What is certain about the steps."""
+    bounds = [record["bound_h1"] for record in records if record["bound_h1"] is not None]
+    if len(bounds) < len(records):
+        return f"{len(records) - len(bounds)} of {len(records)} steps have no bound of the error"
+    return (
+        "certified: in no step is ‖∇_h(u − u_h)‖ of its own problem, in which the steps before"
+        f" are data, above {at_most(max(bounds))}"
+    )
+
+
+def times(records: Sequence[Mapping[str, Any]]) -> str:
+    """How long the steps have taken."""
+    total = sum(record["seconds"] for record in records)
+    whole, each = (known(seconds, None, 2) for seconds in (total, total / len(records)))
+    return f"{whole}{GLUE}s for all {len(records)} steps, {each}{GLUE}s a step"
 
 
 def write_step(folder: Path, records: Sequence[Mapping[str, Any]], solution: Solution) -> None:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy.typing as npt
 
+from ..rounding import at_most, interval, known, rounded_up
 from .meanings import PRINTED
-from .units import PLAIN, Units
+from .units import GLUE, PLAIN, Units
 
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 
@@ -29,11 +29,55 @@ def table_header(first: Mapping[str, Any]) -> str:
 
 def legend(first: Mapping[str, Any], units: Units = PLAIN) -> str:
     """What the printed columns mean, and what they are measured in."""
-    words = {name: PRINTED[name][0] for name, *_ in _columns(first)}
-    for name in MEASURED.keys() & words:
-        if unit := units.after(MEASURED[name]):
-            words[name] += f", in{unit}"
-    return "; ".join(f"{name}: {short}" for name, short in words.items() if short)
+    return explained({name: PRINTED[name][0] for name, *_ in _columns(first)}, MEASURED, units)
+
+
+def explained(words: Mapping[str, str], measured: Mapping[str, str], units: Units) -> str:
+    """A legend: columns, what they mean, and their units.
+
+    Args:
+        words: What the columns mean, by name; those without words are left out.
+        measured: Which unit they have, by name.
+        units: What is told of that.
+    """
+    entries = (
+        f"{name}: {short}{units.within(measured[name]) if name in measured else ''}"
+        for name, short in words.items()
+        if short
+    )
+    return "; ".join(entries)
+
+
+def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
+    """What happens on Γ1, in a sentence, with the digits that are known.
+
+    A place on Γ1 is known to within a facet, the force as well as it is certain.
+
+    Args:
+        record: The last level's.
+        units: What lengths and forces are measured in.
+    """
+    contact, force = record["contact"], record["contact"]["force_bounds"]
+    facet = contact["length"] / contact["active"] if contact["active"] else None
+    wide = None if force["reason"] is not None else force["upper"] - force["lower"]
+    line = (
+        f"contact on {contact['active']} of {contact['facets']} facets, length"
+        f" {known(contact['length'], _ten(facet))}{units.after('x')}, force"
+        f" {known(contact['force'], wide, 4 if wide is None else 6)}{units.after('force')}"
+    )
+    points = [
+        "(" + f",{GLUE}".join(known(value, _ten(facet), least=0) for value in point) + ")"
+        for point in contact["transitions"]
+    ]
+    if points:
+        more = f" and {len(points) - 6} more" if len(points) > 6 else ""
+        line += f"; it begins or ends at {', '.join(points[:6])}{more}{units.after('x')}"
+    return line
+
+
+def _ten(facet: float | None) -> float | None:
+    """Ten facets: the second digit of that is the first of one."""
+    return None if facet is None else 10 * facet
 
 
 def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
@@ -45,7 +89,7 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     """
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
-    facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {_rounded_up(record['bound_h1']):.3g}"]
+    facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {at_most(record['bound_h1'])}"]
     energy = record["energy_bounds"]
     if energy["lower"] is not None and energy["upper"] is not None:
         facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")
@@ -60,15 +104,11 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
 
 
 def _interval(lower: float, upper: float, measured: str = "") -> str:
-    """An interval that holds [lower, upper], with two digits of its width, and its unit."""
+    """An interval that holds [lower, upper], its unit, and its relative width."""
     width, size = upper - lower, max(abs(lower), abs(upper))
-    if not (0.0 < width < math.inf):
-        return f"[{lower!r}, {upper!r}]{measured}"
-    unit = 10.0 ** (math.floor(math.log10(max(width, 1e-15 * size))) - 1)
-    digits = max(math.ceil(math.log10(size / unit)), 1) + 1
-    low, high = math.floor(lower / unit) * unit, math.ceil(upper / unit) * unit
-    share = f"{_rounded_up(100 * width / size, 2):.2g} % wide"
-    return f"[{low:.{digits}g}, {high:.{digits}g}]{measured}, {share}"
+    wide = f", {at_most(100 * width / size, 2)}{GLUE}% wide" if width > 0.0 else ""
+    ends = interval(lower, upper).replace(" ", GLUE)
+    return f"{ends}{measured}{wide}"
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:
@@ -78,16 +118,16 @@ def times(records: Sequence[Mapping[str, Any]]) -> str:
         words: sum(record["seconds"].get(phase) or 0.0 for record in records)
         for phase, words in names.items()
     }
-    parts = ", ".join(f"{words} {seconds:.2g}" for words, seconds in each.items())
-    return f"{sum(each.values()):.2g} s for all levels: {parts}"
+    parts = ", ".join(f"{words} {_time(seconds)}" for words, seconds in each.items())
+    text = f"{_time(sum(each.values()))}{GLUE}s for all levels: {parts}"
+    if len(records) > 1:
+        levels = (sum(r["seconds"].get(phase) or 0.0 for phase in names) for r in records)
+        text += f"; level by level {', '.join(map(_time, levels))}"
+    return text
 
 
-def _rounded_up(value: float, digits: int = 3) -> float:
-    """To so many digits, never below it."""
-    if not (value > 0 and math.isfinite(value)):
-        return value
-    unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
-    return math.ceil(value / unit) * unit
+def _time(seconds: float) -> str:
+    return known(seconds, None, 2)
 
 
 def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None) -> str:
@@ -98,8 +138,8 @@ def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None)
 def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> str:
     """The printed table in Markdown, units in its head."""
     columns = _columns(records[0]) if records else []
-    rows = [_heads(columns, units), [(w - 1) * "-" + ":" for _, w, _ in columns]]
-    rows += [[cell(record) for _, _, cell in columns] for record in records]
+    head, *rows = rows_of(columns, records, MEASURED, units)
+    rows = [head, [(w - 1) * "-" + ":" for _, w, _ in columns], *rows]
     lines = (
         " | ".join(f"{text:>{width}}" for text, (_, width, _) in zip(row, columns, strict=True))
         for row in rows
@@ -109,17 +149,26 @@ def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -
 
 def table_rows(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> list[list[str]]:
     """The cells of the printed table, its head first, which has the units."""
-    columns = _columns(records[0])
-    return [
-        _heads(columns, units),
-        *([cell(record) for _, _, cell in columns] for record in records),
-    ]
+    return rows_of(_columns(records[0]), records, MEASURED, units)
 
 
-def _heads(columns: Sequence[Column], units: Units) -> list[str]:
-    measured = {name: units.after(key) for name, key in MEASURED.items()}
-    return [f"{name}, {unit}" if (unit := measured.get(name, "").strip()) else name
-            for name, _, _ in columns]  # fmt: skip
+def rows_of(
+    columns: Sequence[Column],
+    records: Sequence[Mapping[str, Any]],
+    measured: Mapping[str, str],
+    units: Units,
+) -> list[list[str]]:
+    """The cells of a table, its head first.
+
+    Args:
+        columns: Name, width and contents of each.
+        records: One a row.
+        measured: Which unit the columns have, by name.
+        units: What is told of that.
+    """
+    told = {name: units.after(key).strip() for name, key in measured.items()}
+    head = [f"{name}, {told[name]}" if told.get(name) else name for name, *_ in columns]
+    return [head, *([cell(record) for _, _, cell in columns] for record in records)]
 
 
 def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
@@ -180,16 +229,24 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
         ]
     else:
         columns += [
-            ("energy", 12, lambda r: "-" if r["energy"] is None else f"{r['energy']:.7g}"),
+            ("energy", 12, _energy),
             ("contact", 8, lambda r: _short(r["contact"]["length"])),
         ]
     if bound:
-        columns.append(("bound", 7, lambda r: _short(_rounded_up(r["bound_h1"]))))
+        columns.append(("bound", 7, lambda r: _short(rounded_up(r["bound_h1"]))))
     if bound and exact:
         # Eighty columns: the number of cells gives way, it is in levels.csv
         del columns[1]
         columns.append(("eff.", 4, lambda r: _fixed(r["effectivity"])))
     return columns
+
+
+def _energy(record: Mapping[str, Any]) -> str:
+    """J(u_h) with the digits that J(u) has for certain."""
+    if record["energy"] is None:
+        return "-"
+    low, high = (record["energy_bounds"][end] for end in ("lower", "upper"))
+    return known(record["energy"], None if low is None or high is None else high - low, 7)
 
 
 def _short(value: float | None) -> str:

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+GLUE = "\u00a0"
+"""The space between a number and its unit."""
+
 
 @dataclass(frozen=True)
 class Units:
@@ -43,9 +46,9 @@ class Units:
         return {key: words for key, words in told.items() if words}
 
     def after(self, key: str) -> str:
-        """The unit as it follows a number, with a space before it."""
+        """The unit as it follows a number, with a space before it at which no line breaks."""
         unit = getattr(self, key)
-        return f" {unit}" if unit else ""
+        return f"{GLUE}{unit}" if unit else ""
 
     def within(self, key: str) -> str:
         """The unit as it follows a name in a picture, " in m" for one."""

@@ -89,7 +89,10 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         return
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 80
-    assert "t from 0 to 1.5 in 6 steps of euler; 2 ∂u/∂t" in " ".join(printed.split())
+    flat = " ".join(printed.split())
+    assert "t from 0 to 1.5 in 6 steps of euler; 2 ∂u/∂t" in flat
+    for words in ("force: ∫_Γ1 λ_h; ", "certified: in no step is ", "s for all 6 steps, "):
+        assert words in flat
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     with (out / "times.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -143,7 +146,7 @@ def test_what_makes_no_sense_in_time(old, new, said, case, shared_tmp_path, capf
         assert not out.exists()
 
 
-@pytest.mark.parametrize("option", ["--resume", "--html", "--max-time=9", "--element=p1"])
+@pytest.mark.parametrize("option", ["--resume", "--max-time=9", "--element=p1"])
 def test_options_that_do_not_go_with_time(option, case, shared_tmp_path, capfd):
     assert main(["solve", str(case()), "--out", str(shared_tmp_path / "out"), option]) == 2
     if COMM.rank == 0:

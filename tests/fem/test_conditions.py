@@ -259,5 +259,5 @@ def test_one_form_is_compiled_for_all_numbers(element):
 
 
 def test_a_kind_that_has_no_words_of_its_own_is_called_by_its_name():
-    assert Spring.in_words({}, "0", "κ") == "Spring: g = 0"
+    assert Spring.in_words({}, False, "κ") == "Spring: g = 0"
     assert Spring.in_words({"g": "x"}, "0", "κ") == "Spring: g = x"

@@ -1,11 +1,19 @@
 """The page of a run: complete, on its own, and fit for a narrow screen."""
 
+import html
+import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 
+import browser
 import pytest
 from mpi4py import MPI
 
 from signorini_cr.app.cli import main
+from signorini_cr.output.meanings import OF_STEPS
+
+COMM = MPI.COMM_WORLD
 
 FILE = """title = "price < 5 & more"
 [domain]
@@ -13,9 +21,17 @@ vertices = [[0, 0], [1, 0], [1, 1], [0, 1]]
 boundary = ["contact", "dirichlet", "dirichlet", "dirichlet"]
 size = 0.5
 [data]
-f = "-1"
+f = "-1 - 0.001*x - 0.001*y - 0.001*x*y - 0.001*x*x"
 obstacle = "-0.01"
 """
+TIME = """[time]
+end = 1
+steps = 7
+[units]
+x = "m"
+time = "h"
+"""
+VOID = {"meta", "img", "input"}
 
 
 class Reader(HTMLParser):
@@ -28,7 +44,7 @@ class Reader(HTMLParser):
         self.links += [value for name, value in attrs if name in ("src", "href")]
         if tag == "meta":
             self.metas.append(dict(attrs).get("name"))
-        elif tag != "img":
+        if tag not in VOID:
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -38,29 +54,84 @@ class Reader(HTMLParser):
         self.text += data
 
 
-def test_the_page_holds_everything_and_points_nowhere(shared_tmp_path):
+@pytest.fixture
+def page(shared_tmp_path):
+    """Solves a file and gives the path of its page."""
     pytest.importorskip("matplotlib")
-    path, folder = shared_tmp_path / "case.toml", shared_tmp_path / "out"
-    if MPI.COMM_WORLD.rank == 0:
-        path.write_text(FILE, encoding="utf-8")
-    MPI.COMM_WORLD.Barrier()
-    words = ["solve", str(path), "--out", str(folder), "--levels", "2", "--html", "--quiet"]
-    assert main(words) == 0
-    page = (folder / "report.html").read_text(encoding="utf-8")
+
+    def solve(text, *more):
+        path, folder = shared_tmp_path / "case.toml", shared_tmp_path / "out"
+        if COMM.rank == 0:
+            path.write_text(text, encoding="utf-8")
+        COMM.Barrier()
+        assert main(["solve", str(path), "--out", str(folder), "--html", "--quiet", *more]) == 0
+        return folder / "report.html"
+
+    return solve
+
+
+def read(path):
+    text = path.read_text(encoding="utf-8")
     reader = Reader()
-    reader.feed(page)
+    reader.feed(text)
     assert reader.open == []
-    assert len(reader.links) == 4
     assert all(link.startswith("data:image/png;base64,") for link in reader.links)
-    assert not reader.tags & {"script", "link", "iframe", "object"} and "url(" not in page
-    assert "viewport" in reader.metas and "max-width:100%" in page
+    assert not reader.tags & {"script", "link", "iframe", "object"} and "url(" not in text
+    assert "viewport" in reader.metas and "max-width:100%" in text
+    reader.text = reader.text.replace("\u00a0", " ")
+    return reader
+
+
+def test_the_page_holds_everything_and_points_nowhere(page):
+    reader = read(page(FILE, "--levels", "2"))
+    assert len(reader.links) == 4
     for part in (
         FILE,
         "signorini-cr solve",
         "--levels 2",
         "dolfinx",
         "certified: ",
-        "equation   −Δu = -1",
+        "−Δu = -1 - 0.001*x - 0.001*y - 0.001*x*y - 0.001*x*x",  # not folded
         " % wide",
     ):
         assert part in reader.text
+
+
+def test_the_page_of_a_run_in_time(page):
+    path = page(FILE + TIME, "--levels", "2")
+    reader = read(path)
+    assert len(reader.links) == 4  # the strip, mesh, the end's solution and contact
+    for part in (
+        FILE + TIME,
+        "signorini-cr solve",
+        "dolfinx",
+        "in 7 steps of euler",
+        "certified: in no step is ",
+        "the last step's own problem, certified: ",
+        "s for all 7 steps",
+        "series.pvd opens the fields of all steps",
+        "time: t at its end in h",
+    ):
+        assert part in reader.text
+    text = path.read_text(encoding="utf-8")
+    (table,) = re.findall("<table>.*?</table>", text)
+    head, *rows = table.split("<tr>")[1:]
+    names = [html.unescape(name).split(",")[0] for name in re.findall("<th>(.*?)</th>", head)]
+    assert names == list(OF_STEPS) and len(rows) == 7
+    assert "time, h" in html.unescape(head)
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here; make browser has one")
+@pytest.mark.parametrize("more", ["", TIME], ids=["levels", "steps"])
+def test_a_browser_shows_it_on_a_phone_and_on_a_desk(more, page, tmp_path):
+    for frame in browser.frames(page(FILE + more, "--levels", "2")):
+        command = [CHROMIUM, *browser.FLAGS.split(), f"--user-data-dir={tmp_path / frame.stem}"]
+        done = subprocess.run(
+            [*command, frame.as_uri()], capture_output=True, text=True, timeout=120, check=True
+        )
+        assert browser.complaints(frame, done.stdout) == []

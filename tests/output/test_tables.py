@@ -5,7 +5,16 @@ import re
 import pytest
 
 from signorini_cr.output import series
-from signorini_cr.output.tables import certified, legend, markdown_table, table_header, times
+from signorini_cr.output.meanings import OF_STEPS, PRINTED
+from signorini_cr.output.tables import (
+    certified,
+    facts,
+    legend,
+    markdown_table,
+    table_header,
+    table_row,
+    times,
+)
 from signorini_cr.output.units import Units
 
 RECORD = {
@@ -19,11 +28,16 @@ RECORD = {
 }  # fmt: skip
 
 
+def plain(text):
+    """With spaces that break."""
+    return text.replace("\u00a0", " ")
+
+
 @pytest.mark.parametrize("factor", [1.0, 1e-9, 123.456, 7.1e5])
 @pytest.mark.parametrize("bound", [0.26683801, 1.0, 0.1, 0.999999, 2.5e-7])
 def test_what_is_printed_as_certain_is_certain(factor, bound):
     ends = {end: factor * value for end, value in RECORD["energy_bounds"].items()}
-    text = certified(RECORD | {"bound_h1": factor * bound, "energy_bounds": ends})
+    text = plain(certified(RECORD | {"bound_h1": factor * bound, "energy_bounds": ends}))
     number = r"(-?[\d.]+(?:e[+-]?\d+)?)"
     least = float(re.search(f"at most {number};", text)[1])
     low, high, wide = map(float, re.search(rf"\[{number}, {number}\], {number} %", text).groups())
@@ -43,7 +57,7 @@ def test_no_bound_no_figures():
 @pytest.mark.parametrize("lower, upper", [(0.24871234, 0.25131234), (0.0, 3.1), (0.25, 0.25)])
 def test_the_force_that_is_printed_is_certain(lower, upper):
     bounds = {"lower": lower, "upper": upper, "reason": None}
-    text = certified(RECORD | {"contact": {"force_bounds": bounds}})
+    text = plain(certified(RECORD | {"contact": {"force_bounds": bounds}}))
     low, high = map(float, re.search(r"the contact force is in \[(.*?), (.*?)\]", text).groups())
     assert low <= lower and upper <= high
     assert high - low <= 1.21 * (upper - lower)
@@ -53,29 +67,86 @@ def test_no_force_but_a_reason():
     bounds = {"lower": None, "upper": None, "reason": "they touch"}
     inflow = {"value": 1.0, "lower": 0.9, "upper": 1.1, "reason": None}
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"inflow": inflow}}
-    text = certified(record)
+    text = plain(certified(record))
     assert "; the contact force has no bounds: they touch; inflow is in [0.9, 1.1]" in text
 
 
-def test_every_printed_column_has_its_word():
-    told = {entry.split(":")[0] for entry in legend(RECORD).split("; ")}
-    assert set(table_header(RECORD).split()) - {"level", "cells"} == told
+@pytest.mark.parametrize("exact", [None, 0.5])
+def test_every_printed_column_has_its_word(exact):
+    record = RECORD | {"error_h1": exact}
+    told = [entry.split(":")[0] for entry in legend(record).split("; ")]
+    head = re.sub("(H1|L2) error", r"\1_error", table_header(record)).split()
+    named = [name.replace("_", " ") for name in head if name not in ("level", "cells")]
+    assert list(dict.fromkeys(named)) == told and set(told) <= set(PRINTED)
+
+
+def test_every_column_of_the_steps_has_its_meaning():
+    head = series.header().split()
+    assert head == list(OF_STEPS) and all(meaning for _, meaning in OF_STEPS.values())
+    told = [entry.split(":")[0] for entry in series.legend(Units()).split("; ")]
+    assert told == head[1:]  # step is a number
+
+
+@pytest.mark.parametrize(
+    ("contact", "told"),
+    [
+        (
+            {"active": 52, "length": 2.6, "force": 71.4537, "transitions": [[0.0151051, 0.3]],
+             "force_bounds": {"lower": 0.0, "upper": 170.0, "reason": None}},
+            "length 2.6, force 71; it begins or ends at (0.02, 0.3)",
+        ),
+        (
+            {"active": 3, "length": 0.333333, "force": 0.771593, "transitions": [[0.002, 1e-17]],
+             "force_bounds": {"lower": None, "upper": None, "reason": "they touch"}},
+            "length 0.33, force 0.7716; it begins or ends at (0, 0)",
+        ),
+        (
+            {"active": 0, "length": 0.0, "force": 0.0, "transitions": [],
+             "force_bounds": {"lower": 0.0, "upper": 0.0, "reason": None}},
+            "length 0, force 0",
+        ),
+    ],
+)  # fmt: skip
+def test_places_and_forces_have_the_digits_that_are_known(contact, told):
+    text = plain(facts({"contact": {"facets": 80, **contact}}))
+    assert text == f"contact on {contact['active']} of 80 facets, {told}"
+
+
+def test_energies_have_the_digits_that_are_known():
+    record = RECORD | {"energy": -2.685465123}
+    assert table_row(record).split()[7] == "-2.68547"
+    unknown = {"lower": None, "upper": None}
+    assert table_row(record | {"energy_bounds": unknown}).split()[7] == "-2.685465"
+
+
+def test_nothing_breaks_between_a_number_and_its_unit():
+    text = certified(RECORD, Units(force="N"))
+    assert "\u00a0% wide" in text and ",\u00a0-2.68" in text
 
 
 def test_units_stand_where_their_figures_are():
     units = Units(x="mm", force="N/mm")
     bounds = {"lower": 0.9, "upper": 1.1, "reason": None}
     record = RECORD | {"contact": {"active": 2, "length": 1.0, "force_bounds": bounds}}
-    plain, told = certified(record), certified(record, units)
-    assert told == plain.replace("1.1],", "1.1] N/mm,") != plain
-    entries = dict(entry.split(": ") for entry in legend(record, units).split("; "))
-    assert {name for name in entries if entries[name].endswith(", in mm")} == {"h", "contact"}
+    bare, told = plain(certified(record)), plain(certified(record, units))
+    assert told == bare.replace("1.1],", "1.1] N/mm,") != bare
+    entries = dict(entry.split(": ") for entry in plain(legend(record, units)).split("; "))
+    assert {name for name in entries if entries[name].endswith(" in mm")} == {"h", "contact"}
     heads = [head.strip() for head in markdown_table([record], units).split("\n")[0].split("|")]
     assert {"h, mm", "contact, mm"} < set(heads)
-    assert series.legend(Units(time="h", x="m")) == "time in h, contact in m"
+    entries = plain(series.legend(Units(time="h", x="m"))).split("; ")
+    measured = [entry.split(":")[0] for entry in entries if re.search(" in (h|m)$", entry)]
+    assert measured == ["time", "contact"]
     assert Units.of({**units.record()}) == units and Units().record() == {}
 
 
 def test_times_add_up():
-    text = times([RECORD, RECORD])
-    assert text == "3.5 s for all levels: meshes 1, assembly 0.5, solver 2, certificate 0"
+    text = plain(times([RECORD, RECORD]))
+    parts = "meshes 1, assembly 0.5, solver 2, certificate 0"
+    assert text == f"3.5 s for all levels: {parts}; level by level 1.8, 1.8"
+    assert (
+        plain(times([RECORD])) == "1.8 s for all levels: meshes 0.5, assembly 0.25, "
+        "solver 1, certificate 0"
+    )
+    steps = [{"seconds": 80.0}, {"seconds": 70.0}]
+    assert plain(series.times(steps)) == "150 s for all 2 steps, 75 s a step"

@@ -1,0 +1,79 @@
+"""Figures as people read them: what is certain stays certain, the rest has no digits to spare.
+
+A number is what its shortest decimals say, as those that print floats take it.
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
+
+
+def rounded_up(value: float, digits: int = 3) -> float:
+    """The least number of so many digits that is not below a value; not finite, as it is."""
+    if not math.isfinite(value) or value == 0.0:
+        return value
+    exact = _exact(value)
+    return float(_rounded(exact, exact.adjusted() - digits + 1, ROUND_CEILING))
+
+
+def at_most(value: float, digits: int = 3) -> str:
+    """A bound from above in so many digits; what is printed is not below it."""
+    return told(rounded_up(value, digits))
+
+
+def interval(lower: float, upper: float) -> str:
+    """An interval that holds [lower, upper], with two digits of its width."""
+    width = upper - lower
+    if not (0.0 < width < math.inf):
+        return f"[{lower!r}, {upper!r}]"
+    last = _last(max(width, 1e-15 * max(abs(lower), abs(upper))))
+    low = _rounded(_exact(lower), last, ROUND_FLOOR)
+    return f"[{_told(low)}, {_told(_rounded(_exact(upper), last, ROUND_CEILING))}]"
+
+
+def known(value: float, within: float | None, digits: int = 6, least: int = 2) -> str:
+    """A figure with the digits that mean something.
+
+    Args:
+        value: It.
+        within: How wide the interval is that it is known to lie in; two digits of that are told.
+            None if nothing is known about it.
+        digits: The most there are.
+        least: And the least.
+    """
+    if not math.isfinite(value) or value == 0.0:
+        return told(value)
+    exact = _exact(value)
+    first = exact.adjusted()
+    last = first - digits + 1
+    if within is not None and 0.0 < within < math.inf:
+        last = max(last, min(_last(within), first - least + 1))
+    return _told(_rounded(exact, last, ROUND_HALF_EVEN))
+
+
+def told(value: float) -> str:
+    """A number that has few digits, in them; 100 as 100, not as 1e+02."""
+    return _told(_exact(value)) if math.isfinite(value) else str(value)
+
+
+def _exact(value: float) -> Decimal:
+    return Decimal(repr(float(value)))
+
+
+def _last(width: float) -> int:
+    """The power of ten of the second digit."""
+    return math.floor(math.log10(width)) - 1
+
+
+def _rounded(value: Decimal, last: int, way: str) -> Decimal:
+    return value.quantize(Decimal((0, (1,), last)), rounding=way)
+
+
+def _told(number: Decimal) -> str:
+    if number == 0:
+        return "0"
+    number = number.normalize()
+    if -5 <= number.adjusted() < 10:
+        return f"{number:f}"
+    return f"{number:e}"
