@@ -133,11 +133,15 @@ class Tensor:
         self.fine = Rule(mesh, KAPPA_DEGREE)
         self._compiled: dict[int, fem.Expression] = {}
 
-    def at(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
-        """Values at points of some owned cells, the symmetric part, shape (cells, q, d, d)."""
+    def prepare(self, rule: Rule) -> None:
+        """Compile what evaluates at a rule's points; collective where that has not been done."""
         if rule.degree not in self._compiled:
             rows = ufl.as_vector(self.entries)
             self._compiled[rule.degree] = compat.compile_expression(rows, rule.points, self._mesh)
+
+    def at(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
+        """Values at points of some owned cells, the symmetric part, shape (cells, q, d, d)."""
+        self.prepare(rule)
         which = np.arange(part.start, part.stop, dtype=np.int32)
         found = compat.bound(self._compiled[rule.degree], domain.own).eval(domain.mesh, which)
         found = found.reshape(len(which), len(rule.weights), self._d, self._d)
@@ -217,7 +221,7 @@ class Coefficient:
         self.least, self.most = eigenvalues[:, 0], eigenvalues[:, -1]
         off = np.zeros((means[0].size if len(means) else cells.tdim**2, len(means)))
         for row, entry, mean in zip(
-            off, kappa.entries, means.reshape(len(means), -1).T, strict=True
+            off, kappa.entries, means.reshape(-1, len(off)).T, strict=True
         ):
             found = range_of(entry, cells)
             if found is None:
@@ -228,6 +232,7 @@ class Coefficient:
         varies = bool((off > STEADY * np.abs(means).max(axis=(1, 2), initial=0.0)).any())
         if cells.comm.allreduce(varies, op=MPI.LOR):
             self.tensor, self.rule, self.spread = kappa, kappa.fine, theta
+            kappa.prepare(kappa.fine)  # here, as a rank without cells never asks for values
             deviations = [Deviation(entry) for entry in kappa.entries]
 
             def errors(boxes: Boxes, half: FloatArray) -> FloatArray:

@@ -185,7 +185,7 @@ class Parents:
         owner[index_map.size_local :] = index_map.owners
         nodes = coarse.cells.ravel()
         of_cells = np.column_stack([index_map.local_to_global(nodes), owner[nodes]])
-        told = self._exchange.fetch(of_cells.reshape(len(coarse.cells), -1)).reshape(-1, 2)
+        told = self._exchange.fetch(of_cells.reshape(-1, 2 * coarse.cells.shape[1])).reshape(-1, 2)
         number, owner = told.T
         others = (number < first) | (number >= end)
         ghosts, at, place = np.unique(number[others], return_index=True, return_inverse=True)

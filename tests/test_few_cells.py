@@ -1,0 +1,100 @@
+"""Fewer cells than ranks: whoever has none takes part in everything, and nothing else changes."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Material,
+    Polygon,
+    Problem,
+    Robin,
+    Solution,
+    solve_adaptive,
+    solve_in_time,
+    solve_levels,
+)
+from signorini_cr.restart import Restart
+
+pytestmark = [pytest.mark.slow, pytest.mark.ranks]
+
+COMM = MPI.COMM_WORLD
+PLAIN = Problem(f=-3.0, obstacle=-0.2)
+
+
+def tensor(x: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
+    return ufl.as_matrix([[2 + x[0], 0.5 * x[1]], [0.5 * x[1], 1 + 0 * x[0]]])
+
+
+PROBLEMS = {
+    "plain": PLAIN,
+    "tensor": Problem(f=-3.0, obstacle=-0.2, coefficient=tensor),
+    "varying": Problem(
+        f=lambda x: -3.0 - ufl.sin(5.0 * x[0]),
+        g=lambda x: x[1] ** 2,
+        obstacle=lambda x: -0.2 + 0.1 * ufl.sin(4.0 * x[0]),
+        dirichlet=lambda x: 0.1 * x[0],
+        coefficient=lambda x: ufl.exp(x[0] * x[1]),
+        reaction=2.0,
+    ),
+    "parts": Problem(
+        f=lambda x: -3.0 * ufl.exp(x[0]),
+        conditions={
+            "contact": Contact(obstacle=-0.2, upper=0.1, coefficient=0.5, external=-1.0),
+            "dirichlet": Dirichlet(0.0),
+            "neumann": Robin(coefficient=1.5, external=0.3),
+        },
+        materials={"soft": Material(coefficient=0.1, f=lambda x: -1.0 - x[0], reaction=2.0)},
+    ),
+    "exact": Problem(exact=lambda x: x[0] ** 3 - 3.0 * x[0] * x[1] ** 2, obstacle=-9.0),
+}
+
+
+def solved(
+    kind: str, problem: Problem, comm: MPI.Comm, restart: Restart | None = None
+) -> Iterator[Solution]:
+    """On a triangle, which gmsh cuts into two."""
+    labels = ["contact", "dirichlet", "neumann"]
+    materials = {"soft": np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])}
+    polygon = Polygon(
+        [[0, 0], [1, 0], [0, 1]], labels, materials=materials if problem.materials else {}
+    )
+    domain = polygon.mesh(1.0, comm)
+    if kind == "adaptive":
+        return solve_adaptive(problem, domain, levels=5, restart=restart)
+    return solve_levels(problem, domain, 3, "P1" if kind == "p1" else "CR", restart=restart)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("kind", ["uniform", "adaptive", "p1"])
+def test_the_figures_are_those_of_one_rank(kind: str, name: str) -> None:
+    restart = None
+    for one, all_ranks in zip(
+        solved(kind, PROBLEMS[name], MPI.COMM_SELF),
+        solved(kind, PROBLEMS[name], COMM),
+        strict=True,
+    ):
+        assert one.cells == all_ranks.cells
+        assert one.energy == pytest.approx(all_ranks.energy, rel=1e-8)
+        bounds = [each.certificate.bound_h1 for each in (one, all_ranks)]
+        assert bounds[0] == (bounds[1] and pytest.approx(bounds[1], rel=1e-6))
+        assert one.errors == (one.errors and pytest.approx(all_ranks.errors, rel=1e-6))
+        restart = Restart.of(all_ranks, restart, kind == "adaptive")
+    (again,) = solved(kind, PROBLEMS[name], COMM, COMM.bcast(restart))
+    assert again.energy == pytest.approx(one.energy, rel=1e-8)
+
+
+def in_time(comm: MPI.Comm, scheme: str) -> list[float]:
+    domain = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]).mesh(1.0, comm)
+    steps = solve_in_time(PLAIN, domain, end=1.0, steps=3, scheme=scheme, levels=2)
+    return [solution.energy for _, solution in steps]
+
+
+@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+def test_so_are_those_in_time(scheme: str) -> None:
+    assert in_time(COMM, scheme) == pytest.approx(in_time(MPI.COMM_SELF, scheme), rel=1e-8)
