@@ -485,7 +485,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
 
 
 def _forces(alpha: OnParts, flux: Flux) -> dict[int, float]:
-    """This rank's share of the contact force on each part, by the part's number."""
+    """Return this rank's share of the contact force on each part, by the part's number."""
     found: dict[int, float] = {}
     first = 0
     for part in alpha.parts:
@@ -498,7 +498,7 @@ def _forces(alpha: OnParts, flux: Flux) -> dict[int, float]:
 
 
 def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
-    """About how large the bound will be: ‖p‖, but for κ within cells; collective.
+    """Estimate the bound: ‖p‖, but for κ within cells; collective.
 
     Where that is next to nothing, as without a load, the jumps of u_h tell.
     """
@@ -530,7 +530,7 @@ def _rounding(
     load: VolumeMoments,
     flux: Flux,
 ) -> float:
-    """What rounding may do to ‖p ± b‖; collective.
+    """Bound what rounding may do to ‖p ± b‖; collective.
 
     Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
     is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
@@ -557,7 +557,7 @@ def _rounding(
 
 
 def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
-    """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
+    """Bound what quadrature may have missed of f and g: shares of ω and of J(v); collective.
 
     On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
     on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise. Whatever the signs of the first
@@ -594,7 +594,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
 
 
 def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, float, float]:
-    """Bounds of what ℓ changes, this rank's shares.
+    """Bound what ℓ changes, this rank's shares.
 
     Returns:
         ℓ's energy norm squared, how far J(v + ℓ) may be from J(v), and what ‖p − b‖² and ‖p + b‖²

@@ -614,7 +614,7 @@ def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
 def _promise(
     cells: Cells, kappa: FloatArray, excess: FloatArray, bumps: FloatArray, loose: BoolArray
 ) -> float:
-    """What ‖κ^{1/2}(∇v − ∇u_h)‖² would fall by if each vertex were put right as if it were alone.
+    """Return what ‖κ^{1/2}(∇v − ∇u_h)‖² would fall by if each vertex were put right alone.
 
     Args:
         cells: The mesh.

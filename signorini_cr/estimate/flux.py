@@ -18,6 +18,7 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import NOTHING, Known, VolumeMoments, reacts, to_cells
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..vi.active import touching
 from .beyond import Beyond
 from .descent import descend, nonzero
 
@@ -105,12 +106,11 @@ def equilibrate(
     for part in blocks(cells.number):
         excess[:, part] -= half[cells.facets[:, part]]
     there = on_contact.local, on_contact.cells
-    # In contact: the primal-dual criterion with the facet's diagonal entry of A
     diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
     force, through = fluxes[there] - known[on_contact.dofs], known[on_contact.dofs]
     force *= signs
-    touching = force > np.maximum(diagonal * gap, 0.0)
-    contact = np.where(touching, force, 0.0)
+    in_contact = touching(gap, force, diagonal)
+    contact = np.where(in_contact, force, 0.0)
     excess[there] += through - fluxes[there]
     np.add.at(excess, there, signs * contact)
     natural = ~edge.bounded
@@ -118,7 +118,7 @@ def equilibrate(
     excess[there] += known[side.dofs[natural]] - fluxes[there]
     left = sum_rows(excess)
     left += cells.volume * load.mean
-    return Flux(excess, contact, touching, left, steepness)
+    return Flux(excess, contact, in_contact, left, steepness)
 
 
 def relax(
