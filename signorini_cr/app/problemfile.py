@@ -388,7 +388,7 @@ def _domain(
 
 
 def _outline(name: str, material: Mapping[str, Any]) -> FloatArray:
-    """Where a material is: the vertices of its polygon."""
+    """Read where a material is: the vertices of its polygon."""
     section, key = f"material.{name}", f"material.{name}.polygon"
     given = get(material, section, "polygon", array, needed="a list of points [x, y]")
     points = _points(key, given)

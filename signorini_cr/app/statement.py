@@ -70,7 +70,7 @@ def statement(case: ProblemFile, domain: Domain) -> str:
 
 
 def _extent(domain: Domain) -> str:
-    """How many cells there are, and where; collective."""
+    """Say how many cells there are, and where; collective."""
     mesh, comm = domain.mesh, domain.mesh.comm
     x = mesh.geometry.x[:, : mesh.geometry.dim]
     low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
@@ -80,7 +80,7 @@ def _extent(domain: Domain) -> str:
 
 
 def _equation(said: Mapping[str, Any], own: Collection[str], kappa: str, main: str) -> str:
-    """What holds in the domain.
+    """Say what holds in the domain.
 
     Args:
         said: What the file says.
@@ -98,14 +98,14 @@ def _equation(said: Mapping[str, Any], own: Collection[str], kappa: str, main: s
 
 
 def _cells(domain: Domain, material: str) -> int:
-    """How many cells consist of a material, over all ranks; collective."""
+    """Count the cells of a material, over all ranks; collective."""
     topology = domain.mesh.topology
     there = domain.materials.where(material)[: topology.index_map(topology.dim).size_local]
     return int(domain.mesh.comm.allreduce(np.count_nonzero(there)))
 
 
 def _facets(domain: Domain, part: str) -> str:
-    """How many facets a part has, and how large it is; "" where there are none; collective."""
+    """Say how many facets a part has, and its size; "" where there are none; collective."""
     mesh = domain.mesh
     measures = facet_measures(mesh, domain.facets(domain.parts[part]))[1]
     number = mesh.comm.allreduce(len(measures))
@@ -130,7 +130,7 @@ def _conditions(said: Mapping[str, Any]) -> dict[str, tuple[type[Condition], dic
 
 
 def _short(value: object) -> str:
-    """What was written, on one line."""
+    """Put on one line what was written."""
     text = " ".join(str(value).split())
     if isinstance(value, list):
         text = text.replace("'", "")
