@@ -96,7 +96,7 @@ def create_topology(
 
 
 def can_take_facets(comm: MPI.Comm) -> bool:
-    """Whether a topology can be given facets of our own numbering.
+    """Tell whether a topology can be given facets of our own numbering.
 
     Later versions can't be given any. With several ranks it can't be told which facets lie
     between ranks, so that it would take them for exterior ones.

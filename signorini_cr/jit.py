@@ -51,7 +51,7 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
 
 
 def _waited_in_vain(words: str) -> bool:
-    """Whether FFCx has given up waiting; the source file goes if nobody is at work at it."""
+    """Tell whether FFCx has given up waiting; the source file goes if nobody is at work at it."""
     found = re.search(r"timed out.*remove (.*\.c)\)", words, re.DOTALL)
     if found is None:
         return False

@@ -112,7 +112,7 @@ def _dual(forms: Forms, where: str | None) -> Problem:
 
 
 def _solved(dual: Problem, level: Level) -> Certificate:
-    """What is certain about z, with a companion in P1 where that will do.
+    """Find what is certain about z, with a companion in P1 where that will do.
 
     It is true for whatever comes of a linear solve, in which Γ1 counts for nothing.
     """

@@ -18,7 +18,7 @@ _WORDS = ("std::bad_alloc", "Cannot allocate memory", "MemoryError")
 
 
 def ran_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or what it was raised from, says that no memory is left."""
+    """Tell whether an error, or what it was raised from, says that no memory is left."""
     while error is not None:
         if (
             isinstance(error, MemoryError)
@@ -39,7 +39,7 @@ def most_memory() -> float:
 
 
 def shortage(comm: MPI.Comm, growth: float) -> str | None:
-    """What keeps the ranks from holding more memory than they have ever held; collective.
+    """Say what keeps the ranks from more memory than they have ever held; collective.
 
     Counted are the address space (``ulimit -v``) of each, and what is left to all of them on a
     machine and in their cgroups, file caches not counted as taken.
@@ -69,7 +69,7 @@ def _shown(size: float) -> str:
 
 
 def _status() -> dict[str, float]:
-    """What the system knows of this process, in bytes."""
+    """Ask the system what it knows of this process, in bytes."""
     lines = _text(Path("/proc/self/status")).splitlines()
     return {line.split(":")[0]: 1024.0 * int(line.split()[1]) for line in lines if " kB" in line}
 
@@ -97,7 +97,7 @@ def _spare() -> float:
 
 
 def _cached(group: Path) -> int:
-    """What a cgroup's processes have read or written and would give back."""
+    """Ask what a cgroup's processes have read or written and would give back."""
     facts = dict(line.split() for line in _text(group / "memory.stat").splitlines())
     return sum(
         int(facts.get(f"total_{name}", facts.get(name, 0)))
@@ -106,7 +106,7 @@ def _cached(group: Path) -> int:
 
 
 def _text(path: Path) -> str:
-    """What a file of the system's holds; nothing where there is none."""
+    """Read a file of the system's; nothing where there is none."""
     try:
         return path.read_text()
     except OSError:

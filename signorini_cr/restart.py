@@ -113,7 +113,7 @@ def _nodes(mesh: Mesh) -> Places:
 
 
 def _places(V: fem.FunctionSpace) -> Places:
-    """Where the dofs of CR or P1 are, ghosts included."""
+    """Find where the dofs of CR or P1 are, ghosts included."""
     layout, at = Layout.of_space(V), _corners(V.mesh)
     places = np.empty(layout.index_map.size_local + layout.index_map.num_ghosts, dtype=at.dtype)
     places[layout.cells] = _midpoints(at) if layout.cr else at

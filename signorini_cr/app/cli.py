@@ -116,7 +116,7 @@ def _interruptible() -> Iterator[list[int]]:
 
 
 def _importing(frame: FrameType | None) -> bool:
-    """Whether what runs has been called by an import."""
+    """Tell whether what runs has been called by an import."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True
@@ -224,7 +224,6 @@ def _solve_levels(
     """Solve, and append to `records` what is solved and safe in the folder."""
     from ..errors import NotConverged, naming
     from ..output import report as output
-    from ..output.tables import certified, facts, legend, times
     from ..restart import Restart
     from .statement import folded, statement
 
@@ -272,15 +271,22 @@ def _solve_levels(
             names = output.write_output(folder, report, finest, resumable=True)
             if args.html:
                 names += _write_page(args, comm, folder, problem, report)
-        screen.line("")
-        screen.text(legend(records[0], case.units))
-        screen.line("")
-        screen.text(facts(records[-1], case.units))
-        screen.text(certified(records[-1], case.units))
-        screen.text(times(records))
+        _conclude(screen, records, case.units)
         screen.text(f"written to {folder}: {', '.join(names)}")
     if failure is not None:
         raise NotConverged(_stopped(failure, records, folder))
+
+
+def _conclude(screen: Screen, records: list[dict[str, Any]], units: Units) -> None:
+    """Say what the table above means, and what has come out."""
+    from ..output.tables import certified, facts, legend, times
+
+    screen.line("")
+    screen.text(legend(records[0], units))
+    screen.line("")
+    screen.text(facts(records[-1], units))
+    screen.text(certified(records[-1], units))
+    screen.text(times(records))
 
 
 def _solve_steps(
@@ -408,7 +414,7 @@ def _said(args: argparse.Namespace, case: ProblemFile, comm: Any) -> dict[str, A
 def _resumed(
     folder: Path, said: dict[str, Any], records: list[dict[str, Any]], comm: Any
 ) -> Restart | None:
-    """Where a run goes on; fills in the records of the levels before; collective."""
+    """Find where a run goes on, and fill in the records of the levels before; collective."""
     import json
 
     from ..errors import InputError, naming
@@ -484,7 +490,7 @@ def _write_page(
 
 
 def _above_tolerance(case: ProblemFile, records: list[dict[str, Any]]) -> NotConverged | None:
-    """What stopped an adaptive run before the bound that was asked for was reached."""
+    """Say what stopped an adaptive run before the bound that was asked for was reached."""
     tolerance = case.adaptive["tolerance"]
     if tolerance == 0.0 or not records:
         return None

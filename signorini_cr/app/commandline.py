@@ -57,7 +57,7 @@ class _Help(argparse.Action):
 
 
 def columns() -> str:
-    """What every figure of a run means, for a terminal."""
+    """Say what every figure of a run means, for a terminal."""
     lines: list[str] = []
     for head, entries in SECTIONS.items():
         lines += [*textwrap.wrap(head + ":", WIDTH), ""]

@@ -45,7 +45,7 @@ def bare(key: str) -> str:
 
 
 def is_kappa(key: str) -> bool:
-    """Whether a key is that of κ; an entry of a tensor is not."""
+    """Tell whether a key is that of κ; an entry of a tensor is not."""
     return key.endswith(".coefficient") and not key.startswith("boundary.")
 
 

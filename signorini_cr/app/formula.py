@@ -216,7 +216,7 @@ def constant(value: float | bool) -> Node:
 
 
 def is_constant(node: Node, value: float | bool) -> bool:
-    """Whether a node is known to have this value."""
+    """Tell whether a node is known to have this value."""
     return node.op == "const" and node.args[0] == value
 
 

@@ -363,27 +363,9 @@ def _domain(
         )
     size = get(table, "domain", "size", positive, needed="a number above 0, the length of a facet,")
     polygon = _polygon(table, "domain", names, size)
-    holes, polygons = [], {}
-    for name, material in materials.items():
-        key, needed = f"material.{name}", "a list of points [x, y]"
-        points = _points(f"{key}.polygon", get(material, key, "polygon", array, needed=needed))
-        with naming(f"{key}.polygon", SIMPLE):
-            check_loops([coordinates(points)])
-        polygons[name] = points
-    for i, hole in enumerate(array("domain.holes", table.get("holes", []))):
-        key = f"domain.holes[{i}]"
-        if not isinstance(hole, dict):
-            raise InputError(
-                f"{key}: {{ vertices = [...], boundary = [...] }} or {{ center = [...], radius ="
-                f" ..., boundary = ... }} is needed, found {shown(hole)}"
-            )
-        round_keys = ("center", "radius", "boundary")
-        insist_known(hole, key, ("vertices", "arcs", *round_keys))
-        if "center" in hole or "radius" in hole:
-            insist_known(hole, key, round_keys)
-            holes.append(_circle(hole, key, names, size))
-        else:
-            holes.append(_polygon(hole, key, names, size))
+    polygons = {name: _outline(name, material) for name, material in materials.items()}
+    given = enumerate(array("domain.holes", table.get("holes", [])))
+    holes = [_hole(f"domain.holes[{i}]", hole, names, size) for i, hole in given]
     if holes or polygons:
         with naming("domain.holes", "holes must lie inside the polygon and apart from each other"):
             polygon = replace(polygon, holes=tuple(holes))
@@ -403,6 +385,31 @@ def _domain(
             f" {polygon.diameter:.6g}; the length of a facet is needed, no more than that"
         )
     return polygon, size
+
+
+def _outline(name: str, material: Mapping[str, Any]) -> FloatArray:
+    """Read where a material is: the vertices of its polygon."""
+    section, key = f"material.{name}", f"material.{name}.polygon"
+    given = get(material, section, "polygon", array, needed="a list of points [x, y]")
+    points = _points(key, given)
+    with naming(key, SIMPLE):
+        check_loops([coordinates(points)])
+    return points
+
+
+def _hole(key: str, hole: Any, names: tuple[str, ...], size: float) -> Polygon:
+    """A polygon in the domain, or a circle."""
+    if not isinstance(hole, dict):
+        raise InputError(
+            f"{key}: {{ vertices = [...], boundary = [...] }} or {{ center = [...], radius ="
+            f" ..., boundary = ... }} is needed, found {shown(hole)}"
+        )
+    round_keys = ("center", "radius", "boundary")
+    insist_known(hole, key, ("vertices", "arcs", *round_keys))
+    if "center" not in hole and "radius" not in hole:
+        return _polygon(hole, key, names, size)
+    insist_known(hole, key, round_keys)
+    return _circle(hole, key, names, size)
 
 
 def _polygon(

@@ -50,7 +50,7 @@ class Screen:
             self.progress(text.strip())
 
     def progress(self, text: str) -> None:
-        """What is going on, on a terminal, until the next line."""
+        """Show what is going on, on a terminal, until the next line."""
         if self.root and not self.quiet and sys.stderr.isatty():
             self.clear()
             self._put(sys.stderr, text[: WIDTH - 1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,40 +31,23 @@ def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
     Returns:
         A line by the name of what it is about.
     """
-    mesh, said = domain.mesh, case.said
-    unit = case.units.after("x")
-    comm, tdim, gdim = mesh.comm, mesh.topology.dim, mesh.geometry.dim
-    x = mesh.geometry.x[:, :gdim]
-    low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
-    high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
-    extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
-
-    materials = {name: case.said[f"material.{name}"] for name in case.materials}
-    own_kappa = any("coefficient" in material for material in materials.values())
-    kappa = "κ" if "data.coefficient" in said or own_kappa else ""
-    gain = f" + {as_factor(_short(said['data.reaction']))} u" if "data.reaction" in said else ""
-    if not gain and any("reaction" in material for material in materials.values()):
-        gain = " + c u"
-    usual, exact = _short(said.get("data.coefficient", 1)), "exact.u" in said
-    load = _short(said.get("data.f", "f from exact.u" if exact else "0"))
-    equation = f"−∇·(κ∇u){gain} = {load}, κ = {usual}"
+    said, unit = case.said, case.units.after("x")
+    materials = {name: said[f"material.{name}"] for name in case.materials}
+    own = set().union(*materials.values())
+    kappa = "κ" if "data.coefficient" in said or "coefficient" in own else ""
+    exact = "exact.u" in said
     rows = {
-        "domain": f"{mesh.topology.index_map(tdim).size_global} cells in {extent}{unit}",
-        "equation": equation if kappa else f"−Δu{gain} = {load}",
+        "domain": f"{_extent(domain)}{unit}",
+        "equation": _equation(said, own, kappa),
     }
     for name, material in materials.items():
-        tags = domain.materials
-        number = np.count_nonzero(tags.where(name)[: mesh.topology.index_map(tdim).size_local])
-        own = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
-        rows[name] = f"{', '.join(own) or 'no data of its own'}; {comm.allreduce(number)} cells"
+        data = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
+        number = _cells(domain, name)
+        rows[name] = f"{', '.join(data) or 'no data of its own'}; {number} cells"
     for name, (kind, given) in _conditions(said).items():
         condition = kind.in_words({key: _short(v) for key, v in given.items()}, exact, kappa)
-        measures = facet_measures(mesh, domain.facets(domain.parts[name]))[1]
-        number = comm.allreduce(len(measures))
-        if number > 0:
-            total = comm.allreduce(float(measures.sum()))
-            what = "length" if gdim == 2 else "area"
-            rows[name] = f"{condition}; {number} facets, {what} {total:.6g}{unit}"
+        if there := _facets(domain, name):
+            rows[name] = f"{condition}; {there}{unit}"
     if case.time is not None:
         words = f"t from 0 to {case.time.end:g}{case.units.after('time')} in {case.time.steps}"
         words += f" steps of {case.time.scheme}"
@@ -94,6 +77,51 @@ def folded(rows: Mapping[str, str]) -> str:
     )
 
 
+def _extent(domain: Domain) -> str:
+    """Say how many cells there are, and where; collective."""
+    mesh, comm = domain.mesh, domain.mesh.comm
+    x = mesh.geometry.x[:, : mesh.geometry.dim]
+    low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
+    high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
+    extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
+    return f"{mesh.topology.index_map(mesh.topology.dim).size_global} cells in {extent}"
+
+
+def _equation(said: Mapping[str, Any], own: Collection[str], kappa: str) -> str:
+    """Say what holds in the domain.
+
+    Args:
+        said: What the file says.
+        own: The data that materials have of their own.
+        kappa: What stands before ∂ₙu.
+    """
+    gain = " + c u" if "reaction" in own else ""
+    if "data.reaction" in said:
+        gain = f" + {as_factor(_short(said['data.reaction']))} u"
+    load = _short(said.get("data.f", "f from exact.u" if "exact.u" in said else "0"))
+    if not kappa:
+        return f"−Δu{gain} = {load}"
+    return f"−∇·(κ∇u){gain} = {load}, κ = {_short(said.get('data.coefficient', 1))}"
+
+
+def _cells(domain: Domain, material: str) -> int:
+    """Count the cells of a material, over all ranks; collective."""
+    topology = domain.mesh.topology
+    there = domain.materials.where(material)[: topology.index_map(topology.dim).size_local]
+    return int(domain.mesh.comm.allreduce(np.count_nonzero(there)))
+
+
+def _facets(domain: Domain, part: str) -> str:
+    """Say how many facets a part has, and its size; "" where there are none; collective."""
+    mesh = domain.mesh
+    measures = facet_measures(mesh, domain.facets(domain.parts[part]))[1]
+    number = mesh.comm.allreduce(len(measures))
+    if not number:
+        return ""
+    total = mesh.comm.allreduce(float(measures.sum()))
+    return f"{number} facets, {'length' if mesh.geometry.dim == 2 else 'area'} {total:.6g}"
+
+
 def _conditions(said: Mapping[str, Any]) -> dict[str, tuple[type[Condition], dict[str, Any]]]:
     """The kind of condition on each part, and what was written for its data, by name."""
     found = {}
@@ -109,7 +137,7 @@ def _conditions(said: Mapping[str, Any]) -> dict[str, tuple[type[Condition], dic
 
 
 def _short(value: object) -> str:
-    """What was written, on one line."""
+    """Put on one line what was written."""
     text = " ".join(str(value).split())
     if isinstance(value, list):
         text = text.replace("'", "")

@@ -32,7 +32,7 @@ def number(expression: Expr) -> float | None:
 
 
 def may_change(expression: Expr) -> bool:
-    """Whether an expression holds a Constant or a Function, which may get other values."""
+    """Tell whether an expression holds a Constant or a Function, which may get other values."""
     found = extract_constants(expression) or extract_coefficients(expression)
     return bool(found)
 
@@ -104,7 +104,7 @@ class Condition:
         return tuple(each.name for each in fields(cls) if each.name not in common)
 
     def _derived(self, given: Given, expressions: dict[str, Expr]) -> Expr | None:
-        """What an exact solution says of the main datum, where the user does not."""
+        """Derive the main datum from an exact solution, where the user does not give it."""
         return None
 
     @classmethod
@@ -319,7 +319,7 @@ def _left_in_words(said: Mapping[str, str], kappa: str) -> str:
 
 
 def _matters(said: Mapping[str, str], name: str) -> bool:
-    """Whether a datum is given and not written as the number 0."""
+    """Tell whether a datum is given and not written as the number 0."""
     return said.get(name, "0") not in ("0", "0.0")
 
 

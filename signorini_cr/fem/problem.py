@@ -111,7 +111,7 @@ class Problem:
     error_degree: int = 6
 
     def __repr__(self) -> str:
-        """What differs from nothing, functions by their names."""
+        """Tell what differs from nothing, functions by their names."""
         given = []
         for each in fields(self):
             value = getattr(self, each.name)
@@ -447,7 +447,7 @@ class Forms:
         return sum(self._without_gradients(u, v), form)
 
     def _without_gradients(self, u: Expr, v: Expr) -> list[ufl.Form]:
-        """What a_h has beside κ∇u·∇v."""
+        """Add up what a_h has beside κ∇u·∇v."""
         degree = {"quadrature_degree": self.problem.quadrature_degree}
         terms = [(self.reaction, self.dx)]
         terms += [(c.loss, self.ds(c.number)) for c in self.conditions if c.loss is not None]
@@ -540,7 +540,7 @@ class Forms:
 
 
 def _order(expression: Expr) -> int:
-    """How often functions are differentiated in it."""
+    """Count how often functions are differentiated in it."""
     below = max(map(_order, expression.ufl_operands), default=0)
     return below + isinstance(expression, ufl.differentiation.Derivative)
 
@@ -566,7 +566,7 @@ def _check_materials(problem: Problem, materials: Materials) -> None:
 
 
 def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tuple[Condition, ...]:
-    """What holds on each part of the boundary.
+    """Say what holds on each part of the boundary.
 
     Raises:
         InputError: A part has no condition, or a condition no part.

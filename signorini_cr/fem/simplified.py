@@ -105,7 +105,7 @@ class _Reader:
         return self._atom(self._key(e, operands), e)
 
     def _key(self, e: Any, operands: Any) -> Any:
-        """What makes a function of normal forms the same as another one."""
+        """Make a key that is the same for the same functions of normal forms."""
         if not operands or any(
             operand.ufl_shape != () or isinstance(operand, classes.Condition)
             for operand in operands

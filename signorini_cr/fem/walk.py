@@ -44,7 +44,7 @@ def along_boundary(
 
 
 def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDArray:
-    """Whether Ω lies to the right when a facet is walked from its first vertex to its second."""
+    """Tell whether Ω lies to the right on the way from a facet's first vertex to its second."""
     cells, local = facet_entities(mesh, facets).T
     apex = mesh.geometry.x[cell_nodes(mesh)[cells, local]]
     along, inward = vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]
@@ -121,7 +121,7 @@ def _way_from_first(
 
 
 def _doublings(before: Int64Array) -> int:
-    """How often a stride has to be doubled to pass through all facets."""
+    """Count how often a stride has to be doubled to pass through all facets."""
     return max(len(before), 1).bit_length()
 
 

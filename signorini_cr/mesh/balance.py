@@ -78,7 +78,7 @@ def _moved(mesh: Mesh) -> Mesh:
 
 
 def _ranks(mesh: Mesh) -> Int32Array:
-    """Where the cells of this rank are to go; collective."""
+    """Find where the cells of this rank are to go; collective."""
     comm, nodes = mesh.comm, compat.cell_nodes(mesh)
     parts = comm.gather(mesh.geometry.x[nodes, : mesh.geometry.dim].mean(axis=1))
     shares = None

@@ -309,7 +309,7 @@ def _insist_on(
 
 
 def is_by_cells(function: object) -> bool:
-    """Whether it is a scalar function that is constant on each cell."""
+    """Tell whether it is a scalar function that is constant on each cell."""
     if not isinstance(function, fem.Function) or function.ufl_shape:
         return False
     element = function.function_space.ufl_element()
@@ -339,7 +339,7 @@ def _exterior(mesh: Mesh) -> Int32Array:
 
 
 def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
-    """What keeps a user's mesh and tags from being used, if anything."""
+    """Say what keeps a user's mesh and tags from being used, if anything."""
     tdim = mesh.topology.dim
     kind = mesh.topology.cell_type.name
     if kind not in ("triangle", "tetrahedron"):

@@ -70,13 +70,8 @@ def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -
             f"the polygon's edges don't lie on squares of side 1/{n}: give a polygon of upright "
             "and level edges, and an n that its vertices fit"
         )
-    columns, rows = number
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(columns), np.arange(rows)))
-    corner = i + (columns + 1) * j
-    right, up, across = corner + 1, corner + columns + 1, corner + columns + 2
-    triangles = np.stack([corner, right, across, corner, across, up], axis=1).reshape(-1, 3)
-    x, y = np.meshgrid(np.arange(columns + 1), np.arange(rows + 1))
-    points = low + np.stack([x.ravel(), y.ravel()], axis=1) * ((high - low) / number)
+    points, triangles = _grid(*number)
+    points = low + points * ((high - low) / number)
     middles = points[triangles].mean(axis=1)
     within = inside(middles, polygon.vertices)
     for hole in polygon.holes:
@@ -94,6 +89,16 @@ def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -
         points[:, 0] += shift * half * (1.0 - ((points[:, 0] - middle) / half) ** 2)
         _require_kept(polygon, middle, half)
     return Triangulation(points, triangles, facets, labels[edge])
+
+
+def _grid(columns: int, rows: int) -> tuple[FloatArray, Int64Array]:
+    """Squares of side 1, each in two triangles: their corners, and the corners of each triangle."""
+    i, j = (index.ravel() for index in np.meshgrid(np.arange(columns), np.arange(rows)))
+    corner = i + (columns + 1) * j
+    right, up, across = corner + 1, corner + columns + 1, corner + columns + 2
+    triangles = np.stack([corner, right, across, corner, across, up], axis=1).reshape(-1, 3)
+    x, y = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
+    return np.stack([x.ravel(), y.ravel()], axis=1), triangles
 
 
 def _require_kept(polygon: Polygon, middle: float, half: float) -> None:

@@ -366,14 +366,12 @@ def _check_names(
     curves = {name: np.concatenate(group) for name, group in others.items() if group}
     if not curves:
         return
-
-    def keys(ends: Int64Array) -> Int64Array:
-        return ends.min(axis=-1) * (int(triangles.max()) + 1) + ends.max(axis=-1)
-
-    sides, cells = np.unique(keys(triangles[:, [[1, 2], [0, 2], [0, 1]]]), return_counts=True)
-    loose = np.setdiff1d(sides[cells == 1], keys(labelled))
+    tags = int(triangles.max()) + 1
+    sides = _key(triangles[:, [[1, 2], [0, 2], [0, 1]]], tags)
+    keys, cells = np.unique(sides, return_counts=True)
+    loose = np.setdiff1d(keys[cells == 1], _key(labelled, tags))
     for name, ends in curves.items():
-        number = np.count_nonzero(np.isin(keys(ends), loose))
+        number = np.count_nonzero(np.isin(_key(ends, tags), loose))
         if number:
             near = [part for part in allowed if part in name.lower()]
             near += difflib.get_close_matches(name.strip().lower(), allowed, n=1)
@@ -416,53 +414,28 @@ def _check_cells(file: MshFile) -> None:
 
 def _check_facets(raw: Triangulation, names: dict[int, str], holding: Collection[str]) -> None:
     """Insist on labels of exterior facets, one each, and on something that holds every piece."""
-    count = len(raw.points)
     u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
     area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     flat = np.flatnonzero(~(area > 1e-14 * ((u**2).sum(axis=1) + (v**2).sum(axis=1))))
     if len(flat):
         x, y = raw.points[raw.triangles[flat[0], 0]]
         raise InputError(f"the triangle at ({x:g}, {y:g}) has no area")
-
-    def key(ends: Int64Array) -> Int64Array:
-        return ends.min(axis=-1) * count + ends.max(axis=-1)
-
-    def facet(number: int) -> str:
-        a, b = raw.points[raw.facets[number]]
-        return f"the facet from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g})"
-
-    sides = key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]])
-    edges, where, cells = np.unique(sides, return_inverse=True, return_counts=True)
-    where = where.reshape(sides.shape)
-    labelled = key(raw.facets)
-    position = np.minimum(np.searchsorted(edges, labelled), len(edges) - 1)
-    strange = np.flatnonzero(edges[position] != labelled)
-    inside = np.flatnonzero(cells[position] > 1)
-    for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
-        if len(bad):
-            name = names[int(raw.labels[bad[0]])]
-            raise InputError(f"{facet(bad[0])} is labelled {name} but {fault}")
-    order = np.lexsort((raw.labels, labelled))
-    one, two = order[:-1], order[1:]
-    twice = np.flatnonzero((labelled[one] == labelled[two]) & (raw.labels[one] != raw.labels[two]))
-    if len(twice):
-        i, j = one[twice[0]], two[twice[0]]
-        raise InputError(
-            f"{facet(i)} belongs to {names[int(raw.labels[i])]} and to "
-            f"{names[int(raw.labels[j])]}: only one is possible"
-        )
-    if cells.max() > 2:
-        raise InputError(f"{cells.max()} triangles meet in one facet: at most 2 can")
-    piece = pieces(where, len(edges))
-    if (found := overlap(raw.points, raw.triangles, where, cells, piece)) is not None:
+    of_cells = _key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]], len(raw.points))
+    keys, sides, count = np.unique(of_cells, return_inverse=True, return_counts=True)
+    sides = sides.reshape(of_cells.shape)
+    side = _labelled(raw, keys, count, names)
+    if count.max() > 2:
+        raise InputError(f"{count.max()} triangles meet in one facet: at most 2 can")
+    piece = pieces(sides, len(keys))
+    if (found := overlap(raw.points, raw.triangles, sides, count, piece)) is not None:
         raise InputError(found)
     if not holding:
         return
-    fixed = np.zeros(len(edges), dtype=bool)
+    fixed = np.zeros(len(keys), dtype=bool)
     holds = [number for number, name in names.items() if name in holding]
-    fixed[position[np.isin(raw.labels, holds)]] = True
+    fixed[side[np.isin(raw.labels, holds)]] = True
     held = np.zeros(len(raw.triangles), dtype=bool)
-    held[piece[fixed[where].any(axis=1)]] = True
+    held[piece[fixed[sides].any(axis=1)]] = True
     loose = np.flatnonzero(~held[piece])
     if len(loose):
         x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
@@ -470,6 +443,50 @@ def _check_facets(raw: Triangulation, names: dict[int, str], holding: Collection
             f"the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
             "Dirichlet facet and no contact facet"
         )
+
+
+def _key(ends: Int64Array, points: int) -> Int64Array:
+    """Make one number of two, in either order, that are below the number of points."""
+    return ends.min(axis=-1) * points + ends.max(axis=-1)
+
+
+def _labelled(
+    raw: Triangulation, keys: Int64Array, count: Int64Array, names: Mapping[int, str]
+) -> Int64Array:
+    """The side that each labelled facet is, shape (facets,).
+
+    Args:
+        raw: The mesh.
+        keys: The sides' ends, by `_key`, ascending.
+        count: How many triangles have each side.
+        names: Of the labels.
+
+    Raises:
+        InputError: It is none, or lies inside, or has two labels.
+    """
+
+    def facet(number: int) -> str:
+        a, b = raw.points[raw.facets[number]]
+        return f"the facet from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g})"
+
+    own = _key(raw.facets, len(raw.points))
+    side = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
+    strange = np.flatnonzero(keys[side] != own)
+    inside = np.flatnonzero(count[side] > 1)
+    for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
+        if len(bad):
+            name = names[int(raw.labels[bad[0]])]
+            raise InputError(f"{facet(bad[0])} is labelled {name} but {fault}")
+    order = np.lexsort((raw.labels, own))
+    one, two = order[:-1], order[1:]
+    twice = np.flatnonzero((own[one] == own[two]) & (raw.labels[one] != raw.labels[two]))
+    if len(twice):
+        i, j = one[twice[0]], two[twice[0]]
+        raise InputError(
+            f"{facet(i)} belongs to {names[int(raw.labels[i])]} and to "
+            f"{names[int(raw.labels[j])]}: only one is possible"
+        )
+    return side
 
 
 def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> Int64Array:

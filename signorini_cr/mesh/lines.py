@@ -86,7 +86,7 @@ def arranged(
 
 
 def _crossings(edge: FloatArray, others: FloatArray) -> FloatArray:
-    """Where an edge, shape (2, 2), crosses others, shape (n, 2, 2)."""
+    """Find where an edge, shape (2, 2), crosses others, shape (n, 2, 2)."""
     u, v, w = edge[1] - edge[0], others[:, 1] - others[:, 0], others[:, 0] - edge[0]
     with np.errstate(all="ignore"):  # parallel ones have none
         det = u[0] * v[:, 1] - u[1] * v[:, 0]

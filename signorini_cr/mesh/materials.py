@@ -34,7 +34,7 @@ class Materials:
     of_cells: Int32Array = field(default_factory=lambda: np.empty(0, dtype=np.int32))
 
     def where(self, name: str) -> BoolArray:
-        """Which local cells consist of a material, shape (cells,)."""
+        """Tell which local cells consist of a material, shape (cells,)."""
         return np.asarray(self.of_cells == self.numbers[name])
 
     def of_children(self, parent: Int32Array) -> Materials:

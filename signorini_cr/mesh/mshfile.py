@@ -328,7 +328,7 @@ class _Reader:
         return found[1].decode()
 
     def line(self) -> str:
-        """Where in the file we are, in words."""
+        """Say where in the file we are."""
         if self.binary:
             return f"byte {self.at}"
         return f"line {self.data.count(10, 0, self.at) + 1}"
@@ -343,7 +343,7 @@ class _Reader:
         self.at = found.end()
 
     def body(self, name: str) -> tuple[bytes, int]:
-        """What stands between the first and last line of a section, and its first line's number."""
+        """Take what stands between a section's first and last line, and its first line's number."""
         end = self.data.find(b"$End" + name.encode(), self.at)
         if end < 0:
             raise _Damaged(f"there is no $End{name}")

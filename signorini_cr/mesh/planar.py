@@ -76,7 +76,7 @@ def _angles(corners: FloatArray) -> FloatArray:
 
 
 def _crowded(points: FloatArray, ccw: Int64Array, vertex: int) -> bool:
-    """Whether two triangles that have a vertex in common overlap around it."""
+    """Tell whether two triangles that have a vertex in common overlap around it."""
     cell, corner = np.nonzero(ccw == vertex)
     first, last = points[ccw[cell, (corner + 1) % 3]], points[ccw[cell, (corner + 2) % 3]]
     apex = np.broadcast_to(points[vertex], first.shape)
@@ -141,14 +141,14 @@ def _turn(side: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _cross(one: FloatArray, two: FloatArray) -> BoolArray:
-    """Whether two sides have a point inside both in common, and no more."""
+    """Tell whether two sides have a point inside both in common, and no more."""
     return (_turn(one, two[:, 0]) * _turn(one, two[:, 1]) < 0) & (
         _turn(two, one[:, 0]) * _turn(two, one[:, 1]) < 0
     )
 
 
 def _touched(side: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether an end of the other lies inside the side."""
+    """Tell whether an end of the other lies inside the side."""
     u = side[:, 1] - side[:, 0]
     length = np.hypot(*u.T)
     found = np.zeros(len(side), dtype=bool)
@@ -161,7 +161,7 @@ def _touched(side: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def _run_along(one: FloatArray, two: FloatArray) -> BoolArray:
-    """Whether two sides are the same and have the mesh on the same hand."""
+    """Tell whether two sides are the same and have the mesh on the same hand."""
     length = np.hypot(*(one[:, 1] - one[:, 0]).T)
     return (np.hypot(*(one - two).transpose(2, 0, 1)) <= _NEAR * length[:, None]).all(axis=1)
 

@@ -254,7 +254,7 @@ def _number_vertices(mesh: Mesh, corners: Int32Array, facets: Int32Array) -> _Ve
 def _coordinates(
     mesh: Mesh, corners: Int32Array, corner: Int32Array, middle: Int32Array, count: int
 ) -> npt.NDArray[np.floating]:
-    """Where the fine vertices are.
+    """Compute where the fine vertices are.
 
     Args:
         mesh: The coarse mesh.
@@ -274,7 +274,7 @@ def _coordinates(
 
 
 def _first_places(table: Int32Array, count: int) -> Int32Array:
-    """Where each of the numbers below ``count`` first stands in a table.
+    """Find where each of the numbers below ``count`` first stands in a table.
 
     Those of entities that no cell of this rank meets follow behind the table, one by one.
     """
@@ -285,7 +285,7 @@ def _first_places(table: Int32Array, count: int) -> Int32Array:
 
 
 def _ghosts_in(index_map: Any, entities: Int32Array) -> Int32Array:
-    """Which of the ghost entities belong to cells of this rank: all, unless it has ghost cells."""
+    """Find the ghost entities of cells of this rank: all, unless it has ghost cells."""
     seen = np.zeros(index_map.num_ghosts, dtype=bool)
     seen[entities[entities >= index_map.size_local] - index_map.size_local] = True
     return np.flatnonzero(seen).astype(np.int32)
