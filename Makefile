@@ -85,6 +85,7 @@ test-wheels:
 lint:
 	$(run) container/tool ruff check
 	$(run) container/tool ruff format --check
+	$(run) container/tool pytest -q tests/test_metadata.py
 	@if command -v shellcheck >/dev/null; then \
 	    grep -lr '^#!.*sh$$' container .ci | xargs -d '\n' shellcheck; \
 	else echo 'no shellcheck here: the shell scripts are not looked at'; fi

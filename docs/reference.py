@@ -7,8 +7,10 @@ import contextlib
 import io
 from pathlib import Path
 
+from signorini_cr import options
 from signorini_cr.app.commandline import read_arguments
 from signorini_cr.app.reference import page
+from signorini_cr.multigrid.smoothing import SMOOTHERS
 from signorini_cr.output.meanings import SECTIONS
 
 MADE = "\n*This page is made by `./container/run python3 docs/reference.py` from {}.*\n"
@@ -23,7 +25,56 @@ def command() -> str:
             read_arguments([*words, "--help"])
         lines += [f"## {' '.join(['signorini-cr', *words])}", "", "```text"]
         lines += [text.getvalue().rstrip(), "```", ""]
-    return "\n".join(lines) + MADE.format("`signorini-cr --help`")
+    lines += ["## Options of PETSc", "", ABOUT_OPTIONS, *_options(), ""]
+    return "\n".join(lines) + MADE.format("`signorini-cr --help` and `signorini_cr/options.py`")
+
+
+ABOUT_OPTIONS = f"""\
+PETSc's options that begin with `-{options.PREFIX}` reach the solvers of this program, from its
+command line and from that of any script. What follows the prefix is PETSc's own, such as
+`ksp_rtol 1e-10`; users' come before what the program sets. Tolerances that are not named here are
+computed.
+
+| they begin with | they are about | set by the program |
+|---|---|---|"""
+
+AMG = "BoomerAMG, or GAMG where PETSc is without hypre"
+P = options.PREFIX
+PREFIXES: dict[str, tuple[str, str | dict[str, object]]] = {
+    f"{P}snes_": ("the active set method; its steps are Newton's", options.NEWTON),
+    f"{P}ksp_": ("the linear systems of its steps", options.REDUCED),
+    f"{P}pc_": ("what preconditions them, in Python: the multigrid cycle", options.REDUCED),
+    options.REDUCED_PREFIX: ("what SNES itself asks: a shell around those two", "its `ksp_type`"),
+    options.BOTTOM_PREFIX: ("the bottom of the cycle", f"small ones are factorised; {AMG}"),
+    options.ALONE_PREFIX: (
+        "what takes the cycle's place where it is given up",
+        f"factors, where they fit; {AMG}",
+    ),
+    options.ESTIMATE_PREFIX: ("the certificate: its sharpness, not its validity", f"CG; {AMG}"),
+}
+
+
+def _options() -> list[str]:
+    """A table of the prefixes, and what is the program's own."""
+    lines = []
+    for prefix, (what, settings) in PREFIXES.items():
+        if not isinstance(settings, str):
+            kind = prefix.removeprefix(P)
+            values = {
+                name: f"{value:g}" if isinstance(value, float) else value
+                for name, value in settings.items()
+                if name.startswith(kind)
+            }
+            settings = ", ".join(f"`{name} {value}`" for name, value in values.items())
+        lines.append(f"| `-{prefix}` | {what} | {settings} |")
+    first, second = SMOOTHERS
+    lines += [
+        "",
+        f"`-{P}smoother {second}` is the program's own: what smooths in the cycle. It takes twice "
+        f"the steps of `{first}`, the default, and",
+        "gives the same figures on any number of ranks.",
+    ]
+    return lines
 
 
 def figures() -> str:

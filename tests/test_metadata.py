@@ -1,8 +1,10 @@
 """What is told of the program in several files is the same in all of them."""
 
 import importlib
+import json
 import re
 import runpy
+import tomllib
 
 import pytest
 from helpers import ROOT
@@ -16,6 +18,17 @@ def test_one_version(file):
     text = (ROOT / file).read_text(encoding="utf-8")
     found = re.search(r"^(?: *version:|## (?=\d)) *\"?([\d.]+)", text, re.MULTILINE)
     assert found and found[1] == signorini_cr.__version__
+
+
+@pytest.mark.serial
+def test_one_date():
+    """Releases have dates, the newest comes first, and CITATION.cff has its date."""
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    releases = re.findall(r"^## (\d+)\.(\d+)\.(\d+) \((\d{4}-\d\d-\d\d)\)$", changes, re.MULTILINE)
+    assert len(releases) == changes.count("\n## ")
+    assert sorted(releases, key=lambda each: tuple(map(int, each[:3])), reverse=True) == releases
+    assert sorted((each[3] for each in releases), reverse=True) == [each[3] for each in releases]
+    assert f"\ndate-released: {releases[0][3]}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 @pytest.mark.serial
@@ -116,3 +129,101 @@ def test_what_is_cited_is_in_the_bibliography():
     for person in ("Marini", "Dörfler"):
         assert any(person in text for text in texts.values())
         assert any(f". {person}: " in entry for entry in entries), person
+
+
+def loaded(path):
+    """A YAML file; `make lint` has a reader of them, other runs may not."""
+    yaml = pytest.importorskip("yaml", reason="make lint reads YAML")
+    return yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
+
+
+def project():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+@pytest.mark.serial
+def test_the_recipe_is_as_conda_forge_asks():
+    """Its linter's rules, but for the maintainer and the homepage that there are none of yet."""
+    recipe, about = loaded("conda/recipe.yaml"), project()
+    assert list(recipe) == [
+        "schema_version", "context", "package", "source", "build", "requirements", "tests", "about",
+        "extra",
+    ]  # fmt: skip
+    context, build, needs = recipe["context"], recipe["build"], recipe["requirements"]
+    assert context["name"] == about["name"] and re.fullmatch(r"[a-z0-9_.-]+", context["name"])
+    assert about["requires-python"] == f">={context['python_min']}"
+    assert build["noarch"] == "python" and build["number"] == 0
+    assert "--no-deps" in build["script"] and "--no-build-isolation" in build["script"]
+    scripts = [f"{name} = {place}" for name, place in about["scripts"].items()]
+    assert build["python"]["entry_points"] == scripts
+    assert {"python ${{ python_min }}.*", "pip", "setuptools >=77"} == set(needs["host"])
+    assert needs["run"][0] == "python >=${{ python_min }}"
+    for line in needs["host"] + needs["run"]:
+        assert re.fullmatch(r"[a-z0-9_-]+( (>=|<|==)?[\w.*${} ]+)?", line), line
+    assert set(about["dependencies"]) <= set(needs["run"])
+    imports, command = recipe["tests"]
+    assert imports["python"]["imports"] and imports["python"]["pip_check"]
+    assert "${{ python_min }}.*" in imports["python"]["python_version"]
+    assert all((ROOT / file).is_file() for file in command["files"]["source"])
+    told = recipe["about"]
+    assert told["license"] == about["license"]
+    assert [told["license_file"]] == about["license-files"] and (
+        ROOT / told["license_file"]
+    ).is_file()
+    assert told["summary"] == about["description"] and not told["summary"].endswith(".")
+    assert isinstance(recipe["extra"]["recipe-maintainers"], list)
+    assert (ROOT / "conda" / recipe["source"]["path"] / "pyproject.toml").is_file()
+
+
+@pytest.mark.serial
+def test_images_are_made_of_files_that_exist():
+    for file in ("Dockerfile", ".devcontainer/Dockerfile"):
+        text = (ROOT / file).read_text(encoding="utf-8")
+        sources = re.findall(r"^COPY (\S+) \S+$", text, re.MULTILINE)
+        assert sources and all((ROOT / source).exists() for source in sources), file
+    recipe = (ROOT / "container" / "signorini_cr.def").read_text(encoding="utf-8")
+    sections = re.split(r"^%(\w+)\n", recipe, flags=re.MULTILINE)
+    parts = dict(zip(sections[1::2], sections[2::2], strict=True))
+    assert set(parts) == {"files", "post", "environment", "runscript", "test", "help"}
+    assert sections[0].endswith("Bootstrap: docker\nFrom: debian:trixie-slim\n\n")
+    for line in filter(None, parts["files"].partition("#")[0].splitlines()):
+        source, target = line.split()
+        assert (ROOT / source).exists() and target == f"/opt/signorini_cr/{source}"
+    editor = json.loads((ROOT / ".devcontainer/devcontainer.json").read_text(encoding="utf-8"))
+    assert (ROOT / ".devcontainer" / editor["build"]["dockerfile"]).is_file()
+    assert (ROOT / ".devcontainer" / editor["build"]["context"] / "Makefile").is_file()
+    # The settings of container/run, in all of them
+    settings = {**editor["containerEnv"], "PYTHONPATH": "", "PATH": ""}
+    image = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    for name, value in settings.items():
+        assert f"{name}={value}" in image and f"export {name}={value}" in parts["environment"]
+
+
+@pytest.mark.serial
+def test_the_environment_of_conda():
+    environment = loaded("environment.yml")
+    assert environment["channels"] == ["conda-forge", "nodefaults"]
+    names = {line.split()[0] for line in environment["dependencies"]}
+    assert {*project()["dependencies"], *project()["optional-dependencies"]["test"]} <= names
+
+
+@pytest.mark.serial
+def test_workflows_call_what_exists():
+    make = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    tools = (ROOT / "container" / "tools.txt").read_text()
+    lines = []
+    for job in loaded(".github/workflows/ci.yml")["jobs"].values():
+        assert job["timeout-minutes"] and job["runs-on"]
+        lines += [step["run"] for step in job["steps"] if "run" in step]
+        assert all("run" in step or "@" in step["uses"] for step in job["steps"])
+    for hook in loaded(".pre-commit-config.yaml")["repos"][0]["hooks"]:
+        lines.append(hook["entry"])
+        tool = re.search(r"container/tool (\w+)", hook["entry"])[1]
+        assert f"{tool}==" in tools
+    for line in lines:
+        for goals in re.findall(r"^make ((?:[\w-]+ ?)+)$", line):
+            assert set(goals.split()) <= make, line
+        assert all((ROOT / file).is_file() for file in re.findall(r"container/[\w.-]+", line)), line
+    for template in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"):
+        form = loaded(template.relative_to(ROOT))
+        assert form["name"] and form["description"] and form["body"]

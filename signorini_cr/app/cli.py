@@ -33,6 +33,7 @@ from .screen import Screen, wrapped
 if TYPE_CHECKING:
     from ..errors import NotConverged
     from ..mesh.domain import Domain
+    from ..output.units import Units
     from ..restart import Restart
     from ..solution import Solution
     from .problemfile import ProblemFile

@@ -12,6 +12,7 @@ from helpers import ROOT
 from mpi4py import MPI
 
 import signorini_cr
+from signorini_cr import options
 from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import _parser
 from signorini_cr.app.problemfile import load
@@ -47,6 +48,38 @@ def test_every_option_is_in_the_reference() -> None:
     for each in (parser, *commands.values()):
         words += each._option_string_actions
     assert [word for word in words if not re.search(rf"(?<!\w){word}\b", text)] == []
+
+
+@pytest.mark.serial
+def test_every_prefix_of_petsc_options_is_in_the_reference() -> None:
+    text = (DOCS / "command.md").read_text(encoding="utf-8")
+    for name, prefix in vars(options).items():
+        if name.endswith("_PREFIX"):
+            assert f"| `-{prefix}` |" in text, name
+    code = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "signorini_cr").rglob("*.py"))
+    own = set(re.findall(r"\bread_(?:word|number)\(\"(\w+)\"", code))
+    assert own == {"smoother", "snes_atol"}
+    assert f"`-{options.PREFIX}smoother " in text
+
+
+@pytest.mark.serial
+def test_the_tutorial_prints_what_the_program_prints(tmp_path, capsys) -> None:
+    """The statement of the problem, the head of the table and its first rows."""
+    page = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    file, shown = tmp_path / "membrane.toml", re.search(r"```text\n(.*?)```", page, re.S)[1]
+    file.write_text(re.search(r"```toml\n(.*?)```", page, re.S)[1], encoding="utf-8")
+    words = ["solve", str(file), "--levels", "2", "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    printed = capsys.readouterr().out.splitlines()
+    shown = shown.splitlines()
+    if shown[0] != printed[0]:
+        pytest.skip("another gmsh has made another mesh")
+    head = shown.index("") + 1
+    assert shown[: head + 1] == printed[: head + 1]
+    cg = shown[head].split().index("cg")  # depends on the ranks, which there are two of there
+    for before, now in zip(shown[head + 1 : head + 3], printed[head + 1 : head + 3], strict=True):
+        assert before.split()[:cg] == now.split()[:cg]
+        assert before.split()[cg + 1 :] == now.split()[cg + 1 :]
 
 
 def names_in(head: str) -> list[str]:
