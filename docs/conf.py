@@ -36,7 +36,14 @@ suppress_warnings = ["myst.header"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+python_use_unqualified_type_names = True
 autodoc_typehints_description_target = "documented"
+# Types by the names that the program gives them.
+autodoc_type_aliases = {
+    **{kind: kind for kind in ("BoolArray", "FloatArray", "IndexArray", "Int32Array", "Int64Array")},
+    "Data": "Data",
+    "npt.ArrayLike": "ArrayLike",
+}
 autodoc_default_options = {"members": True}
 napoleon_use_ivar = True
 napoleon_preprocess_types = False
