@@ -55,7 +55,7 @@ default_role = "code"
 def _as_text(app, what, name, obj, options, lines):
     """Keep |F| the measure of F, and y. the name of y; reStructuredText sees other things there."""
     lines[:] = [line.replace("|", r"\|") for line in lines]
-    lines[:] = [re.sub(r"^( *:\w+ \w+: )(\w\.)", r"\1\\\2", line) for line in lines]
+    lines[:] = [re.sub(r"^( *(?::\w+ \w+: *)?)(\w\.)$", r"\1\\\2", line) for line in lines]
 
 
 def _for_download(app, name, content):
