@@ -9,7 +9,7 @@ import signorini_cr
 
 PACKAGE = Path(signorini_cr.__file__).parent
 FLOORS = (
-    ("arrays", "errors", "jit", "compat", "options", "garbage", "memory", "__init__"),
+    ("arrays", "errors", "jit", "compat", "options", "garbage", "memory", "reading", "__init__"),
     ("mesh",),
     ("fem",),
     ("data",),
