@@ -220,9 +220,7 @@ class Coefficient:
         self.mean = self.low = self.high = np.exp(np.log(eigenvalues).mean(axis=1))
         self.least, self.most = eigenvalues[:, 0], eigenvalues[:, -1]
         off = np.zeros((means[0].size if len(means) else cells.tdim**2, len(means)))
-        for row, entry, mean in zip(
-            off, kappa.entries, means.reshape(-1, len(off)).T, strict=True
-        ):
+        for row, entry, mean in zip(off, kappa.entries, means.reshape(-1, len(off)).T, strict=True):
             found = range_of(entry, cells)
             if found is None:
                 self.reason = NO_RANGE
