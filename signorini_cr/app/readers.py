@@ -65,10 +65,10 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise InputError(f"TOML syntax in {where}: {what}{picture}") from None
     except ValueError:  # Python's own limit, of which TOML knows nothing
         digits = sys.get_int_max_str_digits()
-        found = re.search(rf"\d(?:_?\d){{{digits}}}", text)
-        line = f" in line {text.count(chr(10), 0, found.start()) + 1}" if found else ""
+        at = re.search(rf"\d(?:_?\d){{{digits}}}", text)
+        place = f" in line {text.count(chr(10), 0, at.start()) + 1}" if at else ""
         raise InputError(
-            f"a whole number{line} has more than {digits} digits; up to that many are allowed"
+            f"a whole number{place} has more than {digits} digits; up to that many are allowed"
         ) from None
 
 
