@@ -57,8 +57,8 @@ KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
-TELLING = ("quantities", "units", "names")
-"""Sections that levels do not depend on."""
+TELLING = ("units", "names")
+"""Sections that levels, and what is told of them, do not depend on."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
