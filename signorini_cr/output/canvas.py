@@ -196,7 +196,10 @@ def label_ends(
     height = [0.21 * (1 + label.count("\n")) / high for label in labels]
     order = np.argsort(points[:, 1], kind="stable")
     places = apart(points[order, 1], [height[i] for i in order])
-    for i, y in zip(order, places, strict=True):
+    top = 0.0  # of those before; none stands below the axes
+    for i, wanted in zip(order, places, strict=True):
+        y = max(wanted, top + 0.5 * height[i])
+        top = y + 0.5 * height[i]
         axes.annotate(labels[i], ends[i], (1.02, y), textcoords="axes fraction", va="center",
                       fontsize=12, annotation_clip=False,
                       arrowprops={"arrowstyle": "-", "color": colors[i], "linewidth": 0.6,
