@@ -133,14 +133,12 @@ def draw(left, right):
                colours=[COLOURS[0], COLOURS[0], COLOURS[1], COLOURS[1]],
                named={key: key.removeprefix("CR: ") + same * ",\nCR and P1"
                       for key in curves if "CR" in key})  # fmt: skip
-        for (key, (abscissae, errors)), colour in zip(curves.items(), "0011", strict=True):
-            if not same:  # beside the curves, which run apart
-                element = key.split(":")[0]
-                axes.annotate(element, (abscissae[3], errors[3]), fontsize=13,
-                              color=COLOURS[int(colour)], textcoords="offset points",
-                              xytext=(8, 4) if element == "CR" else (-8, -4),
-                              ha="left" if element == "CR" else "right",
-                              va="bottom" if element == "CR" else "top")  # fmt: skip
+        for key, (abscissae, errors) in {} if same else curves.items():
+            # beside the curves, which run apart
+            colour, at = COLOURS["_h" not in key.split("u_h")[-1]], 3 if "CR" in key else -1
+            axes.annotate(key.split(":")[0], (abscissae[at], errors[at]), (8, 4 if at > 0 else -4),
+                          textcoords="offset points", fontsize=13, color=colour,
+                          va="bottom" if at > 0 else "top")  # fmt: skip
 
 
 study.picture(
