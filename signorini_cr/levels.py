@@ -11,6 +11,7 @@ from dolfinx import fem
 
 from .diffusion import Diffusion
 from .errors import InputError, NotConverged
+from .fem.conditions import facets_of
 from .fem.physics import Physics
 from .fem.problem import Problem
 from .limits import Limits
@@ -18,12 +19,13 @@ from .mesh.balance import Refined
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.cycle import Multigrid
-from .multigrid.hierarchy import Hierarchy
+from .multigrid.hierarchy import Hierarchy, NestedMesh
 from .restart import Restart
 from .solution import Solution
 from .vi.contact import contact_facts
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
+from .vi.pieces import Loose
 from .vi.solver import solve_vi
 from .vi.system import System
 
@@ -178,6 +180,22 @@ def solve_physics(
             start, before = Start(solution, before), solution.u
         seconds = {"mesh": time.perf_counter() - began}
     hierarchy.free()
+
+
+def check_pieces(physics: Diffusion, domain: Domain) -> None:
+    """Insist that something holds each piece that a domain falls into; collective.
+
+    Raises:
+        InputError: A piece has no Dirichlet facet, no reaction and no loss, and is not pressed onto
+            an obstacle.
+    """
+    level = Level((NestedMesh(physics, domain),))
+    fixed = fem.locate_dofs_topological(
+        level.V, domain.mesh.topology.dim - 1, facets_of(domain, physics.fixed)
+    )
+    # without a loose piece nothing needs to be assembled
+    if Loose.of(level.V, fixed).count and level.loose is not None:
+        level.loose.check(level.system)
 
 
 class Start(NamedTuple):

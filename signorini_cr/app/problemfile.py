@@ -22,11 +22,12 @@ from ..adaptive import solve_adaptive
 from ..arrays import FloatArray
 from ..data.admissible import check_data
 from ..data.consistency import doubts
+from ..diffusion import Diffusion
 from ..errors import InputError, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
-from ..fem.problem import Forms, Material, Problem
-from ..levels import solve_levels
+from ..fem.problem import Material, Problem
+from ..levels import check_pieces, solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
@@ -144,19 +145,21 @@ class ProblemFile:
 
         Raises:
             InputError: An expression is not finite where it is needed, the coefficient is not
-                positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, or the last mesh
-                of the sequence would be absurdly large.
+                positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, nothing holds a
+                piece of the domain, or the last mesh of the sequence would be absurdly large.
         """
         topology = domain.mesh.topology
         cells = topology.index_map(topology.dim).size_global
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
-        forms = Forms(self.problem, domain.mesh, parts=domain.parts, materials=domain.materials)
+        forms = Diffusion(self.problem, domain.mesh, "CR", domain.parts, domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
         check_data(forms, domain)
+        if self.time is None:  # else capacity holds all pieces
+            check_pieces(forms, domain)
         return doubts(forms, domain)
 
     def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:

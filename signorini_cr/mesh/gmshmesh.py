@@ -353,7 +353,7 @@ def _check_cells(file: MshFile, path: Path) -> None:
 
 
 def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None:
-    """Insist on labels of exterior facets, one each, and on something that holds every piece."""
+    """Insist on labels of exterior facets, one each, and on triangles side by side."""
     count = len(raw.points)
     u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
     area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
@@ -394,18 +394,6 @@ def _check_facets(raw: Triangulation, path: Path, names: dict[int, str]) -> None
     piece = pieces(where, len(edges))
     if (found := overlap(raw.points, raw.triangles, where, cells, piece)) is not None:
         raise InputError(f"{path}: {found}")
-    holding = [number for number, name in names.items() if name in ("dirichlet", "contact")]
-    fixed = np.zeros(len(edges), dtype=bool)
-    fixed[position[np.isin(raw.labels, holding)]] = True
-    held = np.zeros(len(raw.triangles), dtype=bool)
-    held[piece[fixed[where].any(axis=1)]] = True
-    loose = np.flatnonzero(~held[piece])
-    if len(loose):
-        x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
-        raise InputError(
-            f"{path}: the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
-            "Dirichlet facet and no contact facet"
-        )
 
 
 def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> Int64Array:

@@ -466,6 +466,16 @@ def write(shared_tmp_path: Path, monkeypatch) -> Callable[..., str]:
     return write
 
 
+def test_curves_with_names_of_ones_own(write) -> None:
+    """What holds the mesh is known by its sections: here a loss, or nothing."""
+    write(msh(LINES + _TRIANGLES, "bed").replace("dirichlet", "air"), "own.msh")
+    text = '[domain]\nmesh = "own.msh"\n[boundary.bed]\ntype = "contact"\n[data]\nf = 1\n'
+    name = write(text + '[boundary.air]\ntype = "robin"\ncoefficient = 2\n')
+    assert run("check", name)[0] == cli.DONE
+    name = write(text + '[boundary.air]\ntype = "neumann"\n', "loose.toml")
+    assert "a net force ∫f + ∫g of 1" in " ".join(refused("check", name).split())
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input(name: str, write) -> None:
     text, words = BAD[name]
