@@ -28,7 +28,7 @@ from ufl.core.expr import Expr
 from ..arrays import Int32Array
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import PARTS, Domain, is_by_cells
+from ..mesh.domain import PARTS, Domain, Parts, is_by_cells
 from ..mesh.materials import Materials
 from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, number
 from .simplified import simplified
@@ -86,8 +86,9 @@ class Problem:
         reaction: c, not below 0.
         form: What takes the place of ∫ κ∇u·∇v; there is no κ then, and nothing but u_D is derived
             from ``exact``.
-        conditions: What holds on parts of the boundary, by their names in the domain; g, obstacle
-            and dirichlet are for the parts neumann, contact and dirichlet where they aren't here.
+        conditions: What holds on parts of the boundary, by their names in the domain, or by the
+            facet value that a part of `Domain.from_tags` stands for; g, obstacle and dirichlet are
+            for the parts neumann, contact and dirichlet where they aren't here.
         materials: The data of materials, by their names in the domain; what is not said there, and
             cells without material, have coefficient, f and reaction.
         exact: The exact solution, where it is known. f, g and u_D that are None are then
@@ -104,7 +105,9 @@ class Problem:
     coefficient: Data = 1.0
     reaction: Data = 0.0
     form: Form | None = None
-    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    conditions: (
+        Mapping[str, Condition] | Mapping[int, Condition] | Mapping[str | int, Condition]
+    ) = field(default_factory=dict)
     materials: Mapping[str, Material] = field(default_factory=dict)
     exact: Data | None = None
     quadrature_degree: int = 4
@@ -576,12 +579,18 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
         "neumann": (Neumann(problem.g), "data.g"),
         "contact": (Contact(given.expression(problem.obstacle)), "data.obstacle"),
     }
-    for name, condition in problem.conditions.items():
+    called = parts.called if isinstance(parts, Parts) else {}
+    own: dict[str, Condition] = {}
+    for key, condition in problem.conditions.items():
+        name = called.get(key, "") if isinstance(key, int | np.integer) else key
         if name not in parts:
-            raise InputError(
-                f"conditions: no part of the boundary is called {name!r}; there are"
-                f" {', '.join(parts)}"
-            )
+            values = {part: f" ({value})" for value, part in called.items()}
+            there = ", ".join(part + values.get(part, "") for part in parts)
+            how = f"is called {key!r}" if name else f"stands for the facet value {key} alone"
+            raise InputError(f"conditions: no part of the boundary {how}; there are {there}")
+        if name in own:
+            raise InputError(f"conditions: the part {name!r} has two")
+        own[name] = condition
         if not isinstance(condition, Condition):
             raise InputError(
                 f"conditions: {name!r} is {condition!r}; Dirichlet, Neumann, Robin or Contact is"
@@ -589,8 +598,8 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
             )
     made = []
     for name, value in parts.items():
-        if name in problem.conditions:
-            condition = problem.conditions[name]
+        if name in own:
+            condition = own[name]
             label = f"boundary.{name}.{condition.names()[0]}"
         elif name in usual:
             condition, label = usual[name]

@@ -47,6 +47,19 @@ REST = NEUMANN
 """The part of the exterior facets that nobody names: the weak form's natural condition."""
 
 
+class Parts(dict[str, int]):
+    """Parts of a boundary and their values in facet tags.
+
+    Attributes:
+        called: The parts that stand for one value each of a user's own tags, by that value.
+    """
+
+    def __init__(self, parts: Mapping[str, int], called: Mapping[int, str]):
+        """Take both."""
+        super().__init__(parts)
+        self.called = dict(called)
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
     """A mesh whose exterior facets are sorted into Γ0, Γ1, Γg and other parts.
@@ -142,6 +155,7 @@ class Domain:
         contact: int | Sequence[int] | None = None,
         dirichlet: int | Sequence[int] | None = None,
         neumann: int | Sequence[int] | None = None,
+        parts: Sequence[int] = (),
         **others: int | Sequence[int],
     ) -> Domain:
         """Take a mesh and facet tags of the user's own; collective.
@@ -162,6 +176,8 @@ class Domain:
             contact: The value or values that stand for Γ1; 1 if there are no further parts.
             dirichlet: The value or values that stand for Γ0; 2 if there are no further parts.
             neumann: The value or values that stand for Γg; named so that they can be checked.
+            parts: Values that are further parts by themselves, called as they are: 3 is the part
+                "3", and `Problem.conditions` may have its condition by 3.
             **others: The same for further parts, by names of your own.
 
         Raises:
@@ -169,17 +185,18 @@ class Domain:
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
         fdim = mesh.topology.dim - 1
+        others = {**{str(value): value for value in parts}, **others}
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
-        parts = numbered(others)
-        needed = {parts[name] for name, own in given.items() if own is not None} - {REST}
+        inner = numbered(others)
+        needed = {inner[name] for name, own in given.items() if own is not None} - {REST}
         if not others:
             needed |= {CONTACT, DIRICHLET}
         wanted: dict[int, Int32Array] = {}
         for name, own in given.items():
-            usual: list[int] = [PARTS[name]] if own is None and parts[name] in needed else []
+            usual: list[int] = [PARTS[name]] if own is None and inner[name] in needed else []
             numbers = np.asarray(usual if own is None else own, dtype=np.int32)
-            wanted[parts[name]] = np.unique(np.atleast_1d(numbers))
-        called = {value: name for name, value in parts.items()}
+            wanted[inner[name]] = np.unique(np.atleast_1d(numbers))
+        called = {value: name for name, value in inner.items()}
         for a, b in itertools.combinations(wanted, 2):
             if len(both := np.intersect1d(wanted[a], wanted[b])):
                 raise InputError(
@@ -224,7 +241,8 @@ class Domain:
             )
         made = Materials.from_tags(mesh, cell_tags, materials or {})
         tags = meshtags(mesh, fdim, exterior, values[exterior])
-        return cls(mesh, tags, parts=parts, materials=made)
+        alone = {int(v[0]): called[part] for part, v in wanted.items() if len(v) == 1}
+        return cls(mesh, tags, parts=Parts(inner, alone), materials=made)
 
 
 def is_by_cells(function: object) -> bool:

@@ -208,6 +208,18 @@ def test_parts_of_the_users_own_by_tags():
     with pytest.raises(InputError, match=r"no exterior facet is tagged rest \(value 5\)"):
         Domain.from_tags(mesh, tags, floor=7, rest=(5, 8, 9, 10))
 
+    for facets, key in ({"floor": 7}, 7), ({"parts": [7]}, 7), ({"parts": [7]}, "7"):
+        domain = Domain.from_tags(mesh, tags, dirichlet=(8, 9, 10), **facets)
+        again = solve(Problem(f=-9.0, conditions={key: Contact(-0.1)}), domain)
+        assert again.contact.force == pytest.approx(
+            solve(Problem(f=-9.0, obstacle=-0.1), usual).contact.force
+        )
+    said = r"stands for the facet value 8 alone; there are contact, dirichlet, neumann, 7 \(7\)"
+    with pytest.raises(InputError, match=said):
+        solve(Problem(conditions={7: Contact(), 8: Dirichlet()}), domain)
+    with pytest.raises(InputError, match="the part '7' has two"):
+        solve(Problem(conditions={7: Contact(), "7": Contact()}), domain)
+
 
 def exterior_facet_indices_of(mesh):
     mesh.topology.create_connectivity(1, 2)
