@@ -8,16 +8,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import ufl
 from dolfinx import fem
+from mpi4py import MPI
+from ufl.core.expr import Expr
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import Cells, vertex_rows
-from ..fem.conditions import Condition, may_change, number
+from ..fem.conditions import Condition, is_by_cells, may_change, number
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
-from ..mesh.domain import Domain, is_by_cells
+from ..mesh.domain import Domain
 from .loads import NeumannMoments, VolumeMoments, chi
 from .moments import Compiled, OnFacets, Tensor
 
@@ -48,7 +51,38 @@ class DiffusionOnMesh:
     def cells(self) -> Cells:
         """The mesh as arrays, for the Crouzeix-Raviart element."""
         fixed = [condition.number for condition in self.forms.fixed]
-        return Cells(self.domain, self.V, fixed, self.forms.sinks, self._stretch())
+        return Cells(self.domain, self.V, fixed, self._sinks(), self._stretch())
+
+    def _sinks(self) -> dict[int, FloatArray]:
+        """The parts whose b is above 0, and that on their facets; collective."""
+        found = {c.number: self._loss(c) for c in self.forms.conditions if c.loss is not None}
+        return {
+            part: loss
+            for part, loss in found.items()
+            if self.domain.mesh.comm.allreduce(bool((loss > 0.0).all()), op=MPI.LAND)
+        }
+
+    def _loss(self, condition: Condition) -> FloatArray:
+        """B on the facets of owned cells, in the order of `Cells.sides`, shape (n,) or ()."""
+        b = self._by_cells(ufl.as_ufl(condition.loss or 0.0))
+        if not b.ndim:
+            return b
+        facets = self.domain.all_facets[condition.number]
+        cells = facet_entities(self.domain.mesh, facets)[:, 0]
+        return b[cells[cells < len(b)]]
+
+    def _by_cells(self, datum: Expr) -> FloatArray:
+        """Values on owned cells of what is constant there, shape (cells,), or () for a number.
+
+        What varies within cells counts as 0: nothing is certified then.
+        """
+        known = number(datum) if is_by_cells(datum) else 0.0
+        if known is not None:
+            return np.array(known)
+        expression, mesh = self.compiled.by_cells(datum), self.domain.mesh
+        which = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
+        values = compat.bound(expression, self.domain.own).eval(mesh, which)
+        return np.asarray(values, dtype=np.float64).reshape(len(which))
 
     def _stretch(self) -> FloatArray | None:
         kappa = self.compiled.kappa
@@ -96,12 +130,7 @@ class DiffusionOnMesh:
     @property
     def reaction(self) -> FloatArray:
         """C on owned cells, shape (cells,), or () where it is a number."""
-        c = self.forms.reaction
-        if not is_by_cells(c):
-            return np.array(number(c) or 0.0)
-        own = self.domain.own(c)
-        dofs = own.function_space.dofmap.list[: self.cells.number, 0]
-        return np.asarray(own.x.array[dofs], dtype=np.float64)
+        return self._by_cells(self.forms.reaction)
 
     def with_source(self, load: VolumeMoments) -> VolumeMoments:
         """Moments of f, as given, and what it has beside."""
@@ -113,7 +142,10 @@ class DiffusionOnMesh:
     def edges(self) -> tuple[NeumannMoments, ...]:
         """Moments of the fluxes that are known, one for each condition."""
         sampled = self._sampled(self.forms.natural, lambda condition: condition.flux)
-        return tuple(NeumannMoments(on_facets, self.cells) for on_facets in sampled)
+        return tuple(
+            NeumannMoments(on_facets, self.cells, self._loss(on_facets.condition))
+            for on_facets in sampled
+        )
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:

@@ -25,12 +25,12 @@ from ufl.algorithms import compute_form_data
 from ufl.algorithms.check_arities import ArityMismatch
 from ufl.core.expr import Expr
 
-from ..arrays import Int32Array
+from ..arrays import FloatArray, Int32Array
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import PARTS, Domain, Parts, is_by_cells
+from ..mesh.domain import PARTS, Domain, Parts
 from ..mesh.materials import Materials
-from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, number
+from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, is_by_cells, number
 from .simplified import simplified
 from .space import facet_entities, ufl_element
 
@@ -156,13 +156,16 @@ class Kernel:
         form: UFL form on the mesh that the data were written for.
         mesh: That mesh.
         stand_ins: The UFL coefficients in ``form`` that get their values when it is bound.
+
+    Attributes:
+        own: The Functions that the form holds beside them.
     """
 
     def __init__(self, form: ufl.Form, mesh: Mesh, stand_ins: Sequence[ufl.Coefficient] = ()):
         self._compiled = compiled(mesh.comm, fem.compile_form, mesh.comm, form)
         self._mesh = mesh
         self._stand_ins = tuple(stand_ins)
-        self._own = [
+        self.own = [
             w
             for w in ufl.algorithms.extract_coefficients(form)
             if not any(w is s for s in self._stand_ins)
@@ -194,10 +197,15 @@ class Kernel:
             list(spaces),
             domain.mesh,
             subdomains,
-            {w: domain.own(w) for w in self._own}
+            {w: domain.own(w) for w in self.own}
             | dict(zip(self._stand_ins, functions, strict=True)),
             self._constants,
         )
+
+    def values(self) -> list[FloatArray]:
+        """What the Constants and Functions in the form have for values at present."""
+        constants = [np.array(each.value) for each in self._constants]
+        return constants + [each.x.array.copy() for each in self.own]
 
 
 class Forms:
@@ -344,23 +352,17 @@ class Forms:
         return tuple(c for c in self.conditions if c.flux is not None)
 
     @property
-    def sinks(self) -> dict[int, float]:
-        """The parts whose b is a number above 0, and these."""
-        found = {c.number: number(c.loss) for c in self.conditions if c.loss is not None}
-        return {part: loss for part, loss in found.items() if loss}
-
-    @property
     def uncertified(self) -> str | None:
         """Why there is no certificate, if the form, the reaction or some condition has none."""
         if self.problem.form is not None:
             return "the form is the user's own: the flux that goes with it is not known"
-        if number(self.reaction) is None and not is_by_cells(self.reaction):
+        if not is_by_cells(self.reaction):
             return "the reaction varies within cells: its part of the energy has no enclosure"
         for condition in self.conditions:
             if condition.uncertified:
                 return condition.uncertified
-            if condition.loss is not None and number(condition.loss) is None:
-                return f"{condition.part}: its coefficient is no number, and has no enclosure"
+            if condition.loss is not None and not is_by_cells(condition.loss):
+                return f"{condition.part}: its coefficient varies within cells: it has no enclosure"
         return None
 
     @cached_property
@@ -375,9 +377,19 @@ class Forms:
         Raises:
             InputError: The data hold a Function on another mesh that can't be carried to this one.
         """
+        for function in self.functions:
+            domain.own(function)
+
+    @property
+    def functions(self) -> list[fem.Function]:
+        """The Functions that the data hold, each once."""
+        found: dict[fem.Function, None] = {}
         for each in self._data.values():
-            for function in ufl.algorithms.extract_coefficients(each):
-                domain.own(function)
+            found |= dict.fromkeys(ufl.algorithms.extract_coefficients(each))
+        if self.problem.form is not None:
+            for kernel in (self.a, self.own_load):
+                found |= dict.fromkeys([] if kernel is None else kernel.own)
+        return list(found)
 
     @property
     def uniform(self) -> bool:
