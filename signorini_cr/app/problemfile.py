@@ -17,22 +17,23 @@ from typing import Any
 import numpy as np
 import ufl
 from mpi4py import MPI
+from ufl.algorithms.analysis import extract_constants
 
 from ..adaptive import solve_adaptive
 from ..arrays import FloatArray
-from ..data.admissible import check_data
+from ..data.admissible import check_data, check_operator
 from ..data.consistency import doubts
 from ..diffusion import Diffusion
 from ..errors import InputError, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.conditions import Contact, Dirichlet, Neumann, Robin
-from ..fem.problem import Material, Problem
+from ..fem.problem import Forms, Material, Problem
 from ..levels import check_pieces, solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
 from ..solution import Solution
-from .datacheck import USED_ON, bare, check_values, is_kappa
+from .datacheck import USED_ON, check_values, is_kappa
 from .expressions import Expression, check_name, parse
 from .formula import Clock, Node
 from .readers import (
@@ -84,6 +85,20 @@ class Time:
     initial: Any
     capacity: float
     clock: Clock
+
+    def check(self, forms: Forms, domain: Domain) -> None:
+        """Try out at all times what a_h is made of, where that depends on them; collective."""
+        losses = [c.loss for c in forms.conditions if c.loss is not None]
+        if not any(map(extract_constants, (forms.kappa, forms.reaction, *losses))):
+            return
+        start = self.clock.value
+        for step in range(1, self.steps + 1):
+            self.clock.value = self.end * step / self.steps
+            try:
+                check_operator(forms, domain)
+            except InputError as error:
+                raise InputError(f"{error}, at the time {self.clock.value:g}") from None
+        self.clock.value = start
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +173,10 @@ class ProblemFile:
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
         check_data(forms, domain)
-        if self.time is None:  # else capacity holds all pieces
-            check_pieces(forms, domain)
+        if self.time is None:
+            check_pieces(forms, domain)  # capacity would hold all
+        else:
+            self.time.check(forms, domain)
         return doubts(forms, domain)
 
     def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:
@@ -544,11 +561,9 @@ def _time(
         raise InputError('refine.mode: a problem in time needs "uniform": its meshes do not change')
     if "exact.u" in expressions:
         raise InputError("exact.u: a problem in time has none")
-    for key, expression in expressions.items():
-        fixed = bare(key).endswith((".coefficient", ".reaction")) or key == "time.initial"
-        if fixed and expression.depends_on_time:
-            raise InputError(f"{key}: this must not depend on t")
     initial = expressions.get("time.initial")
+    if initial is not None and initial.depends_on_time:
+        raise InputError("time.initial: this must not depend on t")
     return Time(
         end=get(table, "time", "end", positive, needed="a number above 0, the last time,"),
         steps=get(table, "time", "steps", whole, needed="a whole number, of steps,"),

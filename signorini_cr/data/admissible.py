@@ -72,17 +72,8 @@ def check_data(forms: Forms, domain: Domain) -> None:
         InputError: κ, or the user's form, is not symmetric and positive definite, u_D jumps, or α
             is above u_D where Γ0 meets Γ1. The message names the point and the values.
     """
+    check_operator(forms, domain)
     comm = domain.mesh.comm
-    if forms.problem.form is not None:
-        raise_together(comm, _bad_form(forms, domain))
-    _raise_first(comm, _bad_coefficient(forms, domain))
-    _raise_first(comm, _negative(_Values(forms.reaction, domain), _middles(domain), REACTION))
-    for condition in forms.conditions:
-        if condition.loss is not None:
-            facets = _Facets.of(domain, condition.number)
-            at = facets.x.mean(axis=1), facets.cells
-            name = f"the coefficient of the part {condition.part!r}"
-            _raise_first(comm, _negative(_Values(condition.loss, domain), at, name))
     fixed = [(_Values(c.fixed, domain), _Facets.of(domain, c.number)) for c in forms.fixed]
     for condition, (u_D, facets) in zip(forms.fixed, fixed, strict=True):
         _raise_first(comm, _jump(u_D, facets, condition.source))
@@ -103,6 +94,21 @@ def check_data(forms: Forms, domain: Domain) -> None:
         if len(contact.bounds) == 2:
             (_, lower), (_, upper) = contact.bounds
             _raise_first(comm, _crossed(lower, upper, domain, bounded, contact.label))
+
+
+def check_operator(forms: Forms, domain: Domain) -> None:
+    """Insist on an a_h that is an energy, as `check_data` does; collective."""
+    comm = domain.mesh.comm
+    if forms.problem.form is not None:
+        raise_together(comm, _bad_form(forms, domain))
+    _raise_first(comm, _bad_coefficient(forms, domain))
+    _raise_first(comm, _negative(_Values(forms.reaction, domain), _middles(domain), REACTION))
+    for condition in forms.conditions:
+        if condition.loss is not None:
+            facets = _Facets.of(domain, condition.number)
+            at = facets.x.mean(axis=1), facets.cells
+            name = f"the coefficient of the part {condition.part!r}"
+            _raise_first(comm, _negative(_Values(condition.loss, domain), at, name))
 
 
 REACTION = "the reaction"
