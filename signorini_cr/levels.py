@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from dolfinx import fem
 
+from .data.admissible import NOT_DEFINITE
 from .diffusion import Diffusion
 from .errors import InputError, NotConverged
 from .fem.conditions import facets_of
@@ -250,6 +251,8 @@ def solve_level(
                 cycle, vectors, system.residual_scale, monitor=told, row_sums=system.row_sums
             )
     except NotConverged as failure:
+        if level.physics.problem.form is not None and "DIVERGED_INDEFINITE" in failure.reason:
+            raise InputError(f"{NOT_DEFINITE}; level {level.number} shows it") from None
         raise NotConverged(failure.reason, level.number) from None
     for function in (u, residual):
         function.x.scatter_forward()

@@ -17,12 +17,15 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.mesh import Mesh, compute_midpoints, entities_to_geometry
 from mpi4py import MPI
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
 
 from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
-from ..fem.conditions import negative
+from ..fem.conditions import facets_of, negative
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, function_space, ghosted_vector
 from ..garbage import release
@@ -59,6 +62,19 @@ mean of both sides."""
 
 SHORTEST = 1e3
 """Length of the shortest intervals, in units of the points' rounding."""
+
+
+FACTORISED = 100_000
+"""Largest matrix of a form of the user's own that is looked at for eigenvalues below 0."""
+
+DEFINITE = 1e-13
+"""What is no eigenvalue of a matrix whose diagonal is 1: a stiff part in one 1e12 times as soft has
+1e-12."""
+
+NOT_DEFINITE = (
+    "form: a(u, u) is not above 0 for all u that vanish on the dirichlet parts; without that there"
+    " may be no solution"
+)
 
 
 def check_data(forms: Forms, domain: Domain) -> None:
@@ -520,18 +536,59 @@ def _bad_form(forms: Forms, domain: Domain) -> str | None:
     functions[1].interpolate(lambda x: np.cos(2.0 + 13.0 * x[0] - 5.0 * x[1]))
     x, y, image = (*(ghosted_vector(V, each.x.array) for each in functions), A.createVecLeft())
     A.mult(x, image)
-    there, energy = image.dot(y), image.dot(x)
+    there = image.dot(y)
     A.mult(y, image)
     skew, size = abs(there - image.dot(x)), A.norm() * x.norm() * y.norm()
     least = A.getDiagonal().min()[1]
+    fixed = fem.locate_dofs_topological(
+        V, domain.mesh.topology.dim - 1, facets_of(domain, forms.fixed)
+    )
+    rows = A.getValuesCSR() if A.getSize()[0] <= FACTORISED else None
     release(A, x, y, image)
     if not np.isfinite(size):
         return "form: a(u, v) is not finite at some point of the mesh"
     if skew > TOLERANCE * size:
         return "form: a(u, v) is not a(v, u); without symmetry this is no problem of least energy"
-    if least <= 0.0 or energy < -TOLERANCE * size:
-        return "form: a(u, u) is not above 0 for all u; without that there may be no solution"
-    return None
+    if least <= 0.0:
+        return NOT_DEFINITE
+    if rows is None:
+        return None
+    comm, held = domain.mesh.comm, V.dofmap.index_map.local_to_global(fixed)
+    found = comm.gather((*rows, held))
+    definite = None if found is None else _definite(found)
+    return None if comm.bcast(definite) else NOT_DEFINITE
+
+
+def _definite(ranks: Sequence[tuple[IndexArray, IndexArray, FloatArray, Int64Array]]) -> bool:
+    """Whether a symmetric matrix is definite but for constants, which obstacles may hold.
+
+    By Sylvester's law of inertia there are as many eigenvalues below 0 as pivots.
+
+    Args:
+        ranks: Of each rank the rows, as PETSc has them, and which unknowns are not free.
+    """
+    starts, columns, values, held = zip(*ranks, strict=True)
+    counts = np.concatenate([np.diff(start) for start in starts])
+    start = np.concatenate([[0], np.cumsum(counts)])
+    A = csr_array((np.concatenate(values), np.concatenate(columns), start))
+    free = np.setdiff1d(np.arange(len(counts)), np.concatenate(held))
+    A = A[free][:, free]
+    scale = diags_array(1.0 / np.sqrt(A.diagonal()))
+    of_constants = np.abs(scale @ (A @ np.ones(len(free))))
+    A = scale @ A @ scale
+    number, piece = connected_components(A, directed=False)
+    loose = np.count_nonzero(np.bincount(piece, of_constants, number) <= TOLERANCE)
+    negative_pivots = []
+    for sign in (1.0, -1.0):
+        shifted = csc_array(A + sign * DEFINITE * eye_array(len(free)))
+        try:
+            factors = splu(
+                shifted, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError:  # a pivot is 0
+            return False
+        negative_pivots.append(np.count_nonzero(factors.U.diagonal() <= 0.0))
+    return negative_pivots[0] == 0 and negative_pivots[1] <= loose
 
 
 def place(x: FloatArray, mesh: Mesh) -> tuple[float, ...]:

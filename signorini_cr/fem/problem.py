@@ -501,6 +501,16 @@ class Forms:
                     f"form: {name} has an integral of the type {integral.integral_type()}; dx and"
                     " ds(name) are what there is: functions of Crouzeix-Raviart jump across facets"
                 )
+            over, inside = integral.subdomain_id(), integral.integral_type() == "cell"
+            given = over if isinstance(over, tuple) else (over,)
+            known = ("everywhere",) if inside else tuple(self._parts.values())
+            if not all(each in known for each in given):
+                kind = "dx" if inside else "ds"
+                raise InputError(
+                    f"form: {name} has {kind} over the subdomain {over}; the dx and the ds(name)"
+                    " that it is given are what there is, the name that of a boundary part; where"
+                    " cells differ, Functions of degree 0 say so"
+                )
             if _order(integral.integrand()) > 1:
                 raise InputError(
                     f"form: {name} has derivatives of second order or more, which are 0 for"
