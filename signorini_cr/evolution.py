@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
+from numbers import Real
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -240,9 +241,9 @@ def solve_in_time(
     capacities = {name: each.capacity for name, each in problem.materials.items()}
     own = {name: each for name, each in capacities.items() if each is not None}
     for name, each in {"": capacity, **own}.items():
-        if not (each > 0.0 and np.isfinite(each)):
+        if not (isinstance(each, Real) and 0.0 < each < np.inf):
             of = f" of {name}" if name else ""
-            raise InputError(f"capacity{of} is {each}; it must be above 0")
+            raise InputError(f"capacity{of} is {each!r}; it must be a number above 0")
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")
     x = ufl.SpatialCoordinate(domain.mesh)

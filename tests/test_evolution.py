@@ -241,7 +241,8 @@ def test_what_goes_on_for_long_stands_still():
         ({"end": 0.0}, "end is 0.0"),
         ({"steps": 0}, "steps is 0"),
         ({"scheme": "crank"}, "one of euler, bdf2"),
-        ({"capacity": -1.0}, "capacity is -1.0"),
+        ({"capacity": -1.0}, "capacity is -1.0; it must be a number above 0"),
+        ({"capacity": lambda x: x[0]}, "capacity is <function .*>; it must be a number above 0"),
         ({"levels": 0}, "levels is 0"),
     ],
 )

@@ -7,7 +7,7 @@ value can be trusted: no data are refused for what rounding has made of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
-from ..fem.conditions import facets_of, negative
+from ..fem.conditions import facets_of, is_by_cells, negative
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, function_space, ghosted_vector
 from ..garbage import release
@@ -118,16 +118,16 @@ def check_operator(forms: Forms, domain: Domain) -> None:
     if forms.problem.form is not None:
         raise_together(comm, _bad_form(forms, domain))
     _raise_first(comm, _bad_coefficient(forms, domain))
-    _raise_first(comm, _negative(_Values(forms.reaction, domain), _middles(domain), REACTION))
+    at, owner = _middles(domain), _owner(forms, domain, "reaction")
+    names = {"": "the reaction"} | {m: f"the reaction of {m!r}" for m in forms.problem.materials}
+    _raise_first(comm, _unfit(_Values(forms.reaction, domain), at, lambda cell: names[owner(cell)]))
     for condition in forms.conditions:
         if condition.loss is not None:
             facets = _Facets.of(domain, condition.number)
             at = facets.x.mean(axis=1), facets.cells
             name = f"the coefficient of the part {condition.part!r}"
-            _raise_first(comm, _negative(_Values(condition.loss, domain), at, name))
-
-
-REACTION = "the reaction"
+            loss = _Values(condition.loss, domain)
+            _raise_first(comm, _unfit(loss, at, lambda _: name))
 
 
 def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
@@ -137,17 +137,34 @@ def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
     return compute_midpoints(domain.mesh, tdim, cells), cells
 
 
-def _negative(datum: _Values, at: tuple[FloatArray, Int32Array], name: str) -> list[Complaint]:
-    """Where a datum is below 0 that must not be."""
+def _owner(forms: Forms, domain: Domain, datum: str) -> Callable[[int], str]:
+    """Tell which material a cell's datum is from, "" for none: `Problem`'s own."""
+    own = [m for m, data in forms.problem.materials.items() if getattr(data, datum) is not None]
+    where = {material: domain.materials.where(material) for material in own}
+    return lambda cell: next((material for material in own if where[material][cell]), "")
+
+
+def _unfit(
+    datum: _Values, at: tuple[FloatArray, Int32Array], name: Callable[[int], str]
+) -> list[Complaint]:
+    """Where a datum is below 0 that must not be; or not finite, and that on all of a cell.
+
+    Args:
+        datum: It.
+        at: Points, and their cells.
+        name: What it is called in a cell.
+    """
     x, cells = at
     found = datum.at(x, cells, datum.precision.points)
     if found is None:
         return []
     values, errors = found
     complaints = []
-    for i in np.flatnonzero(values < -errors):
+    endless = ~np.isfinite(values) & is_by_cells(datum.expression)
+    for i in np.flatnonzero(endless | (values < -errors)):
         where = place(x[i], datum.mesh)
-        said = f"{name} is {values[i]:.10g} at {shown(where)}; it must not be below 0"
+        rule = "be finite" if endless[i] else "not be below 0"
+        said = f"{name(cells[i])} is {values[i]:.10g} at {shown(where)}; it must {rule}"
         complaints.append((where, said))
     return complaints
 
@@ -523,7 +540,9 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
         if not crooked[i]:
             said = f"is [{rows}], with the eigenvalue {least[i]:.10g}; "
         said += "a symmetric positive definite tensor is needed"
-    return [(where, f"data.coefficient: the value at {shown(where)} {said}")]
+    material = _owner(forms, domain, "coefficient")(cells[i])
+    key = f"material.{material}" if material else "data"
+    return [(where, f"{key}.coefficient: the value at {shown(where)} {said}")]
 
 
 def _bad_form(forms: Forms, domain: Domain) -> str | None:

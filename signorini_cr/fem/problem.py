@@ -249,8 +249,9 @@ class Forms:
         ):
             raise InputError("a form takes the coefficient's place; only one of them can be given")
         self.kappa = self._by_material("coefficient", problem.coefficient, materials)
-        if self.uniform and not float(self.kappa) > 0.0:
-            raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
+        if self.uniform and not 0.0 < float(self.kappa) < np.inf:
+            said = "finite and above 0" if float(self.kappa) > 0.0 else "above 0"
+            raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be {said}")
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
         # UFL can't differentiate a number
         level = self.exact is None or number(self.exact) is not None or problem.form is not None
