@@ -196,7 +196,7 @@ def check_pieces(physics: Diffusion, domain: Domain) -> None:
     )
     # without a loose piece nothing needs to be assembled
     if Loose.of(level.V, fixed).count and level.loose is not None:
-        level.loose.check(level.system)
+        level.loose.check(level.system, level.data.inflow())
 
 
 class Start(NamedTuple):
@@ -234,7 +234,7 @@ def solve_level(
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
     u, residual = system.start(), fem.Function(level.V)
     if level.loose is not None:
-        level.loose.check(system)
+        level.loose.check(system, level.data.inflow())
     if start.known is not None:
         known_start(start.known, level, u)
     elif start.coarser is not None:
