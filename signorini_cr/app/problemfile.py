@@ -177,7 +177,16 @@ class ProblemFile:
             check_pieces(forms, domain)  # capacity would hold all
         else:
             self.time.check(forms, domain)
-        return doubts(forms, domain)
+        return [*self._of_no_material(domain), *doubts(forms, domain)]
+
+    @staticmethod
+    def _of_no_material(domain: Domain) -> list[str]:
+        """Say which physical surfaces of a mesh file have no section, where others have."""
+        return [
+            f"the physical surface {name} has no section [material.{name}]: all its data are those"
+            " of [data]"
+            for name in domain.materials.others
+        ]
 
     def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:
         """Solve step by step what has a [time]; collective.

@@ -503,7 +503,8 @@ def _distribute(
     materials = Materials()
     if numbers:
         corners, of_cells = distribute_entity_data(mesh, 2, raw.triangles, raw.materials)
-        materials = Materials(numbers, np.zeros(_count(mesh, 2), dtype=np.int32))
+        others = comm.bcast(raw.others)
+        materials = Materials(numbers, np.zeros(_count(mesh, 2), dtype=np.int32), others)
         mesh.topology.create_connectivity(2, 2)
         cells = meshtags_from_entities(mesh, 2, adjacencylist(corners), of_cells)
         materials.of_cells[cells.indices] = cells.values

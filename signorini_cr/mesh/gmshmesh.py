@@ -55,6 +55,7 @@ class Triangulation(NamedTuple):
         labels: Index of each facet's label, shape (facets,).
         materials: Number of each triangle's material, 0 for none, shape (triangles,); empty where
             none has a name.
+        others: Named physical surfaces beside the materials, where there are such.
     """
 
     points: FloatArray
@@ -62,6 +63,7 @@ class Triangulation(NamedTuple):
     facets: Int64Array
     labels: Int32Array
     materials: Int32Array = np.empty(0, dtype=np.int32)
+    others: tuple[str, ...] = ()
 
 
 def _keep_sigpipe() -> None:
@@ -246,14 +248,19 @@ def read(
     triangles = file.elements(_TRIANGLE)
     raw = _compact(file.tags, file.points, triangles, facets, labels)
     if materials:
-        raw = raw._replace(materials=_of_materials(file, path, materials))
+        numbers, without = _of_materials(file, path, materials)
+        raw = raw._replace(materials=numbers, others=without)
     _check_names(triangles, facets, others, path, tuple(parts))
     _check_facets(raw, path, {label: name for name, label in parts.items()})
     return raw
 
 
-def _of_materials(file: MshFile, path: Path, materials: Mapping[str, int]) -> Int32Array:
+def _of_materials(
+    file: MshFile, path: Path, materials: Mapping[str, int]
+) -> tuple[Int32Array, tuple[str, ...]]:
     """The number of the physical surface that each triangle lies in, or 0, shape (triangles,).
+
+    Beside them the names of the surfaces of which no triangle has a material.
 
     Raises:
         InputError: There is no such surface, or two of them have a triangle in common.
@@ -280,7 +287,12 @@ def _of_materials(file: MshFile, path: Path, materials: Mapping[str, int]) -> In
                 f"{path}: no physical surface with triangles is named {name!r}; the names there"
                 f" are: {', '.join(there) or 'none'}"
             )
-    return numbers
+    tagged, bare = set[int](), set[int]()
+    for block in blocks:
+        own = any(called[name] & block.groups for name in materials)
+        (tagged if own else bare).update(block.groups if len(block.nodes) else ())
+    names = {file.names.get((2, tag), "").strip() for tag in bare - tagged}
+    return numbers, tuple(sorted(names - {""}))
 
 
 def _check_names(
