@@ -11,20 +11,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
+from numbers import Real
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
+from ufl.core.expr import Expr
 
-from .arrays import FloatArray
+from .arrays import FloatArray, Int32Array
+from .data.admissible import check_operator
 from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
 from .data.moments import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError
-from .fem.conditions import Data, number
+from .fem.conditions import Data, is_by_cells
 from .fem.problem import Problem, as_expression
 from .levels import Start, solve_level
 from .mesh.domain import Domain
@@ -36,6 +40,9 @@ from .vi.level import Level
 
 SCHEMES = ("euler", "bdf2")
 
+Refined = tuple[Domain, Int32Array]
+"""A mesh, and the cell of the one below that holds each of its cells."""
+
 
 class Clock(Protocol):
     """What has a time that can be set, as dolfinx's Constant."""
@@ -46,8 +53,9 @@ class Clock(Protocol):
 class Solver:
     """A problem on one mesh, set up once; for a `with` block, which frees what it holds.
 
-    What a_h is made of, κ, c and b, must stay. Everything else may change between solves: the
-    values of dolfinx Constants that f, g, u_D and obstacles hold, and a source of its own.
+    Between solves dolfinx Constants, and Functions of degree 0, in the data may get other values,
+    and there may be a source of its own. What they change is assembled anew and nothing else: the
+    matrix and multigrid only where a_h holds one of them, in κ, c or b.
     """
 
     def __init__(
@@ -69,24 +77,45 @@ class Solver:
         if levels > 1:
             check_refinable(domain.mesh)
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
+        self.physics, self._domain = physics, domain
+        self._refined: list[Refined] = [] if like is None else like._refined
         physics.check(domain)
-        hierarchy = Hierarchy(physics, domain)
         if like is None:
             for _ in range(levels - 1):
-                hierarchy.add(*refine(hierarchy.meshes[-1].domain))
-        else:
-            for mesh in like._hierarchy.meshes[1:]:
-                assert mesh.parents is not None
-                hierarchy.add(mesh.domain, mesh.parents.cell)
-        self.physics = physics
-        self._hierarchy: Hierarchy = hierarchy
-        self._level = Level(hierarchy.meshes)
+                self._refined.append(refine(self._refined[-1][0] if self._refined else domain))
+        self._stack = ExitStack()
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """Assemble the matrix with the data as they are, and set up multigrid; collective."""
+        self._hierarchy = Hierarchy(self.physics, self._domain)
+        for refined in self._refined:
+            self._hierarchy.add(*refined)
+        self._carry_down()
+        self._level = Level(self._hierarchy.meshes)
         self._held = self._level.loose is None
         system = self._level.system
-        self._stack = ExitStack()
-        self._stack.callback(hierarchy.free)
-        lent = hierarchy.multigrid(system.operator, system.owned_dirichlet)
+        self._stack.callback(self._hierarchy.free)
+        lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet)
         self._cycle = self._stack.enter_context(lent)
+        self._assembled = self.physics.a.values()
+
+    def _carry_down(self) -> None:
+        """Give the data's Functions of degree 0 on all meshes the values they have by now."""
+        for function in self.physics.functions:
+            above = function
+            for fine, parents in self._refined:
+                own = fine.own(function)
+                here, there = (each.function_space.dofmap.list[:, 0] for each in (own, above))
+                own.x.array[here[: len(parents)]] = above.x.array[there[parents]]
+                above = own
+
+    def _changed(self) -> bool:
+        """Whether a_h would be another one by now; collective."""
+        now = self.physics.a.values()
+        pairs = zip(now, self._assembled, strict=True)
+        changed = not all(np.array_equal(one, other) for one, other in pairs)
+        return self._domain.mesh.comm.allreduce(changed, op=MPI.LOR)
 
     def __enter__(self) -> Self:
         """Begin."""
@@ -119,7 +148,7 @@ class Solver:
         """Solve with the data as they are now; collective.
 
         Args:
-            source: Added to f, a function in `V`, ghosts up to date.
+            source: Added to f, a function like those in `V`, ghosts up to date.
             before: What to start from, with its active set; from this solver.
             rate: What the source is multiplied by, one number or one for each owned cell, see
                 `by_material`.
@@ -128,6 +157,11 @@ class Solver:
             InputError: As for `solve`.
             NotConverged: As for `solve`.
         """
+        self._carry_down()
+        if self._changed():
+            check_operator(self.physics, self._domain)
+            self.close()
+            self._set_up()
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
         own = None if source is None else source.x.array
         data = diffusion(self._level.data).renewed(own, np.asarray(rate, dtype=np.float64))
@@ -176,13 +210,12 @@ def solve_in_time(
 ) -> Iterator[tuple[float, Solution]]:
     """Solve capacity ∂u/∂t − ∇·(κ∇u) + c u = f with contact, step by step; collective.
 
-    The matrix is assembled once. Every step starts from the last one with its active set; its
-    certificate is that of its own problem, in which the steps before are data: it says nothing of
-    what the step's length does to u.
+    The matrix is assembled once, and anew where κ, c or b depend on the time. Every step starts
+    from the last one with its active set; its certificate is that of its own problem, in which the
+    steps before are data: it says nothing of what the step's length does to u.
 
     Args:
-        problem: The data. What depends on the time t holds a Constant on the domain's mesh; κ, c
-            and b must not.
+        problem: The data. What depends on the time t holds a Constant on the domain's mesh.
         domain: The coarsest mesh of multigrid, and its boundary parts.
         end: The last time; the first is 0.
         steps: How many steps of the same length there are.
@@ -244,28 +277,28 @@ def _capacities(problem: Problem, usual: float) -> dict[str, float]:
     given = {name: each.capacity for name, each in problem.materials.items()}
     own = {name: each for name, each in given.items() if each is not None}
     for name, each in {"": usual, **own}.items():
-        if not (each > 0.0 and np.isfinite(each)):
+        if not (isinstance(each, Real) and 0.0 < each < np.inf):
             of = f" of {name}" if name else ""
-            raise InputError(f"capacity{of} is {each}; it must be above 0")
+            raise InputError(f"capacity{of} is {each!r}; it must be a number above 0")
     return own
 
 
-def _reactions(problem: Problem, domain: Domain) -> dict[str, float]:
-    """The reactions, numbers, of materials that have their own, by name; "" is for all others."""
+def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:
+    """The reactions of materials that have their own, by name; "" is for all others."""
     given = {name: each.reaction for name, each in problem.materials.items()}
-    x, found = ufl.SpatialCoordinate(domain.mesh), {}
-    for name, each in {"": problem.reaction, **given}.items():
-        if each is None:
-            continue
-        value = number(as_expression(each, x))
-        if value is None:
-            raise InputError("problems in time need a reaction that is a number in each material")
-        found[name] = value
+    x = ufl.SpatialCoordinate(domain.mesh)
+    found = {
+        name: as_expression(each, x)
+        for name, each in {"": problem.reaction, **given}.items()
+        if each is not None
+    }
+    if not all(map(is_by_cells, found.values())):
+        raise InputError("problems in time need a reaction that is a number on each cell")
     return found
 
 
 def _stepping(
-    problem: Problem, reactions: Mapping[str, float], rates: Mapping[str, float]
+    problem: Problem, reactions: Mapping[str, Expr], rates: Mapping[str, float]
 ) -> Problem:
     """The problem of a step: c + rate in the place of c.
 

@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 from dolfinx import fem
 
+from .data.admissible import NOT_DEFINITE
 from .diffusion import Diffusion
 from .errors import InputError, NotConverged
+from .fem.conditions import facets_of
 from .fem.physics import Physics
 from .fem.problem import Problem
 from .limits import Limits
@@ -18,12 +20,13 @@ from .mesh.balance import Refined
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.cycle import Multigrid
-from .multigrid.hierarchy import Hierarchy
+from .multigrid.hierarchy import Hierarchy, NestedMesh
 from .restart import Restart
 from .solution import Solution
 from .vi.contact import contact_facts
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
+from .vi.pieces import Loose
 from .vi.solver import solve_vi
 from .vi.system import System
 
@@ -180,6 +183,22 @@ def solve_physics(
     hierarchy.free()
 
 
+def check_pieces(physics: Diffusion, domain: Domain) -> None:
+    """Insist that something holds each piece that a domain falls into; collective.
+
+    Raises:
+        InputError: A piece has no Dirichlet facet, no reaction and no loss, and is not pressed onto
+            an obstacle.
+    """
+    level = Level((NestedMesh(physics, domain),))
+    fixed = fem.locate_dofs_topological(
+        level.V, domain.mesh.topology.dim - 1, facets_of(domain, physics.fixed)
+    )
+    # without a loose piece nothing needs to be assembled
+    if Loose.of(level.V, fixed).count and level.loose is not None:
+        level.loose.check(level.system, level.data.inflow())
+
+
 class Start(NamedTuple):
     """What a solve starts from: zero, unless there is something here.
 
@@ -215,7 +234,7 @@ def solve_level(
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
     u, residual = system.start(), fem.Function(level.V)
     if level.loose is not None:
-        level.loose.check(system)
+        level.loose.check(system, level.data.inflow())
     if start.known is not None:
         known_start(start.known, level, u)
     elif start.coarser is not None:
@@ -232,6 +251,8 @@ def solve_level(
                 cycle, vectors, system.residual_scale, monitor=told, row_sums=system.row_sums
             )
     except NotConverged as failure:
+        if level.physics.problem.form is not None and "DIVERGED_INDEFINITE" in failure.reason:
+            raise InputError(f"{NOT_DEFINITE}; level {level.number} shows it") from None
         raise NotConverged(failure.reason, level.number) from None
     for function in (u, residual):
         function.x.scatter_forward()

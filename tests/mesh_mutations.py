@@ -213,7 +213,7 @@ def outcome(path: Path, data: bytes) -> tuple[str, str]:
     path.write_bytes(data)
     began = time.perf_counter()
     try:
-        raw = read(path, PARTS, USUAL, USUAL)
+        raw = read(path, PARTS, USUAL)
     except InputError as error:
         words = str(error)
         good = words.startswith(f"{path}: ") and "\n" not in words and len(words) < 600

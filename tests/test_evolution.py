@@ -10,13 +10,16 @@ from scipy.optimize import lsq_linear
 from signorini_cr import (
     Contact,
     Dirichlet,
+    Form,
     InputError,
     Neumann,
     Polygon,
     Problem,
+    Robin,
     Solver,
     solve,
     solve_in_time,
+    solve_levels,
 )
 
 WORLD = MPI.COMM_WORLD
@@ -145,6 +148,78 @@ def test_steps_are_those_of_problems_with_a_reaction():
     assert mine.energy == pytest.approx(other.energy, rel=1e-4)
 
 
+WALLS = {"right": Neumann(), "top": Dirichlet(0.0), "left": Neumann()}
+
+
+def by_cells(domain, value):
+    function = fem.Function(fem.functionspace(domain.mesh, ("DG", 0)))
+    function.x.array[:] = value
+    return function
+
+
+def by_a_number(domain, value):
+    return fem.Constant(domain.mesh, value)
+
+
+@pytest.mark.parametrize("make", [by_cells, by_a_number])
+@pytest.mark.parametrize("levels", [1, 3])
+@pytest.mark.parametrize("where", ["f", "obstacle", "coefficient", "reaction", "b", "form"])
+def test_what_changes_between_solves_is_assembled_anew(make, levels, where):
+    """Also on meshes below, and with its certificate: all as if it had never been another."""
+    domain = SQUARE.mesh(0.35)
+    datum = make(domain, 1.0)
+    data = {where: datum} if where in ("f", "coefficient", "reaction") else {}
+    if where == "form":
+        data = {"form": Form(lambda u, v, dx, ds: datum * ufl.inner(ufl.grad(u), ufl.grad(v)) * dx)}
+    conditions = WALLS | {"floor": Contact(-0.1 * datum if where == "obstacle" else -0.1)}
+    if where == "b":
+        conditions["right"] = Robin(coefficient=datum, external=-0.3)
+    problem = Problem(**{"f": -4.0, "conditions": conditions} | data)
+    with Solver(problem, domain, levels) as solver:
+        before = solver.solve()
+        if make is by_cells:
+            datum.x.array[:] = 6.0
+        else:
+            datum.value = 6.0
+        after = solver.solve(before=before)
+    *_, wanted = solve_levels(problem, domain, levels)
+    assert np.allclose(after.u.x.array, wanted.u.x.array, rtol=0, atol=1e-7)
+    assert abs(after.energy - before.energy) > 0.01
+    assert after.contact.force == pytest.approx(wanted.contact.force, rel=1e-6, abs=1e-9)
+    found, alone = after.certificate, wanted.certificate
+    if where == "form":
+        assert found.bound_h1 is None
+    else:
+        assert found.bound_energy_norm == pytest.approx(alone.bound_energy_norm, rel=1e-4)
+
+
+@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+def test_all_of_the_equation_may_depend_on_the_time(scheme):
+    """u = (1 + t) y is in the space, and both schemes are exact for it."""
+    domain = SQUARE.mesh(0.4)
+    t = clock(domain)
+    u, kappa = lambda x: (1 + t) * x[1], 1 + t**2
+    problem = Problem(
+        f=lambda x: x[1] + 2 * t * u(x),
+        coefficient=lambda x: kappa,
+        reaction=lambda x: 2 * t,
+        conditions={
+            "floor": Contact(-9.0, g=lambda x: -kappa * (1 + t)),
+            "right": Robin(lambda x: 3 * t * u(x), coefficient=3 * t),
+            "top": Robin(lambda x: kappa * (1 + t) + t * u(x), coefficient=t),
+            "left": Neumann(),
+        },
+    )
+    steps = solve_in_time(
+        problem, domain, end=1.0, steps=4, scheme=scheme, time=t, initial=lambda x: x[1], levels=2
+    )
+    for time, solution in steps:
+        exact = fem.Function(solution.u.function_space)
+        exact.interpolate(lambda x, now=time: (1 + now) * x[1])
+        assert np.allclose(solution.u.x.array, exact.x.array, rtol=0, atol=1e-7)
+        assert 0.0 <= solution.certificate.bound_energy_norm < 1e-5
+
+
 def test_what_goes_on_for_long_stands_still():
     """u_n tends to the stationary solution; steps then take nothing; multigrid, with its meshes."""
     domain = SQUARE.mesh(0.3)
@@ -166,7 +241,8 @@ def test_what_goes_on_for_long_stands_still():
         ({"end": 0.0}, "end is 0.0"),
         ({"steps": 0}, "steps is 0"),
         ({"scheme": "crank"}, "one of euler, bdf2"),
-        ({"capacity": -1.0}, "capacity is -1.0"),
+        ({"capacity": -1.0}, "capacity is -1.0; it must be a number above 0"),
+        ({"capacity": lambda x: x[0]}, "capacity is <function .*>; it must be a number above 0"),
         ({"levels": 0}, "levels is 0"),
     ],
 )

@@ -16,15 +16,17 @@ from typing import Any
 import numpy as np
 import ufl
 from mpi4py import MPI
+from ufl.algorithms.analysis import extract_constants
 
 from ..adaptive import solve_adaptive
 from ..arrays import FloatArray
-from ..data.admissible import check_data
+from ..data.admissible import check_data, check_operator
 from ..data.consistency import doubts
+from ..diffusion import Diffusion
 from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
-from ..levels import solve_levels
+from ..levels import check_pieces, solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
@@ -96,6 +98,20 @@ class Time:
     capacity: float
     clock: Clock
 
+    def check(self, forms: Forms, domain: Domain) -> None:
+        """Try out at all times what a_h is made of, where that depends on them; collective."""
+        losses = [c.loss for c in forms.conditions if c.loss is not None]
+        if not any(map(extract_constants, (forms.kappa, forms.reaction, *losses))):
+            return
+        start = self.clock.value
+        for step in range(1, self.steps + 1):
+            self.clock.value = self.end * step / self.steps
+            try:
+                check_operator(forms, domain)
+            except InputError as error:
+                raise InputError(f"{error}, at the time {self.clock.value:g}") from None
+        self.clock.value = start
+
 
 @dataclass(frozen=True, eq=False)
 class ProblemFile:
@@ -154,20 +170,33 @@ class ProblemFile:
 
         Raises:
             InputError: An expression is not finite where it is needed, the coefficient is not
-                positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, or the last mesh
-                of the sequence would be absurdly large.
+                positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, nothing holds a
+                piece of the domain, or the last mesh of the sequence would be absurdly large.
         """
         topology = domain.mesh.topology
         cells = topology.index_map(topology.dim).size_global
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         check_values(self.expressions, domain)
-        forms = Forms(self.problem, domain.mesh, parts=domain.parts, materials=domain.materials)
+        forms = Diffusion(self.problem, domain.mesh, "CR", domain.parts, domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
         check_data(forms, domain)
-        return doubts(forms, domain)
+        if self.time is None:
+            check_pieces(forms, domain)  # capacity would hold all
+        else:
+            self.time.check(forms, domain)
+        return [*self._of_no_material(domain), *doubts(forms, domain)]
+
+    @staticmethod
+    def _of_no_material(domain: Domain) -> list[str]:
+        """Say which physical surfaces of a mesh file have no section, where others have."""
+        return [
+            f"the physical surface {name} has no section [material.{name}]: all its data are those"
+            " of [data]"
+            for name in domain.materials.others
+        ]
 
     def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:
         """Solve step by step what has a [time]; collective.
@@ -566,11 +595,9 @@ def _time(
         raise InputError('refine.mode: a problem in time needs "uniform": its meshes do not change')
     if "exact.u" in expressions:
         raise InputError("exact.u: a problem in time has none")
-    for key, expression in expressions.items():
-        fixed = bare(key).endswith((".coefficient", ".reaction")) or key == "time.initial"
-        if fixed and expression.depends_on_time:
-            raise InputError(f"{key}: this must not depend on t")
     initial = expressions.get("time.initial")
+    if initial is not None and initial.depends_on_time:
+        raise InputError("time.initial: this must not depend on t")
     return Time(
         end=get(table, "time", "end", positive, needed="a number above 0, the last time,"),
         steps=_steps(get(table, "time", "steps", whole, needed="a whole number, of steps,")),

@@ -193,8 +193,9 @@ ABOUT = {
     "exact": "Optional.",
     "refine": "Optional.",
     "time": "Optional: capacity ∂u/∂t − ∇·(κ∇u) + c u = f, step by step. `t` may then stand in "
-    "every expression but those of κ, c and the coefficients of parts. The bound of a step is that "
-    "of its own problem, in which the steps before are data.",
+    "every expression; where those of κ, c or the coefficients of parts hold it, the matrix is "
+    "assembled anew in each step. The bound of a step is that of its own problem, in which the "
+    "steps before are data.",
     "units": "Optional. What is printed, written and drawn says them; nothing is converted, all "
     "data are to be in these units.",
     "names": "Optional. What stands in pictures beside x, y, u and the pressure.",

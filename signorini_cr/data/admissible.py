@@ -7,7 +7,7 @@ value can be trusted: no data are refused for what rounding has made of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -17,12 +17,15 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.mesh import Mesh, compute_midpoints, entities_to_geometry
 from mpi4py import MPI
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
 
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
-from ..fem.conditions import negative
+from ..fem.conditions import facets_of, is_by_cells, negative
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, function_space, ghosted_vector
 from ..garbage import release
@@ -61,6 +64,19 @@ SHORTEST = 1e3
 """Length of the shortest intervals, in units of the points' rounding."""
 
 
+FACTORISED = 100_000
+"""Largest matrix of a form of the user's own that is looked at for eigenvalues below 0."""
+
+DEFINITE = 1e-13
+"""What is no eigenvalue of a matrix whose diagonal is 1: a stiff part in one 1e12 times as soft has
+1e-12."""
+
+NOT_DEFINITE = (
+    "form: a(u, u) is not above 0 for all u that vanish on the dirichlet parts; without that there"
+    " may be no solution"
+)
+
+
 def check_data(forms: Forms, domain: Domain) -> None:
     """Insist on data for which there is a solution; collective.
 
@@ -72,17 +88,8 @@ def check_data(forms: Forms, domain: Domain) -> None:
         InputError: κ, or the user's form, is not symmetric and positive definite, u_D jumps, or α
             is above u_D where Γ0 meets Γ1. The message names the point and the values.
     """
+    check_operator(forms, domain)
     comm = domain.mesh.comm
-    if forms.problem.form is not None:
-        raise_together(comm, _bad_form(forms, domain))
-    _raise_first(comm, _bad_coefficient(forms, domain))
-    _raise_first(comm, _negative(_Values(forms.reaction, domain), _middles(domain), REACTION))
-    for condition in forms.conditions:
-        if condition.loss is not None:
-            facets = _Facets.of(domain, condition.number)
-            at = facets.x.mean(axis=1), facets.cells
-            name = f"the coefficient of the part {condition.part!r}"
-            _raise_first(comm, _negative(_Values(condition.loss, domain), at, name))
     fixed = [(_Values(c.fixed, domain), _Facets.of(domain, c.number)) for c in forms.fixed]
     for condition, (u_D, facets) in zip(forms.fixed, fixed, strict=True):
         _raise_first(comm, _jump(u_D, facets, condition.source))
@@ -105,7 +112,22 @@ def check_data(forms: Forms, domain: Domain) -> None:
             _raise_first(comm, _crossed(lower, upper, domain, bounded, contact.label))
 
 
-REACTION = "the reaction"
+def check_operator(forms: Forms, domain: Domain) -> None:
+    """Insist on an a_h that is an energy, as `check_data` does; collective."""
+    comm = domain.mesh.comm
+    if forms.problem.form is not None:
+        raise_together(comm, _bad_form(forms, domain))
+    _raise_first(comm, _bad_coefficient(forms, domain))
+    at, owner = _middles(domain), _owner(forms, domain, "reaction")
+    names = {"": "the reaction"} | {m: f"the reaction of {m!r}" for m in forms.problem.materials}
+    _raise_first(comm, _unfit(_Values(forms.reaction, domain), at, lambda cell: names[owner(cell)]))
+    for condition in forms.conditions:
+        if condition.loss is not None:
+            facets = _Facets.of(domain, condition.number)
+            at = facets.x.mean(axis=1), facets.cells
+            name = f"the coefficient of the part {condition.part!r}"
+            loss = _Values(condition.loss, domain)
+            _raise_first(comm, _unfit(loss, at, lambda _: name))
 
 
 def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
@@ -115,17 +137,34 @@ def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
     return compute_midpoints(domain.mesh, tdim, cells), cells
 
 
-def _negative(datum: _Values, at: tuple[FloatArray, Int32Array], name: str) -> list[Complaint]:
-    """Find where a datum is below 0 that must not be."""
+def _owner(forms: Forms, domain: Domain, datum: str) -> Callable[[int], str]:
+    """Tell which material a cell's datum is from, "" for none: `Problem`'s own."""
+    own = [m for m, data in forms.problem.materials.items() if getattr(data, datum) is not None]
+    where = {material: domain.materials.where(material) for material in own}
+    return lambda cell: next((material for material in own if where[material][cell]), "")
+
+
+def _unfit(
+    datum: _Values, at: tuple[FloatArray, Int32Array], name: Callable[[int], str]
+) -> list[Complaint]:
+    """Find where a datum is below 0 that must not be; or not finite, and that on all of a cell.
+
+    Args:
+        datum: It.
+        at: Points, and their cells.
+        name: What it is called in a cell.
+    """
     x, cells = at
     found = datum.at(x, cells, datum.precision.points)
     if found is None:
         return []
     values, errors = found
     complaints = []
-    for i in np.flatnonzero(values < -errors):
+    endless = ~np.isfinite(values) & is_by_cells(datum.expression)
+    for i in np.flatnonzero(endless | (values < -errors)):
         where = place(x[i], datum.mesh)
-        said = f"{name} is {values[i]:.10g} at {shown(where)}; it must not be below 0"
+        rule = "be finite" if endless[i] else "not be below 0"
+        said = f"{name(cells[i])} is {values[i]:.10g} at {shown(where)}; it must {rule}"
         complaints.append((where, said))
     return complaints
 
@@ -551,7 +590,9 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
         if not crooked[i]:
             said = f"is [{rows}], with the eigenvalue {least[i]:.10g}; "
         said += "a symmetric positive definite tensor is needed"
-    return [(where, f"data.coefficient: the value at {shown(where)} {said}")]
+    material = _owner(forms, domain, "coefficient")(cells[i])
+    key = f"material.{material}" if material else "data"
+    return [(where, f"{key}.coefficient: the value at {shown(where)} {said}")]
 
 
 def _bad_form(forms: Forms, domain: Domain) -> str | None:
@@ -564,18 +605,59 @@ def _bad_form(forms: Forms, domain: Domain) -> str | None:
     functions[1].interpolate(lambda x: np.cos(2.0 + 13.0 * x[0] - 5.0 * x[1]))
     x, y, image = (*(ghosted_vector(V, each.x.array) for each in functions), A.createVecLeft())
     A.mult(x, image)
-    there, energy = image.dot(y), image.dot(x)
+    there = image.dot(y)
     A.mult(y, image)
     skew, size = abs(there - image.dot(x)), A.norm() * x.norm() * y.norm()
     least = A.getDiagonal().min()[1]
+    fixed = fem.locate_dofs_topological(
+        V, domain.mesh.topology.dim - 1, facets_of(domain, forms.fixed)
+    )
+    rows = A.getValuesCSR() if A.getSize()[0] <= FACTORISED else None
     release(A, x, y, image)
     if not np.isfinite(size):
         return "form: a(u, v) is not finite at some point of the mesh"
     if skew > TOLERANCE * size:
         return "form: a(u, v) is not a(v, u); without symmetry this is no problem of least energy"
-    if least <= 0.0 or energy < -TOLERANCE * size:
-        return "form: a(u, u) is not above 0 for all u; without that there may be no solution"
-    return None
+    if least <= 0.0:
+        return NOT_DEFINITE
+    if rows is None:
+        return None
+    comm, held = domain.mesh.comm, V.dofmap.index_map.local_to_global(fixed)
+    found = comm.gather((*rows, held))
+    definite = None if found is None else _definite(found)
+    return None if comm.bcast(definite) else NOT_DEFINITE
+
+
+def _definite(ranks: Sequence[tuple[IndexArray, IndexArray, FloatArray, Int64Array]]) -> bool:
+    """Whether a symmetric matrix is definite but for constants, which obstacles may hold.
+
+    By Sylvester's law of inertia there are as many eigenvalues below 0 as pivots.
+
+    Args:
+        ranks: Of each rank the rows, as PETSc has them, and which unknowns are not free.
+    """
+    starts, columns, values, held = zip(*ranks, strict=True)
+    counts = np.concatenate([np.diff(start) for start in starts])
+    start = np.concatenate([[0], np.cumsum(counts)])
+    A = csr_array((np.concatenate(values), np.concatenate(columns), start))
+    free = np.setdiff1d(np.arange(len(counts)), np.concatenate(held))
+    A = A[free][:, free]
+    scale = diags_array(1.0 / np.sqrt(A.diagonal()))
+    of_constants = np.abs(scale @ (A @ np.ones(len(free))))
+    A = scale @ A @ scale
+    number, piece = connected_components(A, directed=False)
+    loose = np.count_nonzero(np.bincount(piece, of_constants, number) <= TOLERANCE)
+    negative_pivots = []
+    for sign in (1.0, -1.0):
+        shifted = csc_array(A + sign * DEFINITE * eye_array(len(free)))
+        try:
+            factors = splu(
+                shifted, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError:  # a pivot is 0
+            return False
+        negative_pivots.append(np.count_nonzero(factors.U.diagonal() <= 0.0))
+    return negative_pivots[0] == 0 and negative_pivots[1] <= loose
 
 
 def place(x: FloatArray, mesh: Mesh) -> tuple[float, ...]:

@@ -8,18 +8,24 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import ufl
 from dolfinx import fem
+from mpi4py import MPI
+from ufl.core.expr import Expr
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array
-from ..fem.cells import Cells, vertex_rows
-from ..fem.conditions import Condition, may_change, number
+from ..fem.cells import Cells, measures, vertex_rows
+from ..fem.conditions import Condition, is_by_cells, may_change, number
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
-from ..mesh.domain import Domain, is_by_cells
+from ..mesh.domain import Domain
 from .loads import NeumannMoments, VolumeMoments, chi
-from .moments import Compiled, OnFacets, Tensor
+from .moments import Compiled, OnFacets, Tensor, Trace
+
+FINE = (12, 16)
+"""Degrees of rules that tell a net force from none."""
 
 ONE = np.array(1.0)
 """A rate that changes nothing."""
@@ -59,7 +65,7 @@ class Moments:
         forms, kappa = self.compiled.forms, self.compiled.kappa
         fixed = [condition.number for condition in forms.fixed]
         stretch = kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
-        return Cells(self.domain, self.V, fixed, forms.sinks, stretch)
+        return Cells(self.domain, self.V, fixed, self._sinks(), stretch)
 
     @cached_property
     def of_f(self) -> VolumeMoments:
@@ -88,7 +94,43 @@ class Moments:
         sampled = (
             OnFacets.of(each, self.compiled.trace(each.flux), self.domain) for each in natural
         )
-        return tuple(NeumannMoments(on_facets, self.cells) for on_facets in sampled)
+        return tuple(
+            NeumannMoments(on_facets, self.cells, self._loss(on_facets.condition))
+            for on_facets in sampled
+        )
+
+    def _sinks(self) -> dict[int, FloatArray]:
+        """The parts whose b is above 0, and that on their facets; collective."""
+        conditions = self.compiled.forms.conditions
+        found = {c.number: self._loss(c) for c in conditions if c.loss is not None}
+        return {
+            part: loss
+            for part, loss in found.items()
+            if self.domain.mesh.comm.allreduce(bool((loss > 0.0).all()), op=MPI.LAND)
+        }
+
+    def _loss(self, condition: Condition) -> FloatArray:
+        """The loss b on facets of owned cells, in the order of `Cells.sides`, shape (n,) or ()."""
+        b = _by_cells(self.compiled, self.domain, ufl.as_ufl(condition.loss or 0.0))
+        if not b.ndim:
+            return b
+        facets = self.domain.all_facets[condition.number]
+        cells = facet_entities(self.domain.mesh, facets)[:, 0]
+        return b[cells[cells < len(b)]]
+
+
+def _by_cells(compiled: Compiled, domain: Domain, datum: Expr) -> FloatArray:
+    """Values on owned cells of what is constant there, shape (cells,), or () for a number.
+
+    What varies within cells counts as 0: nothing is certified then.
+    """
+    known = number(datum) if is_by_cells(datum) else 0.0
+    if known is not None:
+        return np.array(known)
+    expression, mesh = compiled.by_cells(datum), domain.mesh
+    which = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
+    values = compat.bound(expression, domain.own).eval(mesh, which)
+    return np.asarray(values, dtype=np.float64).reshape(len(which))
 
 
 class DiffusionOnMesh:
@@ -168,12 +210,7 @@ class DiffusionOnMesh:
     @property
     def reaction(self) -> FloatArray:
         """The reaction c on owned cells, shape (cells,), or () where it is a number."""
-        c = self.forms.reaction
-        if not is_by_cells(c):
-            return np.array(number(c) or 0.0)
-        own = self.domain.own(c)
-        dofs = own.function_space.dofmap.list[: self.cells.number, 0]
-        return np.asarray(own.x.array[dofs], dtype=np.float64)
+        return _by_cells(self.compiled, self.domain, self.forms.reaction)
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:
@@ -227,6 +264,22 @@ class DiffusionOnMesh:
             found = self._assembled(self.forms.chi)
         if self.forms.own_load is not None:
             found += self._assembled(self.forms.own_load)
+        return found
+
+    def inflow(self) -> FloatArray | None:
+        """∫ f + ∫ g over each owned cell by two fine rules; None where more is part of the load."""
+        if self.forms.own_load is not None or self.moments.source is not None:
+            return None
+        cells = self.cells
+        found = np.empty((len(FINE), cells.number))
+        for row, degree in zip(found, FINE, strict=True):
+            f = self.compiled.f.exact_for(degree)
+            row[:] = VolumeMoments.of(f, cells).mean * cells.volume
+            for condition in self.forms.natural:
+                trace = Trace(condition.flux, self.forms.mesh, degree)
+                g = OnFacets.of(condition, trace, self.domain).seen_from(cells)
+                side = g.side(cells)
+                np.add.at(row, side.cells, measures(cells, side) * g.means)
         return found
 
     def of_constants(self) -> FloatArray | None:

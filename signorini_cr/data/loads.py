@@ -11,7 +11,6 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
-from ..fem.conditions import number
 from ..fem.space import facet_quadrature
 from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
@@ -235,20 +234,19 @@ class NeumannMoments:
         side: The facets.
         measure: |F|, shape (n,).
         shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
-        loss: b, where g − b u_h is what is meant in the end; 0 where there is none.
+        loss: b, where g − b u_h is what is meant in the end; 0 where there is none, shape (n,).
         bounded: Whether u is bounded there.
     """
 
-    def __init__(self, sampled: OnFacets, cells: Cells):
-        """Take g's values, and integrate them."""
+    def __init__(self, sampled: OnFacets, cells: Cells, loss: FloatArray):
+        """Take g's values, and integrate them; b has the shape (n,) or ()."""
         g = self.g = sampled.trace
         self.side, self._cells = sampled.side(cells), cells
         self.measure = measures(cells, self.side)
         inside = sampled.seen_from(cells).inside
         self.shares = self.measure * (g.hats.T * g.weights @ inside)
-        condition = sampled.condition
-        self.loss = 0.0 if condition.loss is None else number(condition.loss) or 0.0
-        self.bounded = bool(condition.bounds)
+        self.loss = np.broadcast_to(loss, self.measure.shape)
+        self.bounded = bool(sampled.condition.bounds)
 
     def to_cells(self) -> FloatArray:
         """∫_F g ψ_i for the Crouzeix-Raviart functions of the facet's cell, shape (d + 1, n).
@@ -295,7 +293,7 @@ class Known:
         """
         d = cells.tdim
         side = BoundaryFacets.joined([edge.side for edge in edges], d)
-        loss = np.concatenate([np.full(len(e.measure), e.loss) for e in edges] or [np.empty(0)])
+        loss = np.concatenate([e.loss for e in edges] or [np.empty(0)])
         bounded = [np.full(len(edge.measure), edge.bounded) for edge in edges]
         shares = np.concatenate([np.empty((d, 0)), *(edge.shares for edge in edges)], axis=1)
         if loss.any():
@@ -468,7 +466,7 @@ class Segments:
             total(weights @ values),
             2.0 * total(inside[0]),
             2.0 * np.sqrt(total(inside[1])),
-            np.full(n, edge.loss),
+            edge.loss,
             np.full(n, edge.bounded),
             low,
             reasons[0] if reasons else None,

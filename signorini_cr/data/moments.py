@@ -556,6 +556,7 @@ class Compiled:
         self.forms = forms
         self._rule = Rule(forms.mesh, forms.problem.quadrature_degree)
         self._traces: dict[Expr, Trace] = {}
+        self._by_cells: dict[Expr, fem.Expression] = {}
 
     @cached_property
     def f(self) -> Volume:
@@ -567,6 +568,14 @@ class Compiled:
         """Coefficient; collective."""
         kappa = self.forms.kappa
         return (Tensor if ufl.shape(kappa) else Volume)(kappa, self.forms.mesh, self._rule)
+
+    def by_cells(self, expression: Expr) -> fem.Expression:
+        """What is constant on each cell, at one point there; collective."""
+        if expression not in self._by_cells:
+            middle = Rule(self.forms.mesh, 0).points
+            found = compat.compile_expression(expression, middle, self.forms.mesh)
+            self._by_cells[expression] = found
+        return self._by_cells[expression]
 
     def trace(self, expression: Expr) -> Trace:
         """Values of a condition's datum on facets; collective."""

@@ -114,7 +114,7 @@ class Cells:
         stiffness: |T| ∇λ_i·∇λ_j, shape (pairs, cells).
         volume: |T|, shape (cells,).
         sides: The boundary facets by part.
-        sinks: The parts that take up a flux, and their b.
+        sinks: The parts that take up a flux, and b on their facets, shape (n,) or ().
         fixed: The parts that make Γ0, and these.
         stretch: Symmetric matrices of determinant 1 by which lengths on each cell are measured,
             shape (cells, d, d); None where they are what they are. X stands for stretch X then, and
@@ -127,7 +127,7 @@ class Cells:
         domain: Domain,
         V: fem.FunctionSpace,
         fixed: Sequence[int] = (DIRICHLET,),
-        sinks: Mapping[int, float] = MappingProxyType({}),
+        sinks: Mapping[int, FloatArray] = MappingProxyType({}),
         stretch: FloatArray | None = None,
     ):
         """Read a domain's mesh; V is its Crouzeix-Raviart space."""

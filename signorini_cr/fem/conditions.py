@@ -18,6 +18,7 @@ from ufl.algorithms.analysis import extract_coefficients, extract_constants
 from ufl.core.expr import Expr
 
 from ..arrays import Int32Array
+from ..mesh import domain
 from ..mesh.domain import Domain
 
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
@@ -29,6 +30,15 @@ def number(expression: Expr) -> float | None:
     if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
         return float(expression)
     return None
+
+
+def is_by_cells(expression: Expr) -> bool:
+    """Tell whether it is a scalar of numbers, Constants and Functions of degree 0."""
+    known = ufl.constantvalue.ConstantValue, ufl.Constant, ufl.core.multiindex.MultiIndex
+    terminals = ufl.corealg.traversal.traverse_unique_terminals(expression)
+    return not expression.ufl_shape and all(
+        isinstance(each, known) or domain.is_by_cells(each) for each in terminals
+    )
 
 
 def may_change(expression: Expr) -> bool:
@@ -344,7 +354,7 @@ def _difference(left: str, right: str) -> str:
     return f"{left} + {right.lstrip('- ')}" if number < 0.0 else f"{left} − {right}"
 
 
-def facets_of(domain: Domain, conditions: Sequence[Condition]) -> Int32Array:
+def facets_of(where: Domain, conditions: Sequence[Condition]) -> Int32Array:
     """Local indices of the owned facets under some conditions, ascending, shape (n,)."""
-    facets = [domain.facets(condition.number) for condition in conditions]
+    facets = [where.facets(condition.number) for condition in conditions]
     return np.sort(np.concatenate([np.empty(0, dtype=np.int32), *facets]))

@@ -69,6 +69,13 @@ class OnMesh(Protocol):
     def of_constants(self) -> FloatArray | None:
         """a_h(1, ·) by unknown, this rank's cells' share; None where it vanishes."""
 
+    def inflow(self) -> FloatArray | None:
+        """Compute ∫ f + ∫ g over each owned cell by two rules, much finer than that of `chi`.
+
+        Returns:
+            Shape (2, cells), the finest last; None if that can't be told.
+        """
+
     def conforming(self, cells: Int32Array, index_map: Any) -> tuple[fem.Form, float]:
         """Return a form whose matrix, times a number, is the P1 operator on this mesh.
 

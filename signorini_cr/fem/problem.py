@@ -25,12 +25,12 @@ from ufl.algorithms import compute_form_data
 from ufl.algorithms.check_arities import ArityMismatch
 from ufl.core.expr import Expr
 
-from ..arrays import Int32Array
+from ..arrays import FloatArray, Int32Array
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import PARTS, Domain, is_by_cells
+from ..mesh.domain import PARTS, Domain, Parts
 from ..mesh.materials import Materials
-from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, number
+from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, is_by_cells, number
 from .simplified import simplified
 from .space import facet_entities, ufl_element
 
@@ -86,8 +86,9 @@ class Problem:
         reaction: c, not below 0.
         form: What takes the place of ∫ κ∇u·∇v; there is no κ then, and nothing but u_D is derived
             from ``exact``.
-        conditions: What holds on parts of the boundary, by their names in the domain; g, obstacle
-            and dirichlet are for the parts neumann, contact and dirichlet where they aren't here.
+        conditions: What holds on parts of the boundary, by their names in the domain, or by the
+            facet value that a part of `Domain.from_tags` stands for; g, obstacle and dirichlet are
+            for the parts neumann, contact and dirichlet where they aren't here.
         materials: The data of materials, by their names in the domain; what is not said there, and
             cells without material, have coefficient, f and reaction.
         exact: The exact solution, where it is known. f, g and u_D that are None are then
@@ -104,7 +105,9 @@ class Problem:
     coefficient: Data = 1.0
     reaction: Data = 0.0
     form: Form | None = None
-    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    conditions: (
+        Mapping[str, Condition] | Mapping[int, Condition] | Mapping[str | int, Condition]
+    ) = field(default_factory=dict)
     materials: Mapping[str, Material] = field(default_factory=dict)
     exact: Data | None = None
     quadrature_degree: int = 4
@@ -153,13 +156,16 @@ class Kernel:
         form: UFL form on the mesh that the data were written for.
         mesh: That mesh.
         stand_ins: The UFL coefficients in ``form`` that get their values when it is bound.
+
+    Attributes:
+        own: The Functions that the form holds beside them.
     """
 
     def __init__(self, form: ufl.Form, mesh: Mesh, stand_ins: Sequence[ufl.Coefficient] = ()):
         self._compiled = compiled(mesh.comm, fem.compile_form, mesh.comm, form)
         self._mesh = mesh
         self._stand_ins = tuple(stand_ins)
-        self._own = [
+        self.own = [
             w
             for w in ufl.algorithms.extract_coefficients(form)
             if not any(w is s for s in self._stand_ins)
@@ -191,10 +197,15 @@ class Kernel:
             list(spaces),
             domain.mesh,
             subdomains,
-            {w: domain.own(w) for w in self._own}
+            {w: domain.own(w) for w in self.own}
             | dict(zip(self._stand_ins, functions, strict=True)),
             self._constants,
         )
+
+    def values(self) -> list[FloatArray]:
+        """What the Constants and Functions in the form have for values at present."""
+        constants = [np.array(each.value) for each in self._constants]
+        return constants + [each.x.array.copy() for each in self.own]
 
 
 class Forms:
@@ -238,8 +249,9 @@ class Forms:
         ):
             raise InputError("a form takes the coefficient's place; only one of them can be given")
         self.kappa = self._by_material("coefficient", problem.coefficient, materials)
-        if self.uniform and not float(self.kappa) > 0.0:
-            raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be above 0")
+        if self.uniform and not 0.0 < float(self.kappa) < np.inf:
+            said = "finite and above 0" if float(self.kappa) > 0.0 else "above 0"
+            raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be {said}")
         self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
         # UFL can't differentiate a number
         level = self.exact is None or number(self.exact) is not None or problem.form is not None
@@ -341,23 +353,17 @@ class Forms:
         return tuple(c for c in self.conditions if c.flux is not None)
 
     @property
-    def sinks(self) -> dict[int, float]:
-        """The parts whose b is a number above 0, and these."""
-        found = {c.number: number(c.loss) for c in self.conditions if c.loss is not None}
-        return {part: loss for part, loss in found.items() if loss}
-
-    @property
     def uncertified(self) -> str | None:
         """Why there is no certificate, if the form, the reaction or some condition has none."""
         if self.problem.form is not None:
             return "the form is the user's own: the flux that goes with it is not known"
-        if number(self.reaction) is None and not is_by_cells(self.reaction):
+        if not is_by_cells(self.reaction):
             return "the reaction varies within cells: its part of the energy has no enclosure"
         for condition in self.conditions:
             if condition.uncertified:
                 return condition.uncertified
-            if condition.loss is not None and number(condition.loss) is None:
-                return f"{condition.part}: its coefficient is no number, and has no enclosure"
+            if condition.loss is not None and not is_by_cells(condition.loss):
+                return f"{condition.part}: its coefficient varies within cells: it has no enclosure"
         return None
 
     @cached_property
@@ -372,9 +378,19 @@ class Forms:
         Raises:
             InputError: The data hold a Function on another mesh that can't be carried to this one.
         """
+        for function in self.functions:
+            domain.own(function)
+
+    @property
+    def functions(self) -> list[fem.Function]:
+        """The Functions that the data hold, each once."""
+        found: dict[fem.Function, None] = {}
         for each in self._data.values():
-            for function in ufl.algorithms.extract_coefficients(each):
-                domain.own(function)
+            found |= dict.fromkeys(ufl.algorithms.extract_coefficients(each))
+        if self.problem.form is not None:
+            for kernel in (self.a, self.own_load):
+                found |= dict.fromkeys([] if kernel is None else kernel.own)
+        return list(found)
 
     @property
     def uniform(self) -> bool:
@@ -486,6 +502,16 @@ class Forms:
                     f"form: {name} has an integral of the type {integral.integral_type()}; dx and"
                     " ds(name) are what there is: functions of Crouzeix-Raviart jump across facets"
                 )
+            over, inside = integral.subdomain_id(), integral.integral_type() == "cell"
+            given = over if isinstance(over, tuple) else (over,)
+            known = ("everywhere",) if inside else tuple(self._parts.values())
+            if not all(each in known for each in given):
+                kind = "dx" if inside else "ds"
+                raise InputError(
+                    f"form: {name} has {kind} over the subdomain {over}; the dx and the ds(name)"
+                    " that it is given are what there is, the name that of a boundary part; where"
+                    " cells differ, Functions of degree 0 say so"
+                )
             if _order(integral.integrand()) > 1:
                 raise InputError(
                     f"form: {name} has derivatives of second order or more, which are 0 for"
@@ -576,12 +602,18 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
         "neumann": (Neumann(problem.g), "data.g"),
         "contact": (Contact(given.expression(problem.obstacle)), "data.obstacle"),
     }
-    for name, condition in problem.conditions.items():
+    called = parts.called if isinstance(parts, Parts) else {}
+    own: dict[str, Condition] = {}
+    for key, condition in problem.conditions.items():
+        name = called.get(key, "") if isinstance(key, int | np.integer) else key
         if name not in parts:
-            raise InputError(
-                f"conditions: no part of the boundary is called {name!r}; there are"
-                f" {', '.join(parts)}"
-            )
+            values = {part: f" ({value})" for value, part in called.items()}
+            there = ", ".join(part + values.get(part, "") for part in parts)
+            how = f"is called {key!r}" if name else f"stands for the facet value {key} alone"
+            raise InputError(f"conditions: no part of the boundary {how}; there are {there}")
+        if name in own:
+            raise InputError(f"conditions: the part {name!r} has two")
+        own[name] = condition
         if not isinstance(condition, Condition):
             raise InputError(
                 f"conditions: {name!r} is {condition!r}; Dirichlet, Neumann, Robin or Contact is"
@@ -589,8 +621,8 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
             )
     made = []
     for name, value in parts.items():
-        if name in problem.conditions:
-            condition = problem.conditions[name]
+        if name in own:
+            condition = own[name]
             label = f"boundary.{name}.{condition.names()[0]}"
         elif name in usual:
             condition, label = usual[name]

@@ -45,7 +45,7 @@ CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
 """Names that parts of a boundary have by themselves, and their values in facet tags."""
 USUAL = ("contact", "dirichlet")
-"""Parts that there must be where no part has a name of its own: they hold the solution."""
+"""Parts that there must be where no part has a name of its own."""
 REST = NEUMANN
 """The part of the exterior facets that nobody names: the weak form's natural condition."""
 
@@ -68,6 +68,19 @@ class Refinement(NamedTuple):
         rows = values if self.exchange is None else self.exchange.fetch(values)
         found: npt.NDArray = rows[self.parent]
         return found
+
+
+class Parts(dict[str, int]):
+    """Parts of a boundary and their values in facet tags.
+
+    Attributes:
+        called: The parts that stand for one value each of a user's own tags, by that value.
+    """
+
+    def __init__(self, parts: Mapping[str, int], called: Mapping[int, str]):
+        """Take both."""
+        super().__init__(parts)
+        self.called = dict(called)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +174,7 @@ class Domain:
         contact: int | Sequence[int] | None = None,
         dirichlet: int | Sequence[int] | None = None,
         neumann: int | Sequence[int] | None = None,
+        parts: Sequence[int] = (),
         **others: int | Sequence[int],
     ) -> Domain:
         """Take a mesh and facet tags of the user's own; collective.
@@ -181,21 +195,24 @@ class Domain:
             contact: The value or values that stand for Γ1; 1 if there are no further parts.
             dirichlet: The value or values that stand for Γ0; 2 if there are no further parts.
             neumann: The value or values that stand for Γg; named so that they can be checked.
+            parts: Values that are further parts by themselves, called as they are: 3 is the part
+                "3", and `Problem.conditions` may have its condition by 3.
             **others: The same for further parts, by names of your own.
 
         Raises:
             InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
+        others = {**{str(value): value for value in parts}, **others}
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
-        parts = numbered(others)
+        inner = numbered(others)
         needed = {name for name, own in given.items() if own is not None} - {"neumann"}
         if not others:
             needed |= set(USUAL)
-        wanted = _wanted(given, parts, needed)
+        wanted = _wanted(given, inner, needed)
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
         exterior = _exterior(mesh)
-        values = _values(mesh, facet_tags, exterior, wanted, parts)
+        values = _values(mesh, facet_tags, exterior, wanted, inner)
         known = {int(value) for numbers in wanted.values() for value in numbers}
         there = _insist_on(mesh, facet_tags, exterior, wanted, needed)
         if (neumann is not None or others) and (left := sorted(there - known - {0})):
@@ -207,7 +224,8 @@ class Domain:
             )
         made = Materials.from_tags(mesh, cell_tags, materials or {})
         tags = meshtags(mesh, mesh.topology.dim - 1, exterior, values[exterior])
-        return cls(mesh, tags, parts=parts, materials=made)
+        alone = {int(v[0]): part for part, v in wanted.items() if len(v) == 1}
+        return cls(mesh, tags, parts=Parts(inner, alone), materials=made)
 
 
 def _wanted(
@@ -521,9 +539,8 @@ def read_gmsh(
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
     parts, numbers = numbered(names), numbered_materials(materials)
-    own = [name for name in parts if name not in PARTS]
-    needed, holding = (own, ()) if names else (USUAL, USUAL)
-    what = Path(path), parts, needed, holding, numbers
+    needed = [name for name in parts if name not in PARTS] if names else USUAL
+    what = Path(path), parts, needed, numbers
     return _distribute(comm, parts, numbers, gmshmesh.read, *what)
 
 
@@ -566,7 +583,8 @@ def _distribute(
     materials = Materials()
     if numbers:
         corners, of_cells = distribute_entity_data(mesh, 2, raw.triangles, raw.materials)
-        materials = Materials(numbers, np.zeros(_count(mesh, 2), dtype=np.int32))
+        others = comm.bcast(raw.others)
+        materials = Materials(numbers, np.zeros(_count(mesh, 2), dtype=np.int32), others)
         mesh.topology.create_connectivity(2, 2)
         cells = meshtags_from_entities(mesh, 2, adjacencylist(corners), of_cells)
         materials.of_cells[cells.indices] = cells.values

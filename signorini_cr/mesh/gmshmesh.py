@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import signal
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -55,6 +55,7 @@ class Triangulation(NamedTuple):
         labels: Index of each facet's label, shape (facets,).
         materials: Number of each triangle's material, 0 for none, shape (triangles,); empty where
             none has a name.
+        others: Named physical surfaces beside the materials, where there are such.
     """
 
     points: FloatArray
@@ -62,6 +63,7 @@ class Triangulation(NamedTuple):
     facets: Int64Array
     labels: Int32Array
     materials: Int32Array = np.empty(0, dtype=np.int32)
+    others: tuple[str, ...] = ()
 
 
 def _keep_sigpipe() -> None:
@@ -262,7 +264,6 @@ def read(
     path: Path,
     parts: Mapping[str, int],
     needed: Sequence[str],
-    holding: Collection[str],
     materials: Mapping[str, int] = MappingProxyType({}),
 ) -> Triangulation:
     """Read a planar triangle mesh with named physical curves, and perhaps surfaces.
@@ -271,22 +272,19 @@ def read(
         path: A gmsh file, format 2.2 or 4.1, ASCII or binary.
         parts: Label of each name; case does not matter.
         needed: Names of which there must be a curve.
-        holding: Names one of which each piece of the mesh must have facets of; none if it takes
-            the conditions to say what holds a piece.
         materials: Numbers of the physical surfaces that are asked for, by name.
 
     Raises:
         InputError: The file cannot be read, or is no such mesh; the message begins with its path.
     """
     with naming(path):
-        return _read(mshfile.load(path), parts, needed, holding, materials)
+        return _read(mshfile.load(path), parts, needed, materials)
 
 
 def _read(
     file: MshFile,
     parts: Mapping[str, int],
     needed: Sequence[str],
-    holding: Collection[str],
     materials: Mapping[str, int],
 ) -> Triangulation:
     """Take from a file what `read` returns."""
@@ -310,14 +308,19 @@ def _read(
     triangles = file.elements(_TRIANGLE)
     raw = _compact(file.tags, file.points, triangles, facets, labels)
     if materials:
-        raw = raw._replace(materials=_of_materials(file, materials))
+        of_cells, without = _of_materials(file, materials)
+        raw = raw._replace(materials=of_cells, others=without)
     _check_names(triangles, facets, others, tuple(parts))
-    _check_facets(raw, {label: name for name, label in parts.items()}, holding)
+    _check_facets(raw, {label: name for name, label in parts.items()})
     return raw
 
 
-def _of_materials(file: MshFile, materials: Mapping[str, int]) -> Int32Array:
+def _of_materials(
+    file: MshFile, materials: Mapping[str, int]
+) -> tuple[Int32Array, tuple[str, ...]]:
     """The number of the physical surface that each triangle lies in, or 0, shape (triangles,).
+
+    Beside them the names of the surfaces of which no triangle has a material.
 
     Raises:
         InputError: There is no such surface, or two of them have a triangle in common.
@@ -344,7 +347,12 @@ def _of_materials(file: MshFile, materials: Mapping[str, int]) -> Int32Array:
                 f"no physical surface with triangles is named {name!r}; the names there"
                 f" are: {', '.join(there) or 'none'}"
             )
-    return numbers
+    tagged, bare = set[int](), set[int]()
+    for block in blocks:
+        own = any(called[name] & block.groups for name in materials)
+        (tagged if own else bare).update(block.groups if len(block.nodes) else ())
+    names = {file.names.get((2, tag), "").strip() for tag in bare - tagged}
+    return numbers, tuple(sorted(names - {""}))
 
 
 def _check_names(
@@ -412,8 +420,8 @@ def _check_cells(file: MshFile) -> None:
         raise InputError("the mesh does not lie in the x-y plane: z takes several values")
 
 
-def _check_facets(raw: Triangulation, names: dict[int, str], holding: Collection[str]) -> None:
-    """Insist on labels of exterior facets, one each, and on something that holds every piece."""
+def _check_facets(raw: Triangulation, names: Mapping[int, str]) -> None:
+    """Insist on labels of exterior facets, one each, and on triangles side by side."""
     u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
     area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     flat = np.flatnonzero(~(area > 1e-14 * ((u**2).sum(axis=1) + (v**2).sum(axis=1))))
@@ -423,26 +431,12 @@ def _check_facets(raw: Triangulation, names: dict[int, str], holding: Collection
     of_cells = _key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]], len(raw.points))
     keys, sides, count = np.unique(of_cells, return_inverse=True, return_counts=True)
     sides = sides.reshape(of_cells.shape)
-    side = _labelled(raw, keys, count, names)
+    _check_labels(raw, keys, count, names)
     if count.max() > 2:
         raise InputError(f"{count.max()} triangles meet in one facet: at most 2 can")
     piece = pieces(sides, len(keys))
     if (found := overlap(raw.points, raw.triangles, sides, count, piece)) is not None:
         raise InputError(found)
-    if not holding:
-        return
-    fixed = np.zeros(len(keys), dtype=bool)
-    holds = [number for number, name in names.items() if name in holding]
-    fixed[side[np.isin(raw.labels, holds)]] = True
-    held = np.zeros(len(raw.triangles), dtype=bool)
-    held[piece[fixed[sides].any(axis=1)]] = True
-    loose = np.flatnonzero(~held[piece])
-    if len(loose):
-        x, y = raw.points[raw.triangles[loose[0]]].mean(axis=0)
-        raise InputError(
-            f"the mesh falls into pieces, and the one around ({x:g}, {y:g}) has no "
-            "Dirichlet facet and no contact facet"
-        )
 
 
 def _key(ends: Int64Array, points: int) -> Int64Array:
@@ -450,10 +444,10 @@ def _key(ends: Int64Array, points: int) -> Int64Array:
     return ends.min(axis=-1) * points + ends.max(axis=-1)
 
 
-def _labelled(
+def _check_labels(
     raw: Triangulation, keys: Int64Array, count: Int64Array, names: Mapping[int, str]
-) -> Int64Array:
-    """The side that each labelled facet is, shape (facets,).
+) -> None:
+    """Insist on labels of sides on the boundary, one each.
 
     Args:
         raw: The mesh.
@@ -462,7 +456,7 @@ def _labelled(
         names: Of the labels.
 
     Raises:
-        InputError: It is none, or lies inside, or has two labels.
+        InputError: A labelled facet is no side, or lies inside, or has two labels.
     """
 
     def facet(number: int) -> str:
@@ -486,7 +480,6 @@ def _labelled(
             f"{facet(i)} belongs to {names[int(raw.labels[i])]} and to "
             f"{names[int(raw.labels[j])]}: only one is possible"
         )
-    return side
 
 
 def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> Int64Array:

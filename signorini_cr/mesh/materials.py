@@ -28,10 +28,12 @@ class Materials:
         numbers: Their numbers by name.
         of_cells: That of each local cell, `NONE` where there is none, shape (cells,); empty where
             no material has a name.
+        others: Physical surfaces of a file that nobody has asked for, beside materials.
     """
 
     numbers: Mapping[str, int] = field(default_factory=dict)
     of_cells: Int32Array = field(default_factory=lambda: np.empty(0, dtype=np.int32))
+    others: tuple[str, ...] = ()
 
     def where(self, name: str) -> BoolArray:
         """Tell which local cells consist of a material, shape (cells,)."""

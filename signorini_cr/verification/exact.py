@@ -12,7 +12,7 @@ pressure; where it changes to zero lies a critical point.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,9 @@ import numpy as np
 import ufl
 from mpi4py import MPI
 
-from ..fem.problem import Data, Expr, Problem, as_expression
+from ..arrays import FloatArray
+from ..fem.conditions import Condition, Contact, Dirichlet, Neumann, Robin
+from ..fem.problem import Data, Expr, Material, Problem, as_expression
 from ..mesh import families
 from ..mesh.domain import Domain, Polygon
 
@@ -156,6 +158,122 @@ def root(s: float, name: str = "") -> Example:
         energy=float(energy),
         critical=((0.0, 0.0),),
     )
+
+
+EDGES = ("floor", "right", "top", "left")
+"""Those of the unit square, as `made` calls them."""
+
+MARGIN = 0.3
+"""How far from 0 the switch of `made` is where u touches one of two obstacles."""
+
+
+def made(
+    u: Function,
+    kinds: Mapping[str, str],
+    *,
+    switch: Function = lambda x: 1.0 - 2.0 * x[0],
+    coefficient: Data = 1.0,
+    reaction: float = 0.0,
+    loss: float = 0.0,
+    external: float = 0.0,
+    line: float | None = None,
+    east: Material | None = None,
+    name: str = "made",
+) -> Example:
+    """Make an example on the unit square from a function and what is to hold on its edges.
+
+    f, u_D, g and obstacles follow from u. A contact part is touched from below where the switch s
+    is above 0, from above where it is below 0, or both with a `MARGIN` m between: there
+
+        λ = (s − m)⁺ − (−s − m)⁺,  α = u − (m − s)⁺,  β = u + (m + s)⁺
+
+    with m = 0 where one of the obstacles is missing; g = κ∂ₙu + b (u − u_ext) − λ makes up for any
+    u. There is no Γ0 unless a kind is dirichlet.
+
+    Args:
+        u: Takes x = (x, y); smooth, or `kinked` on the line.
+        kinds: For edges of `EDGES` "below", "above" or "between", for contact; or "robin",
+            "neumann", "dirichlet".
+        switch: s.
+        coefficient: κ, a scalar or a tensor.
+        reaction: c.
+        loss: b of Robin and contact parts.
+        external: u_ext there.
+        line: Where x is above it, the domain is of a material.
+        east: Its data, coefficient and reaction, if there is such a line.
+        name: What to call the example.
+    """
+
+    def pressure(x: Expr, kind: str) -> tuple[Expr, Expr, Expr]:
+        """λ, and how far α and β are from u."""
+        s, m = switch(x), MARGIN if kind == "between" else 0.0
+        low = positive(s - m) if kind != "above" else ufl.as_ufl(0.0)
+        high = positive(-s - m) if kind != "below" else ufl.as_ufl(0.0)
+        return low - high, positive(m - s), positive(m + s)
+
+    def flux(x: Expr) -> Expr:
+        """κ∂ₙu + b (u − u_ext)."""
+        kappa = as_expression(coefficient, x)
+        if line is not None and east is not None and east.coefficient is not None:
+            own = as_expression(east.coefficient, x)
+            kappa = ufl.conditional(ufl.lt(x[0], line), kappa, own)
+        normal = ufl.FacetNormal(ufl.domain.extract_unique_domain(x))
+        return ufl.dot(kappa * ufl.grad(u(x)), normal) + loss * (u(x) - external)
+
+    def contact(kind: str) -> Contact:
+        return Contact(
+            None if kind == "above" else lambda x: u(x) - pressure(x, kind)[1],
+            upper=None if kind == "below" else lambda x: u(x) + pressure(x, kind)[2],
+            coefficient=loss,
+            external=external,
+            g=lambda x: flux(x) - pressure(x, kind)[0],
+        )
+
+    plain: dict[str, Condition] = {
+        "dirichlet": Dirichlet(),
+        "neumann": Neumann(),
+        "robin": Robin(coefficient=loss, external=external),
+    }
+    on_contact = [kind for kind in kinds.values() if kind not in plain]
+    polygon = Polygon(
+        np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
+        EDGES,
+        names=EDGES,
+        materials={} if line is None else {"east": _right_of(line)},
+    )
+    problem = Problem(
+        exact=u,
+        coefficient=coefficient,
+        reaction=reaction,
+        conditions={edge: plain.get(kind) or contact(kind) for edge, kind in kinds.items()},
+        materials={} if line is None else {"east": east or Material()},
+    )
+    of_all = len(set(on_contact)) == 1
+    return Example(
+        name, problem, polygon, (lambda x: pressure(x, on_contact[0])[0]) if of_all else None
+    )
+
+
+def _right_of(line: float) -> FloatArray:
+    return np.array([[line, 0.0], [1.0, 0.0], [1.0, 1.0], [line, 1.0]])
+
+
+def kinked(v: Function, line: float, west: float, east: float) -> Function:
+    """Bend a smooth v on a line x = a: u = v(a, y) + (v − v(a, y))/κ, κ∂ₓu = ∂ₓv on both sides.
+
+    Args:
+        v: Takes x = (x, y).
+        line: a.
+        west: κ where x is below a.
+        east: κ where it is above.
+    """
+
+    def function(x: Expr) -> Expr:
+        kappa = ufl.conditional(ufl.lt(x[0], line), west, east)
+        there = v(ufl.as_vector([line, x[1]]))
+        return there + (v(x) - there) / kappa
+
+    return function
 
 
 def raised(example: Example, alpha: Function) -> Example:

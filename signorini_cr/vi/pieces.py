@@ -30,6 +30,9 @@ from .system import System
 BELOW = 4.0
 """A piece is put so far below its obstacle, in parts of what its loads could lift it by."""
 
+DOUBT = 4.0
+"""How many times the difference of two fine rules a net force may be wrong by."""
+
 
 @dataclass(frozen=True, eq=False)
 class Loose:
@@ -61,11 +64,15 @@ class Loose:
         found = np.append(loose, np.inf)[number] == labels
         return cls(len(loose), np.where(found, number + 1, 0))
 
-    def check(self, system: System) -> None:
+    def check(self, system: System, inflow: FloatArray | None) -> None:
         """Insist on pieces that are pressed onto the obstacle; collective.
+
+        The scheme's own rule alone may see a force where there is none: so a much finer one has to
+        see it, too, and not differ from one that is less fine by as much.
 
         Args:
             system: The variational inequality.
+            inflow: `OnMesh.inflow`.
 
         Raises:
             InputError: One is not.
@@ -78,12 +85,25 @@ class Loose:
         sums += [np.bincount(piece[system.bounded], which, self.count + 1) for which in finite]
         size, number, *contact = comm.allreduce(np.array(sums))
         net, (below, above) = self._net(system), contact
-        pressed = np.where(below > 0.0, -net, -np.inf)
-        pressed = np.maximum(pressed, np.where(above > 0.0, net, -np.inf))
-        adrift = pressed <= NOISE * np.sqrt(number) * size
+        doubt = NOISE * np.sqrt(number) * size
+        rules = [net]
+        if inflow is not None:
+            of_cells = self.piece[_cell_dofs(V)[:, 0]]
+            fine = [np.bincount(of_cells, each, self.count + 1) for each in inflow]
+            less, finest = comm.allreduce(np.array(fine))
+            rules, doubt = [net, finest], doubt + DOUBT * np.abs(finest - less)
+        pressed = np.full(len(net), np.inf)
+        for each in rules:
+            here = np.where(below > 0.0, -each, -np.inf)
+            here = np.maximum(here, np.where(above > 0.0, each, -np.inf))
+            pressed = np.minimum(pressed, here)
+        adrift = pressed <= doubt
         adrift[0] = False
         complaint, bad = None, int(np.argmax(adrift))
         wanted = " or ".join(["below 0"] * bool(below[bad]) + ["above 0"] * bool(above[bad]))
+        amount = f"of {net[bad]:g}"
+        if 0.0 < abs(rules[-1][bad]) <= doubt[bad]:
+            amount = "that can't be told from 0"
         if adrift.any() and len(dofs := np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == bad)):
             nodes = compat.cell_nodes(V.mesh)[dofs[0] // V.dofmap.index_map_bs]
             middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
@@ -91,8 +111,8 @@ class Loose:
                 "the domain falls into pieces, and the one around "
                 f"({', '.join(f'{x:g}' for x in middle)}) has no Dirichlet facet and "
             ) + (
-                f"a net force ∫f + ∫g of {net[bad]:g}: only one {wanted}, which presses it onto "
-                "the obstacle, would hold it"
+                f"a net force ∫f + ∫g {amount}: only one {wanted}, which presses it onto the "
+                "obstacle, would hold it"
                 if below[bad] or above[bad]
                 else "no contact facet: nothing holds it"
             )

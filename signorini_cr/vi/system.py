@@ -244,7 +244,10 @@ def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
     diagonal = A.getDiagonal()
     positive = bool((diagonal.array_r > 0.0).all())
     release(diagonal)
-    complaint = "data: the coefficient must be finite and above 0 everywhere"
+    complaint = (
+        "data: the coefficient must be finite and above 0 everywhere, reactions and coefficients of"
+        " parts finite"
+    )
     raise_together(A.comm.tompi4py(), None if positive else complaint)
     A.setOption(PETSc.Mat.Option.SPD, True)
     return A

@@ -516,6 +516,29 @@ def test_what_has_no_end_is_not_read(kind: str, write, monkeypatch) -> None:
             assert ("domain.mesh" in said) is (kind == "mesh")
 
 
+def test_curves_with_names_of_ones_own(write) -> None:
+    """What holds the mesh is known by its sections: here a loss, or nothing."""
+    write(msh(LINES + _TRIANGLES, "bed").replace("dirichlet", "air"), "own.msh")
+    text = '[domain]\nmesh = "own.msh"\n[boundary.bed]\ntype = "contact"\n[data]\nf = 1\n'
+    name = write(text + '[boundary.air]\ntype = "robin"\ncoefficient = 2\n')
+    assert run("check", name)[0] == cli.DONE
+    name = write(text + '[boundary.air]\ntype = "neumann"\n', "loose.toml")
+    assert "a net force ∫f + ∫g of 1" in " ".join(refused("check", name).split())
+
+
+def test_surfaces_without_a_section(write) -> None:
+    """They have the data of [data], and where others have sections, that is said."""
+    mesh = msh([*LINES, "2 2 3 3 1 2 3", "2 2 4 4 1 3 4"]).replace('3 4 "solid"', '2 4 "lining"')
+    write(mesh, "two.msh")
+    text = '[domain]\nmesh = "two.msh"\n[data]\nf = 1\n'
+    for more, said in ("", False), ("[material.body]\ncoefficient = 2\n", True):
+        status, _, err = run("check", write(text + more))
+        assert status == cli.DONE
+        assert (
+            COMM.bcast("lining has no section [material.lining]" in " ".join(err.split())) == said
+        )
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input(name: str, write) -> None:
     text, words = BAD[name]

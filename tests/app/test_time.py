@@ -130,7 +130,12 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         ('capacity = "1 + 1"', 'capacity = "x"', "time.capacity: a number above 0 is needed"),
         ('capacity = "1 + 1"', "capacity = -1", "time.capacity: a number above 0 is needed"),
         ('initial = "0.1*(y - 1)"', 'initial = "t"', "time.initial: this must not depend on t"),
-        ("[data]", '[data]\ncoefficient = "1 + t"', "data.coefficient: this must not depend on t"),
+        (
+            "[data]",
+            '[data]\ncoefficient = "1 - t"',
+            "is 0; it must be above 0 everywhere, at the time 1",
+        ),
+        ("[data]", '[data]\nreaction = "x + t"', "need a reaction that is a number on each cell"),
         ("wave =", "t = 1\nwave =", "define.t: t is the time"),
         ("[time]", '[refine]\nmode = "adaptive"\n[time]', "refine.mode: a problem in time needs"),
         ("[time]", '[exact]\nu = "x"\n[time]', "exact.u: a problem in time has none"),

@@ -18,7 +18,8 @@ from signorini_cr.data.admissible import check_data
 from signorini_cr.data.consistency import doubts
 from signorini_cr.data.pointwise import evaluate
 from signorini_cr.errors import InputError, on_root
-from signorini_cr.fem.problem import Forms, Problem
+from signorini_cr.fem.conditions import Robin
+from signorini_cr.fem.problem import Forms, Material, Problem
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import Domain, Polygon, read_gmsh
 
@@ -245,6 +246,35 @@ def test_a_tensor_that_is_no_coefficient_somewhere():
     assert "at (-1, 1) is [[1, 1], [1, 1]], with the eigenvalue 0" in message
     negative = Problem(coefficient=lambda x: 0.5 - x[0])
     assert "at (0.5, " in refused(lambda: checked(negative, domain))
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"reaction": np.nan}, "the reaction is nan at ("),
+        ({"reaction": np.inf}, "the reaction is inf at ("),
+        ({"reaction": -1.0}, "the reaction is -1 at ("),
+        ({"coefficient": np.inf}, "data: the coefficient is inf; it must be finite and above 0"),
+        ({"b": np.inf}, "the coefficient of the part 'neumann' is inf at (-1, "),
+        ({"b": np.nan}, "the coefficient of the part 'neumann' is nan at (-1, "),
+        ({"rock": Material(reaction=np.nan)}, "the reaction of 'rock' is nan at ("),
+        ({"rock": Material(reaction=-2.0)}, "the reaction of 'rock' is -2 at ("),
+        (
+            {"rock": Material(coefficient=ufl.as_matrix([[3, 9], [9, 2]]))},
+            "material.rock.coefficient: the value at (-1, 0) is [[3, 9], [9, 2]], with the eigen",
+        ),
+        ({"rock": Material(coefficient=-1.0)}, "material.rock.coefficient: the value at (-1, 0)"),
+    ],
+)
+def test_the_datum_that_is_wrong_is_named(data: dict, words: str):
+    rock = {"rock": [[-1, 0], [0, 0], [0, 1], [-1, 1]]}
+    domain = Polygon(RECTANGLE, ABOVE, materials=rock).mesh(0.5)
+    more = {name: value for name, value in data.items() if name not in ("b", "rock")}
+    if "b" in data:
+        more["conditions"] = {"neumann": Robin(coefficient=data["b"])}
+    if "rock" in data:
+        more["materials"] = {"rock": data["rock"]}
+    assert refused(lambda: solve(Problem(**more), domain)).startswith(words)
 
 
 # boundary parts

@@ -33,6 +33,7 @@ from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.conditions import Condition
 from signorini_cr.fem.problem import Forms
 from signorini_cr.fem.space import ghosted_vector
+from signorini_cr.means import mean
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.transfer import inclusion
@@ -171,6 +172,36 @@ def test_a_stiff_spring_is_a_dirichlet_condition():
     assert forces[0] > 0.5 and forces[1] == pytest.approx(forces[0], rel=5e-3)
 
 
+@pytest.mark.parametrize("levels", [1, 3])
+def test_numbers_may_be_constants_and_functions_of_degree_0(levels):
+    """Losses of two walls, and a reaction: each way to give them has the same certificate."""
+    edges = ["floor", "right", "roof", "left"]
+    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=edges).mesh(0.3)
+    zero = fem.functionspace(domain.mesh, ("DG", 0))
+    of_walls, everywhere = fem.Function(zero), fem.Function(zero)
+    of_walls.interpolate(lambda x: np.where(x[0] < 0.5, 2.0, 5.0))
+    everywhere.x.array[:] = 1.5
+    half = fem.Constant(domain.mesh, 0.5)
+    found = []
+    for right, left, c in (
+        (5.0, 2.0, 1.5),
+        (of_walls, of_walls, everywhere),
+        (10.0 * half, 4 * half, lambda x: 3.0 * half),
+    ):
+        conditions = {
+            "floor": Contact(-0.1, coefficient=half if right is of_walls else 0.5),
+            "right": Robin(1.0, coefficient=right),
+            "roof": Neumann(),
+            "left": Robin(coefficient=left, external=-0.2),
+        }
+        *_, last = solve_levels(Problem(f=-3.0, reaction=c, conditions=conditions), domain, levels)
+        inflow = mean(last, "roof")
+        bound = last.certificate.bound_energy_norm
+        found.append([bound, *last.certificate.energy, inflow.lower, inflow.upper])
+        assert inflow.lower < inflow.upper < inflow.lower + 0.1
+    assert np.allclose(found[1:], found[0], rtol=1e-7)
+
+
 def test_parts_and_conditions_must_match():
     flat = [Contact(0.0), Neumann(), Neumann(), Dirichlet()]
     problem, domain = on_the_square(flat)
@@ -207,6 +238,18 @@ def test_parts_of_the_users_own_by_tags():
         Domain.from_tags(mesh, tags, floor=7, rest=(8, 9))
     with pytest.raises(InputError, match=r"no exterior facet is tagged rest \(value 5\)"):
         Domain.from_tags(mesh, tags, floor=7, rest=(5, 8, 9, 10))
+
+    for facets, key in ({"floor": 7}, 7), ({"parts": [7]}, 7), ({"parts": [7]}, "7"):
+        domain = Domain.from_tags(mesh, tags, dirichlet=(8, 9, 10), **facets)
+        again = solve(Problem(f=-9.0, conditions={key: Contact(-0.1)}), domain)
+        assert again.contact.force == pytest.approx(
+            solve(Problem(f=-9.0, obstacle=-0.1), usual).contact.force
+        )
+    said = r"stands for the facet value 8 alone; there are contact, dirichlet, neumann, 7 \(7\)"
+    with pytest.raises(InputError, match=said):
+        solve(Problem(conditions={7: Contact(), 8: Dirichlet()}), domain)
+    with pytest.raises(InputError, match="the part '7' has two"):
+        solve(Problem(conditions={7: Contact(), "7": Contact()}), domain)
 
 
 def exterior_facet_indices_of(mesh):

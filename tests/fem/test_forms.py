@@ -12,7 +12,6 @@ from signorini_cr import (
     InputError,
     Material,
     Neumann,
-    NotConverged,
     Polygon,
     Problem,
     Robin,
@@ -21,6 +20,7 @@ from signorini_cr import (
     solve_adaptive,
     solve_levels,
 )
+from signorini_cr.data import admissible
 
 EDGES = ["floor", "right", "top", "left"]
 SQUARE = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], EDGES, names=EDGES)
@@ -128,6 +128,9 @@ def nowhere(u, v, dx, ds):
         (Form(lambda u, v, dx, ds: ufl.avg(u) * ufl.avg(v) * ufl.dS), "interior_facet"),
         (Form(lambda u, v, dx, ds: u.dx(0).dx(0) * v.dx(1).dx(1) * dx), "second order"),
         (Form(lambda u, v, dx, ds: u * v * ds("roof")), "called 'roof'"),
+        (Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) + u * v * ufl.ds), "a has ds over the"),
+        (Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) + u * v * dx(3)), "a has dx over the"),
+        (Form(lambda u, v, dx, ds: u.dx(0) * v.dx(0) * dx), "not above 0"),
         (Form(laplace, lambda v, dx, ds: v * v * dx), "linear"),
         (Form(laplace, lambda v, dx, ds: 2.0), "load returns 2.0"),
     ],
@@ -138,12 +141,32 @@ def test_what_can_not_work_is_refused(form, said):
         solve(problem, SQUARE.mesh(0.5))
 
 
-def test_what_is_below_0_for_some_u_only_ends_in_words():
-    """∇u·∇v − 400 u v has a positive diagonal, and negative eigenvalues."""
-    form = Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) - 400.0 * u * v * dx)
-    problem = Problem(form=form, f=-1.0, conditions=WALLS | {"floor": Contact(0.0)})
-    with pytest.raises((InputError, NotConverged), match=r"not above 0|INDEFINITE"):
-        list(solve_levels(problem, SQUARE.mesh(0.25), 3))
+@pytest.mark.parametrize("walls", [WALLS, WALLS | {"right": Neumann(), "left": Neumann()}])
+@pytest.mark.parametrize(("element", "looked_at"), [("CR", True), ("P1", True), ("CR", False)])
+def test_what_is_below_0_for_some_u_only_is_refused(walls, element, looked_at, monkeypatch):
+    """∇u·∇v − k u v where k is a little above or below the least eigenvalue; CG tells it, too.
+
+    That of −Δ is π²/4 for u = 0 at the top, and π²/2 with the sides, which are 2 apart.
+    """
+    if not looked_at:
+        monkeypatch.setattr(admissible, "FACTORISED", 0)
+    least = np.pi**2 / (2.0 if walls is WALLS else 4.0)
+    for part in (0.9, 1.1, 12.0):
+        k = part * least
+        form = Form(lambda u, v, dx, ds, k=k: laplace(u, v, dx, ds) - k * u * v * dx)
+        problem = Problem(form=form, f=-1.0, conditions=walls | {"floor": Contact(-99.0)})
+        if part < 1.0:
+            assert solve(problem, SQUARE.mesh(0.2), element).iterations.newton > 0
+            continue
+        with pytest.raises(InputError, match="not above 0 for all u that vanish on the dirichlet"):
+            solve(problem, SQUARE.mesh(0.2), element)
+
+
+def test_constants_need_no_energy():
+    """What has none for them only, on each piece, is held by an obstacle."""
+    walls = dict.fromkeys(WALLS, Neumann())
+    problem = Problem(form=Form(laplace), f=-1.0, conditions=walls | {"floor": Contact(0.0)})
+    assert solve(problem, SQUARE.mesh(0.3)).contact.force == pytest.approx(2.0)
 
 
 def test_a_function_on_another_mesh_is_refused():

@@ -13,6 +13,7 @@ from dolfinx import cpp, fem
 from helpers import MESHES
 from mpi4py import MPI
 
+from signorini_cr import Problem, solve
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.mesh.partition import bisect
@@ -470,12 +471,18 @@ def write_text_mesh(
     on_root(COMM, lambda: path.write_text("\n".join(lines) + "\n") and None)
 
 
-def test_pieces_without_dirichlet_facets(shared_tmp_path: Path):
+def test_pieces_that_nothing_holds(shared_tmp_path: Path):
+    """What holds one is known with the conditions, which a reaction makes up for."""
     path = shared_tmp_path / "pieces.msh"
     nodes = ["1 0 0 0", "2 1 0 0", "3 0 1 0", "4 2 0 0", "5 3 0 0", "6 2 1 0"]
     elements = ["1 2 1 1 1 2", "1 2 2 2 2 3", "2 2 3 3 1 2 3", "2 2 3 3 4 5 6"]
     write_text_mesh(path, nodes, elements)
-    assert "the one around (2.33333, 0.333333) has no Dirichlet" in fails_alike(read_gmsh, path)
+    domain = read_gmsh(path, MPI.COMM_SELF)
+    for problem in (Problem(), Problem(f=-1.0)):
+        with pytest.raises(InputError, match=r"around \(2.33333, 0.333333\) has no Dirichlet"):
+            solve(problem, domain)
+    held = solve(Problem(reaction=1.0, f=3.0), domain).u.x.array
+    assert np.sort(held)[-3:] == pytest.approx(3.0)
 
 
 def test_pieces_of_a_mesh_whose_curves_have_names_of_their_own(shared_tmp_path: Path):

@@ -44,7 +44,7 @@ def test_the_four_formats_say_the_same(texts, tmp_path: Path) -> None:
     found = []
     for data in texts:
         (tmp_path / "mesh.msh").write_bytes(data)
-        found.append(read(tmp_path / "mesh.msh", PARTS, USUAL, USUAL))
+        found.append(read(tmp_path / "mesh.msh", PARTS, USUAL))
     for raw in found:
         assert mesh_mutations.faults(raw) == []
         assert np.allclose(raw.points, found[0].points, rtol=0, atol=1e-15)
@@ -66,7 +66,7 @@ def test_a_line_cut_in_two_is_named(name: str, share: float, tmp_path: Path) -> 
     with pytest.raises(
         InputError, match=rf"section \$Nodes: in line {at + 1} .* expected"
     ) as found:
-        read(path, PARTS, USUAL, USUAL)
+        read(path, PARTS, USUAL)
     assert str(found.value).startswith(f"{path}: ")
 
 
@@ -86,7 +86,7 @@ def test_a_count_that_is_wrong_takes_no_memory(count, which, texts, tmp_path: Pa
     path = tmp_path / "mesh.msh"
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"section \$Nodes"):
-        read(path, PARTS, USUAL, USUAL)
+        read(path, PARTS, USUAL)
 
 
 SQUARE = ["0 0", "1 0", "1 1", "0 1"]
@@ -134,7 +134,7 @@ def test_what_no_mesh_can_be(name: str, tmp_path: Path) -> None:
     points, triangles, words = FILES[name]
     path = written(tmp_path / "m.msh", points, triangles, ["1 2 1 1 1 2", "1 2 2 2 2 3"])
     with pytest.raises(InputError, match=words):
-        read(path, PARTS, USUAL, USUAL)
+        read(path, PARTS, USUAL)
 
 
 def test_slits_and_pieces_that_touch_are_meshes(tmp_path: Path) -> None:
@@ -142,21 +142,19 @@ def test_slits_and_pieces_that_touch_are_meshes(tmp_path: Path) -> None:
     points = ["0 0", "1 0", "1 0.5", "1 1", "0 1", "0.5 0.5", "1 0.5"]
     triangles = ["1 2 6", "2 3 6", "7 4 6", "4 5 6", "5 1 6"]
     labels = ["1 2 1 1 3 6", "1 2 1 1 7 6", "1 2 2 2 5 1"]
-    raw = read(written(tmp_path / "slit.msh", points, triangles, labels), PARTS, USUAL, USUAL)
+    raw = read(written(tmp_path / "slit.msh", points, triangles, labels), PARTS, USUAL)
     assert mesh_mutations.faults(raw) == []
     assert (len(raw.points), len(raw.triangles), len(raw.facets)) == (7, 5, 3)
     corner = ["0 0", "1 0", "1 1", "2 1", "2 2"]
     labels = ["1 2 1 1 1 2", "1 2 2 2 2 3", "1 2 2 2 4 5"]
-    raw = read(
-        written(tmp_path / "touch.msh", corner, ["1 2 3", "3 4 5"], labels), PARTS, USUAL, USUAL
-    )
+    raw = read(written(tmp_path / "touch.msh", corner, ["1 2 3", "3 4 5"], labels), PARTS, USUAL)
     assert len(raw.triangles) == 2
 
 
 def test_other_byte_order_and_crlf(texts, tmp_path: Path) -> None:
     path = tmp_path / "m.msh"
     path.write_bytes(texts[0].replace(b"\n", b"\r\n"))
-    assert len(read(path, PARTS, USUAL, USUAL).triangles) == 74
+    assert len(read(path, PARTS, USUAL).triangles) == 74
     big = b"$MeshFormat\n4.1 1 8\n" + (1).to_bytes(4, "big") + b"\n$EndMeshFormat\n"
     block = np.array([1, 3, 1, 3], ">i8").tobytes() + np.array([2, 1, 0], ">i4").tobytes()
     nodes = block + np.array([3, 1, 2, 3], ">i8").tobytes() + np.eye(3).astype(">f8").tobytes()

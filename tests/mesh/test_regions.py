@@ -67,7 +67,9 @@ def test_physical_surfaces(version, shared_tmp_path):
     on_root(COMM, _write, path, version)
     domain = read_gmsh(path, materials=["rock"])
     assert areas(domain) == pytest.approx({"rock": 0.6}, rel=1e-12)
+    assert domain.materials.others == ("Sand",)
     both = read_gmsh(path, materials=["Sand", "rock"])
+    assert both.materials.others == ()
     assert areas(both) == pytest.approx({"Sand": 0.4, "rock": 0.6}, rel=1e-12)
     assert read_gmsh(path).materials.numbers == {}
     with pytest.raises(InputError, match="no physical surface with triangles is named 'soil'; the"):

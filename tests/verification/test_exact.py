@@ -6,9 +6,10 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from signorini_cr import exact, families, norms, solve, solve_levels
+from signorini_cr import Material, exact, families, norms, solve, solve_levels
+from signorini_cr.data.consistency import doubts
 from signorini_cr.errors import InputError
-from signorini_cr.fem.problem import as_expression
+from signorini_cr.fem.problem import Forms, as_expression
 from signorini_cr.fem.space import facet_measures
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN
 from signorini_cr.mesh.refinement import refine
@@ -136,6 +137,70 @@ def test_a_new_solution_is_one_call():
     h1 = [solution.errors[0] for solution in solutions]
     assert np.all(abs(norms.rates([s.h for s in solutions], h1)[-2:] - 1.0) < 0.05)
     assert np.allclose(solutions[-1].contact.transitions[:, 0], 0.3, atol=0.15)
+
+
+def waves(x):
+    return ufl.sin(2.0 * x[0] + 1.0) * ufl.cosh(x[1]) + 0.5 * x[1] * x[0] ** 2
+
+
+def tensor(x):
+    return ufl.as_matrix([[2.0 + x[0], 0.5], [0.5, 1.0 + x[1]]])
+
+
+def on_edges(floor, *others):
+    return dict(zip(exact.EDGES, (floor, *others), strict=True))
+
+
+MIXED, HELD = ("robin", "neumann", "dirichlet"), ("neumann", "dirichlet", "dirichlet")
+NO_DIRICHLET = ("robin", "neumann", "robin")
+LINE = {"line": 0.4, "coefficient": 2.0}
+LOSS = {"loss": 3.0, "external": 0.7}
+MADE = {
+    "below": (on_edges("below", *MIXED), {}),
+    "below, c, b": (on_edges("below", *MIXED), {"reaction": 2.0, **LOSS}),
+    "above, b": (on_edges("above", *MIXED), LOSS),
+    "above, c": (on_edges("above", *HELD), {"reaction": 2.0}),
+    "between": (on_edges("between", *HELD), {}),
+    "between, c, b": (on_edges("between", *MIXED), {"reaction": 2.0, **LOSS}),
+    "between, no Γ0, c": (on_edges("between", *NO_DIRICHLET), {"reaction": 2.0}),
+    "below, no Γ0, b": (on_edges("below", *NO_DIRICHLET), LOSS),
+    "below and between": (
+        on_edges("below", "neumann", "robin", "between"),
+        {"switch": lambda x: 1.0 - 2.0 * x[0] - 2.0 * x[1], **LOSS},
+    ),
+    "tensor, b": (on_edges("below", *MIXED), {"coefficient": tensor, **LOSS}),
+    "tensor, between, c": (on_edges("between", *HELD), {"coefficient": tensor, "reaction": 2.0}),
+    "line, b": (on_edges("below", *MIXED), {**LINE, **LOSS, "east": Material(20.0)}),
+    "line, between, c": (
+        on_edges("between", *HELD),
+        {**LINE, "reaction": 2.0, "east": Material(0.1, reaction=7.0)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_each_term_and_condition_converges_as_theory_says(name):
+    kinds, data = MADE[name]
+    u = waves
+    if "line" in data:
+        u = exact.kinked(waves, data["line"], data["coefficient"], data["east"].coefficient)
+    example = exact.made(u, kinds, **data)
+    domain = example.mesh(0.2)
+    forms = Forms(example.problem, domain.mesh, "CR", domain.parts, domain.materials)
+    assert doubts(forms, domain) == []
+    solutions = list(solve_levels(example.problem, domain, 4))
+    h, h1, l2 = np.array([(s.h, *s.errors) for s in solutions]).T
+    assert norms.rates(h, h1)[-1] == pytest.approx(1.0, abs=0.03)
+    assert norms.rates(h, l2)[-1] == pytest.approx(2.0, abs=0.1)
+    table = solutions[-1].contact.table()
+    pressure = COMM.bcast(table["pressure"] if COMM.rank == 0 else None)
+    # there is contact, and there is none, on both sides if there are two
+    for kind, sign in ("below", 1), ("above", -1), ("between", 1), ("between", -1):
+        assert kind not in kinds.values() or (sign * pressure > 0.1).any()
+    assert (pressure == 0.0).any()
+    certificate = solutions[-1].certificate
+    if certificate.bound_h1 is not None:
+        assert h1[-1] <= certificate.bound_h1
 
 
 def test_harmonic_roots_need_contact_of_the_right_sign():

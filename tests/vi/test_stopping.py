@@ -20,7 +20,17 @@ import ufl
 from dolfinx.mesh import compute_midpoints, create_mesh, exterior_facet_indices, meshtags
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, NotConverged, Polygon, Problem, Solution, solve_levels
+from signorini_cr import (
+    Contact,
+    Domain,
+    InputError,
+    NotConverged,
+    Polygon,
+    Problem,
+    Solution,
+    solve,
+    solve_levels,
+)
 from signorini_cr.compat import cell_nodes
 from signorini_cr.mesh.refinement import refine
 
@@ -323,6 +333,20 @@ def two_squares():
 def test_a_piece_that_nothing_holds_is_named(f):
     with pytest.raises(InputError, match=r"around \(2\.\d+, 0\.\d+\) has no Dirichlet facet and a"):
         list(solve_levels(Problem(f=f, obstacle=-0.1), two_squares(), 3))
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_a_net_force_that_quadrature_makes_is_none(element):
+    """That of sin 2πx, and of a flux against it; what is there is seen behind what oscillates."""
+    edges = ["floor", "neumann", "neumann", "neumann"]
+    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=("floor",)).mesh(0.3)
+    floor = {"floor": Contact(0.0)}
+    wave = lambda x: 3.0 * ufl.sin(2.0 * np.pi * x[0])  # noqa: E731
+    for data in ({"f": wave}, {"f": lambda x: -ufl.exp(x[0]), "g": (np.e - 1.0) / 3.0}):
+        with pytest.raises(InputError, match="∫g that can't be told from 0: only one below 0"):
+            solve(Problem(conditions=floor, **data), domain, element)
+    weight = Problem(f=lambda x: wave(x) - 1e-3, conditions=floor)
+    assert solve(weight, domain, element).contact.force == pytest.approx(1e-3, rel=0.01)
 
 
 @pytest.mark.parametrize("nested", [True, False])
