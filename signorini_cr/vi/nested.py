@@ -60,7 +60,7 @@ def nested_start(
     system, below = level.system, coarse.level.parents
     ancestor = None if before is None or below is None else Ancestor(before, below)
     values = start.x.array[system.dirichlet].copy()
-    start.x.array[:] = prolongate(coarse.u, level.V, level.parents, ancestor)
+    start.x.array[:] = prolongate(coarse.u, level.V, level.parents, ancestor) - system.offset
     start.x.array[system.dirichlet] = values
     if coarse.element == "P1":  # a dof has many cells, and no one to change its residual through
         return
@@ -83,7 +83,7 @@ def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
     """
     system = level.system
     values = start.x.array[system.dirichlet].copy()
-    start.x.array[:] = u.x.array
+    start.x.array[:] = u.x.array - system.offset
     start.x.array[system.dirichlet] = values
     bounded, bounds = system.bounded, system.bounds
     x = start.x.array[bounded]
