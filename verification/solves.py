@@ -37,6 +37,7 @@ class Case:
         parameters: Theirs.
         contrast: Largest κ over the smallest.
         degree: Of the quadrature.
+        bare: Whether it is judged so, see `Judge`.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Case:
     parameters: tuple[float, ...]
     contrast: float = 1.0
     degree: int = 4
+    bare: bool = False
 
     def run(self, ways: Sequence[bool] = (True, False)) -> list[Verdict]:
         """Solve nested, cold, or both, and judge; collective."""
@@ -56,7 +58,7 @@ class Case:
         }
         problem = Problem(**given, quadrature_degree=self.degree)
         values = {key: numeric(formula, self.parameters) for key, formula in self.formulas.items()}
-        judge = Judge(Data(**values, degree=self.degree))
+        judge = Judge(Data(**values, degree=self.degree), self.bare)
         out = []
         for nested in ways:
             solution, steps = finest(problem, domain, self.levels, nested)
@@ -207,6 +209,106 @@ STIFF = {
     "crooked hexagon, C in a plate": (CROOKED, _layers),
     "L-shape, C in every other field": (ANGLE, _board),
 }
+
+
+def _bottom(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    """A stiff block that rests on Γ1."""
+    return m.where(m.above(0.3, y), p[0], 1.0)
+
+
+def _high_waves(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[1] - 0.3 + 0.1 * m.cos(9.0 * x)
+
+
+def _high_slope(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[1] + x / 5
+
+
+def _block(contrast: float, height: float, levels: int) -> Case:
+    vertices, boundary = RECTANGLE
+    return Case(
+        f"C = {contrast:.0e}, u = {height:g}",
+        lambda: Polygon(vertices, boundary).mesh(0.25, COMM),
+        levels,
+        {
+            "f": _weight,
+            "g": _zero,
+            "obstacle": _high_waves,
+            "dirichlet": _high_slope,
+            "coefficient": _bottom,
+        },
+        (contrast, height),
+        contrast,
+        bare=True,
+    )
+
+
+def _pull(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return -p[1] + 0.0 * x
+
+
+def _near(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[0] - 0.1 * p[1] + 0.05 * p[1] * m.cos(9.0 * x)
+
+
+def _level(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[0] + 0.0 * x
+
+
+def _one(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return 1.0 + 0.0 * x
+
+
+def _weak(height: float, force: float, levels: int) -> Case:
+    square = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    return Case(
+        f"u = {height:g}, f = {-force:g}",
+        lambda: Polygon(square, RECTANGLE[1]).mesh(0.3, COMM),
+        levels,
+        {
+            "f": _pull,
+            "g": _zero,
+            "obstacle": _near,
+            "dirichlet": _level,
+            "coefficient": _one,
+        },
+        (height, force),
+        bare=True,
+    )
+
+
+def offset(seed: int, quick: bool) -> Group:
+    """Forces that are small beside what rounding leaves of them."""
+    levels, heights = 3, (100.0,) if quick else (0.0, 100.0)
+    exponents = (4, 12) if quick else range(2, 14)
+    forces = (1e-2, 1e-8) if quick else [10.0**-k for k in range(1, 13)]
+    rows = []
+    for height in heights:
+        for title, chosen in (
+            ("C ≤ 1e7", [e for e in exponents if e <= 7]),
+            ("C > 1e7", [e for e in exponents if e > 7]),
+        ):
+            cases = [_block(10.0**e, height, levels) for e in chosen]
+            name = f"stiff block (C : 1) that rests on Γ1 at u = {height:g}, {title}"
+            rows.append(row_of(name, cases, lambda case: case.contrast > 1e7))
+    for height in (1e5,) if quick else (293.15, 1e5):
+        for title, chosen in (
+            ("f ≥ 1e-8 u", [f for f in forces if f >= 1e-8 * height]),
+            ("f < 1e-8 u", [f for f in forces if f < 1e-8 * height]),
+        ):
+            cases = [_weak(height, force, levels) for force in chosen]
+            may = title.startswith("f <")
+            name = f"forces of the order of f beside u = {height:g}, {title}"
+            rows.append(row_of(name, cases, lambda case, may=may: may))
+    return Group(
+        "offset",
+        "Forces that rounding may hide",
+        "A stiff block on Γ1, held by a soft part above, α = u − 0.3 + 0.1 cos 9x, u_D = u + x/5, "
+        "f = −3; and κ = 1, α = u − f/10 + f/20 cos 9x, u_D = u. "
+        f"{levels} meshes, nested and cold. Passed: the same facets in contact and forces right "
+        f"to {EXACT:.0e} of their sum, however small that is, and where so noted, or refused.",
+        rows,
+    )
 
 
 def stiff(seed: int, quick: bool) -> Group:

@@ -154,6 +154,8 @@ def solve_vi(
         extended = test.doubtful and reason > 0
         if extended:
             test.settle(vectors, bounds)
+        elif test.touching:
+            vectors.residual.array[linear.active_now().dofs] = 0.0
         iterations = Iterations(
             snes.getIterationNumber(),
             linear.iterations,
@@ -235,6 +237,7 @@ class NewtonTest:
     Attributes:
         force_error: What may be wrong with the contact forces, in parts of their sum.
         imbalance: Largest residual of a class of stiffness in parts of its flows.
+        touching: Whether all forces are rounding, and there are none.
         doubtful: Whether SNES has come as far as it can in double precision, which is not enough.
         failure: Why it can't be done, if it can't.
     """
@@ -255,7 +258,8 @@ class NewtonTest:
         self._for_the_set = self._passes = self._swaps = 0
         self._forces = linear.forces()
         self.force_error = self.imbalance = np.inf
-        self.doubtful, self.failure = False, ""
+        self.doubtful = self.touching = False
+        self.failure = ""
 
     def __call__(self, snes: PETSc.SNES, step: int, norm: float) -> int:
         """Decide; the same on all ranks."""
@@ -273,7 +277,7 @@ class NewtonTest:
             if enough:
                 self.force_error = self.imbalance = 0.0
             return Reason.CONVERGED_FNORM_ABS if enough else Reason.ITERATING
-        known, solved = self.force_error, self.imbalance
+        known, solved, self.touching = self.force_error, self.imbalance, False
         self.force_error = self.imbalance = np.inf  # what was known of another set says nothing
         x, last = snes.getSolution(), self._linear.active.dofs
         facts = self._contact_facts(before)
@@ -352,8 +356,9 @@ class NewtonTest:
             relative = np.where(beside <= loose * FORCES, beside, relative)
             if sure and not stiffness.varied and lost.all():
                 made_of = np.maximum(stiffness.made_of, 1e-300)
-                touching = np.where(lost, noise, np.inf) / made_of
-                relative = np.where(touching <= loose * TOUCHING, touching, relative)
+                touching = noise / made_of
+                if (touching <= loose * TOUCHING).all():
+                    relative, self.touching = touching, True
         return relative, noise
 
     def _close(self, x: PETSc.Vec, active: ActiveSet, moving: bool) -> FloatArray:

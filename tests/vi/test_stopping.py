@@ -386,3 +386,86 @@ def test_a_part_that_presses_little_is_known_as_well(scale):
         MPI.COMM_WORLD.allreduce(float(np.abs(f).sum())) for f in (forces - expected, expected)
     )
     assert whole > 0.1 and wrong < 2e-6 * whole
+
+
+def block(contrast: float, height: float = 100.0) -> Data:
+    """A stiff block that rests on the obstacle, all of it high up."""
+    return Data(
+        coefficient=lambda x, y, on: where(on, y < 0.3, contrast, 1.0),
+        obstacle=lambda x, y, on: height - 0.3 + 0.1 * on.cos(9 * x),
+        dirichlet=lambda x, y, on: height + x / 5,
+    )
+
+
+def block_below(contrast: float) -> Data:
+    return block(contrast, 0.0)
+
+
+def right_or_refused(problem: Data, expected: Reference, may_refuse: bool) -> None:
+    try:
+        solution = solutions(problem, 3)[-1]
+    except NotConverged as error:
+        assert may_refuse and "last digit of the data" in error.reason
+        return
+    assert compare(solution, expected) < 1e-6
+    assert 0.0 < solution.contact.kkt.force_error < 1e-6
+
+
+@pytest.mark.parametrize("contrast", [1e4, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13])
+@pytest.mark.parametrize("data", [block, block_below])
+def test_a_stiff_block_on_the_obstacle(data, contrast):
+    """The split between two facets hangs on 1e-16 C u of α; what doubles hide besides is found."""
+    may_refuse = contrast > (1e8 if data is block else 1e10)
+    right_or_refused(data(contrast), expected(data, contrast), may_refuse)
+
+
+@pytest.mark.parametrize("force", [1e-1, 1e-2, 1e-6, 1e-8, 1e-9, 1e-12])
+def test_forces_that_are_small_beside_u(force):
+    """Means of α are known to 1e-11: to the sixth digit of a force of 1e-2, and hardly of 1e-8."""
+    data = Data(
+        f=lambda x, y, on: -force,
+        obstacle=lambda x, y, on: 1e5 - 0.1 * force + 0.05 * force * on.cos(9 * x),
+        dirichlet=lambda x, y, on: 1e5,
+    )
+    found = reference(mesh_alone(3), rectangle_part, data)
+    right_or_refused(data, found, may_refuse=force < 1e-2)
+
+
+@pytest.mark.parametrize("contrast", [1.0, 1e6])
+def test_far_from_the_obstacle_nothing_is_in_doubt(contrast):
+    data = Data(
+        coefficient=lambda x, y, on: where(on, x < 0.05, contrast, 1.0),
+        f=lambda x, y, on: -1e-9,
+        obstacle=lambda x, y, on: 99999.0,
+        dirichlet=lambda x, y, on: 1e5,
+    )
+    contact = solutions(data, 3)[-1].contact
+    assert contact.force == contact.kkt.force_error == contact.number_active == 0
+
+
+@pytest.mark.parametrize("height", [0.0, 100.0])
+def test_touching_is_no_force(height):
+    """u = u_D = α on Γ1, with flows along it, and none through it."""
+
+    def slope(x, y, on):
+        return height + x / 5
+
+    data = Data(f=lambda x, y, on: 0.0, obstacle=slope, dirichlet=slope)
+    sides = ["contact", "dirichlet", "dirichlet", "dirichlet"]
+    domain = Polygon(RECTANGLE, sides).mesh(0.25)
+    for solution in solve_levels(data.problem(), domain, 3):
+        contact = solution.contact
+        assert contact.force == 0.0 and np.all(contact.pressure == 0.0)
+        assert contact.number_active == 0 and contact.kkt.force_error < 1e-6
+
+
+def test_an_offset_is_taken_off():
+    """What is solved for is u less what the data have in common, whoever asks gets u."""
+    solution = solutions(block(1e4), 1)[-1]
+    system = solution.level.system
+    assert system.offset == pytest.approx(100.0)
+    table = solution.contact.table()
+    if table is not None:
+        assert np.all(np.abs(table["u"] - 100.0) < 1.0)
+        assert np.all(table["u"][table["active"]] == table["obstacle"][table["active"]])
+    assert solutions(block(1e4, 0.2), 1)[-1].level.system.offset == 0.0
