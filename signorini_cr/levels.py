@@ -236,7 +236,8 @@ def solve_level(
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
     contact = contact_facts(level.data, system, u, residual, iterations)
-    u.x.array[:] += system.offset
+    if system.offset:
+        u.x.array[:] += system.offset
     owned = system.A.getLocalSize()[0]
     energy = level.domain.mesh.comm.allreduce(
         0.5 * level.data.energy(u) - system.chi.x.array[:owned] @ u.x.array[:owned]

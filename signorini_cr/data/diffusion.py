@@ -18,6 +18,7 @@ from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
 from ..mesh.domain import Domain, is_by_cells
+from .admissible import check_symmetry
 from .loads import NeumannMoments, VolumeMoments, chi
 from .moments import Compiled, OnFacets, Tensor
 
@@ -39,9 +40,15 @@ class DiffusionOnMesh:
     rate: FloatArray = np.array(1.0)
 
     def __init__(self, compiled: Compiled, domain: Domain):
-        """Make the space; collective."""
+        """Make the space; collective.
+
+        Raises:
+            InputError: Data are not to be had there, or κ is not symmetric at a quadrature point.
+        """
         self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
         self.forms.insist_on_data(domain)
+        if self.forms.problem.form is None and isinstance(compiled.kappa, Tensor):
+            check_symmetry(compiled.kappa, domain)
         self.V = function_space(domain.mesh, self.forms.element)
 
     @cached_property

@@ -60,7 +60,9 @@ def nested_start(
     system, below = level.system, coarse.level.parents
     ancestor = None if before is None or below is None else Ancestor(before, below)
     values = start.x.array[system.dirichlet].copy()
-    start.x.array[:] = prolongate(coarse.u, level.V, level.parents, ancestor) - system.offset
+    start.x.array[:] = prolongate(coarse.u, level.V, level.parents, ancestor)
+    if system.offset:
+        start.x.array[:] -= system.offset
     start.x.array[system.dirichlet] = values
     if coarse.element == "P1":  # a dof has many cells, and no one to change its residual through
         return
