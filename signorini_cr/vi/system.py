@@ -244,11 +244,16 @@ class System:
     @property
     def data_rounded(self) -> float:
         """Bound of what rounding of u_D and of the loads may change in b, summed up; collective."""
-        owned = self.A.getLocalSize()[0]
-        # of the load, and of b − χ, which has u_D; BLAS needs no array for absolute values
-        size = dasum(self.b.x.array[:owned]) + 2.0 * dasum(self.chi.x.array[:owned])
+        owned, fixed = self.A.getLocalSize()[0], self.owned_dirichlet
+        b, chi = self.b.x.array[:owned], self.chi.x.array[:owned]
+        # BLAS needs no array for absolute values; on Γ0 b has u_D, which is no force
+        b[fixed], values = 0.0, b[fixed]
+        size = dasum(b) + 2.0 * dasum(chi)  # b − χ is u_D's share
+        b[fixed] = values
         if self.offset:
-            size += abs(self.offset) * dasum(self.row_sums())
+            sums = self.row_sums()
+            sums[fixed] = 0.0
+            size += abs(self.offset) * dasum(sums)
         return DATUM * float(self.u_D.function_space.mesh.comm.allreduce(float(size)))
 
     def data_rounding(self, seed: int) -> tuple[FloatArray, FloatArray]:
