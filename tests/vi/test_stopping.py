@@ -48,10 +48,29 @@ class Data:
 
 @dataclass
 class Reference:
-    """Midpoints of the contact facets, their forces (0 where there is no contact)."""
+    """Midpoints of the contact facets, their forces (0 where there is no contact).
+
+    Of these facets, which lie on a line, the gap at the midpoints and at both ends, in the order of
+    the ends' x.
+    """
 
     midpoints: npt.NDArray[np.float64]
     forces: npt.NDArray[np.float64]
+    ends: npt.NDArray[np.float64]
+    gaps: npt.NDArray[np.float64]
+
+    @property
+    def transitions(self) -> npt.NDArray[np.float64]:
+        """Where the gap becomes 0 in free facets beside active ones, or the vertices between."""
+        order = np.argsort(self.midpoints[:, 0])
+        x, gaps, active = self.ends[order], self.gaps[order], self.forces[order] > 0
+        found = []
+        for i in np.flatnonzero(active[1:] != active[:-1]):
+            free, end = (i, 2) if active[i + 1] else (i + 1, 0)
+            middle, at_end = gaps[free, 1], gaps[free, end]
+            way = middle / (middle - at_end) if at_end < 0 < middle else 1.0
+            found.append(x[free].mean() + way * (x[free, end // 2] - x[free].mean()))
+        return np.array(found)
 
 
 def where(on, condition, a, b):
@@ -110,6 +129,17 @@ def reference(domain: Domain, part: Callable[[npt.NDArray], npt.NDArray], data: 
     def residual(u):  # rows add up to zero
         return np.add.reduceat(value * (u[columns] - u[row[order]]), begins) - b
 
+    def ends_of(facets, u, middle):
+        """Of facets the ends' x, ascending, and the gaps there and between."""
+        cell, local = (np.array(x) for x in zip(*[np.argwhere(dofs == f)[0] for f in facets]))
+        at_vertices = u[dofs[cell]].sum(axis=1, keepdims=True) - 2 * u[dofs[cell]]
+        which = np.stack([(local + 1) % 3, (local + 2) % 3], axis=1)
+        x, y = np.moveaxis(points[np.take_along_axis(cells[cell], which, axis=1)], 2, 0)
+        gap = np.take_along_axis(at_vertices, which, axis=1) - data.obstacle(x, y, np)
+        order = np.argsort(x, axis=1)
+        x, gap = (np.take_along_axis(each, order, axis=1) for each in (x, gap))
+        return x, np.column_stack([gap[:, 0], middle, gap[:, 1]]).astype(float)
+
     u = np.where(fixed, means["dirichlet"], 0).astype(LONG)
     active = np.zeros(len(contact), dtype=bool)
     for _ in range(60):
@@ -132,7 +162,9 @@ def reference(domain: Domain, part: Callable[[npt.NDArray], npt.NDArray], data: 
         force = residual(u)[contact]
         indicator = force - diagonal[contact] * (u[contact] - means["obstacle"][contact])
         if np.array_equal(indicator > 0, active):
-            return Reference(midpoints[contact], np.where(active, force, 0).astype(float))
+            forces = np.where(active, force, 0).astype(float)
+            middle = u[contact] - means["obstacle"][contact]
+            return Reference(midpoints[contact], forces, *ends_of(contact, u, middle))
         active = indicator > 0
     raise AssertionError("the reference's active set does not settle")
 
@@ -232,6 +264,17 @@ def test_forces_are_right_whatever_the_contrast(data, contrast, nested):
     assert compare(solution, expected(data, contrast)) < 1e-6
     assert solution.contact.kkt.force_error < 1e-6
     assert solution.contact.kkt.residual < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("data", "contrast"), [(halves, 1e2), (halves, 1e4), (halves, 1e6), (halves, 1e8)]
+)
+def test_contact_ends_where_the_reference_says(data, contrast):
+    """In the facets that the active set names, and there where the reference's u meets α."""
+    found, length = solutions(data(contrast), 3)[-1].contact.transitions, 2 / 32
+    wanted = expected(data, contrast).transitions
+    assert len(found) == len(wanted) > 0
+    assert np.abs(np.sort(found[:, 0]) - np.sort(wanted)).max() < 1e-6 * length
 
 
 @pytest.mark.parametrize(("data", "contrast"), BEYOND)
