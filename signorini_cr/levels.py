@@ -27,7 +27,7 @@ from .vi.contact import contact_facts
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
 from .vi.pieces import Loose
-from .vi.solver import solve_vi
+from .vi.solver import Data, solve_vi
 from .vi.system import System
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
@@ -247,9 +247,8 @@ def solve_level(
             lend(system) as cycle,
             system.vectors(u, residual) as vectors,
         ):
-            iterations = solve_vi(
-                cycle, vectors, system.residual_scale, monitor=told, row_sums=system.row_sums
-            )
+            data = Data(system.row_sums, system.data_rounding, system.data_rounded, system.offset)
+            iterations = solve_vi(cycle, vectors, system.residual_scale, monitor=told, data=data)
     except NotConverged as failure:
         if level.physics.problem.form is not None and "DIVERGED_INDEFINITE" in failure.reason:
             raise InputError(f"{NOT_DEFINITE}; level {level.number} shows it") from None
@@ -258,6 +257,8 @@ def solve_level(
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
     contact = contact_facts(level.data, system, u, residual, iterations)
+    if system.offset:
+        u.x.array[:] += system.offset
     owned = system.A.getLocalSize()[0]
     energy = level.domain.mesh.comm.allreduce(
         0.5 * level.data.energy(u) - system.chi.x.array[:owned] @ u.x.array[:owned]

@@ -6,10 +6,10 @@
 
 What is independent of what:
 
-- `forces`, `random`, `thin`: `reference.py` takes the coordinates of the cells, the facets' numbers
-  and the boundary parts from the program's mesh, and nothing else: its matrices, right-hand sides,
-  bounds, solver and arithmetic (extended precision) are its own. Basix gives the quadrature points,
-  as the discrete problem is defined with them.
+- `forces`, `offset`, `random`, `thin`: `reference.py` takes the coordinates of the cells, the
+  facets' numbers and the boundary parts from the program's mesh, and nothing else: its matrices,
+  right-hand sides, bounds, solver and arithmetic (extended precision) are its own. Basix gives the
+  quadrature points, as the discrete problem is defined with them.
 - `bounds`, `sharpness`: solutions in closed form; `exactly.py` integrates their distance from the
   program's u_h on triangles that it splits along the lines where data jump, by rules of its own.
   Of the program it takes the coordinates of the cells and u_h's values at the facets.
@@ -44,6 +44,7 @@ COMM = MPI.COMM_WORLD
 
 GROUPS: dict[str, Callable[[int, bool], Group]] = {
     "forces": solves.stiff,
+    "offset": solves.offset,
     "random": solves.random,
     "bounds": bounds.bounds,
     "sharpness": sharpness.sharpness,

@@ -37,6 +37,7 @@ class Case:
         parameters: Theirs.
         contrast: Largest κ over the smallest.
         degree: Of the quadrature.
+        bare: Whether it is judged so, see `Judge`.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Case:
     parameters: tuple[float, ...]
     contrast: float = 1.0
     degree: int = 4
+    bare: bool = False
 
     def run(self, ways: Sequence[bool] = (True, False)) -> list[Verdict]:
         """Solve nested, cold, or both, and judge; collective."""
@@ -56,7 +58,7 @@ class Case:
         }
         problem = Problem(**given, quadrature_degree=self.degree)
         values = {key: numeric(formula, self.parameters) for key, formula in self.formulas.items()}
-        judge = Judge(Data(**values, degree=self.degree))
+        judge = Judge(Data(**values, degree=self.degree), self.bare)
         out = []
         for nested in ways:
             solution, steps = finest(problem, domain, self.levels, nested)
@@ -207,6 +209,106 @@ STIFF = {
     "crooked hexagon, C in a plate": (CROOKED, _layers),
     "L-shape, C in every other field": (ANGLE, _board),
 }
+
+
+def _bottom(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    """A stiff block that rests on Γ1."""
+    return m.where(m.above(0.3, y), p[0], 1.0)
+
+
+def _high_waves(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[1] - 0.3 + 0.1 * m.cos(9.0 * x)
+
+
+def _high_slope(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[1] + x / 5
+
+
+def _block(contrast: float, height: float, levels: int) -> Case:
+    vertices, boundary = RECTANGLE
+    return Case(
+        f"C = {contrast:.0e}, u = {height:g}",
+        lambda: Polygon(vertices, boundary).mesh(0.25, COMM),
+        levels,
+        {
+            "f": _weight,
+            "g": _zero,
+            "obstacle": _high_waves,
+            "dirichlet": _high_slope,
+            "coefficient": _bottom,
+        },
+        (contrast, height),
+        contrast,
+        bare=True,
+    )
+
+
+def _pull(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return -p[1] + 0.0 * x
+
+
+def _near(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[0] - 0.1 * p[1] + 0.05 * p[1] * m.cos(9.0 * x)
+
+
+def _level(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[0] + 0.0 * x
+
+
+def _one(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return 1.0 + 0.0 * x
+
+
+def _weak(height: float, force: float, levels: int) -> Case:
+    square = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    return Case(
+        f"u = {height:g}, f = {-force:g}",
+        lambda: Polygon(square, RECTANGLE[1]).mesh(0.3, COMM),
+        levels,
+        {
+            "f": _pull,
+            "g": _zero,
+            "obstacle": _near,
+            "dirichlet": _level,
+            "coefficient": _one,
+        },
+        (height, force),
+        bare=True,
+    )
+
+
+def offset(seed: int, quick: bool) -> Group:
+    """Forces that are small beside what rounding leaves of them."""
+    levels, heights = 3, (100.0,) if quick else (0.0, 100.0)
+    exponents = (4, 12) if quick else range(2, 14)
+    forces = (1e-2, 1e-8) if quick else [10.0**-k for k in range(1, 13)]
+    rows = []
+    for height in heights:
+        for title, chosen in (
+            ("C ≤ 1e7", [e for e in exponents if e <= 7]),
+            ("C > 1e7", [e for e in exponents if e > 7]),
+        ):
+            cases = [_block(10.0**e, height, levels) for e in chosen]
+            name = f"stiff block (C : 1) that rests on Γ1 at u = {height:g}, {title}"
+            rows.append(row_of(name, cases, lambda case: case.contrast > 1e7))
+    for height in (1e5,) if quick else (293.15, 1e5):
+        for title, chosen in (
+            ("f ≥ 1e-8 u", [f for f in forces if f >= 1e-8 * height]),
+            ("f < 1e-8 u", [f for f in forces if f < 1e-8 * height]),
+        ):
+            cases = [_weak(height, force, levels) for force in chosen]
+            may = title.startswith("f <")
+            name = f"forces of the order of f beside u = {height:g}, {title}"
+            rows.append(row_of(name, cases, lambda case, may=may: may))
+    return Group(
+        "offset",
+        "Forces that rounding may hide",
+        "A stiff block on Γ1, held by a soft part above, α = u − 0.3 + 0.1 cos 9x, u_D = u + x/5, "
+        "f = −3; and κ = 1, α = u − f/10 + f/20 cos 9x, u_D = u. "
+        f"{levels} meshes, nested and cold. Passed: the same facets in contact and forces right "
+        f"to {EXACT:.0e} of their sum, however small that is, and where so noted, or refused.",
+        rows,
+    )
 
 
 def stiff(seed: int, quick: bool) -> Group:
@@ -369,31 +471,71 @@ STEPS = 60
 """CG steps that thin cells may take on any mesh."""
 
 
-def _flat(factor: float, levels: int, whole: bool, contrast: float = 1.0) -> Case:
-    """A polygon squashed, and meshed before or after."""
+def _hexagon(factor: float) -> Polygon:
     vertices = np.array([[-1, 0], [0.1, -0.1], [1, 0], [1.1, 0.8], [0, 1.1], [-0.9, 0.9]])
     boundary = ("contact", "contact", "neumann", "dirichlet", "dirichlet", "neumann")
+    return Polygon(vertices * [1, factor], boundary)
+
+
+def _angle(factor: float) -> Polygon:
+    return Polygon(np.array(ANGLE[0]) * [1, factor], ANGLE[1])
+
+
+def _strip_of(factor: float) -> Polygon:
+    return Polygon(
+        np.array(RECTANGLE[0]) * [1, factor], ("contact", "neumann", "dirichlet", "neumann")
+    )
+
+
+def _half_disc(factor: float) -> Polygon:
+    angles = np.linspace(0, np.pi, 17)
+    arc = np.column_stack([np.cos(angles), np.sin(angles)]) * [1, factor]
+    return Polygon(arc, (*["dirichlet"] * 8, *["neumann"] * 8, "contact"))
+
+
+def _with_hole(factor: float) -> Polygon:
+    hole = np.array([[-0.3, 0.3], [0.2, 0.3], [0, 0.7]]) * [1, factor]
+    sides = np.array(RECTANGLE[0]) * [1, factor]
+    return Polygon(sides, RECTANGLE[1], [Polygon(hole, ["neumann"] * 3)])
+
+
+SHAPES: dict[str, Callable[[float], Polygon]] = {
+    "hexagon": _hexagon,
+    "L-shape": _angle,
+    "strip": _strip_of,
+    "half disc": _half_disc,
+    "rectangle with a hole": _with_hole,
+}
+
+
+def _flat(
+    name: str, factor: float, levels: int, whole: bool, size: float = 0.25, load: float = 3.0
+) -> Case:
+    """A polygon squashed, and meshed before or after."""
 
     def mesh() -> Domain:
         if whole:
-            return Polygon(vertices * [1, factor], boundary).mesh(0.25, COMM)
-        return squashed(Polygon(vertices, boundary).mesh(0.25, COMM), factor)
+            return SHAPES[name](factor).mesh(size, COMM)
+        return squashed(SHAPES[name](1.0).mesh(size, COMM), factor)
 
-    kind = "meshed after" if whole else "meshed before"
+    kind = "after" if whole else "before"
     return Case(
-        f"squashed to {factor:.0e}, {kind}",
+        f"{name} squashed to {factor:.0e}, meshed {kind}, size {size:g}, f = {-load:.0e}",
         mesh,
         levels,
         {
-            "f": _weight,
+            "f": _load,
             "g": _zero,
             "obstacle": _any_obstacle,
             "dirichlet": _slope,
-            "coefficient": _half,
+            "coefficient": _one,
         },
-        (0, 0, 0, 0, -0.1, 0.2, 7.0, 0.5, 0, 0, contrast, 1.0, 0.0, 0.1, 0, 0, 0),
-        contrast,
+        (load, 0, 0, 0, -0.1, 0.2, 7.0, 0.5),
     )
+
+
+def _load(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return -p[0] + 0.0 * x
 
 
 def thin(seed: int, quick: bool) -> Group:
@@ -403,22 +545,28 @@ def thin(seed: int, quick: bool) -> Group:
         steps = max(verdict.steps, default=0)
         return f"{steps} CG steps" if steps > STEPS else None
 
-    levels = 3 if quick else 5
+    shapes = ["hexagon", "L-shape"] if quick else list(SHAPES)
+    sizes = (0.25,) if quick else (0.25, 0.1)
     rows = []
-    for factor, counted in ((1e-3, True), (1e-4, False)):
-        cases = [_flat(factor, levels, whole) for whole in (True, False)]
-        row = row_of(
-            f"squashed to {factor:.0e}" + (f", ≤ {STEPS} CG steps on every mesh" * counted),
-            cases,
-            lambda case: False,
-            long if counted else lambda *_: None,
-        )
-        rows.append(row)
+    for name in shapes:
+        for factor in (1e-3, 1e-4):
+            levels = 3 if quick or name != "hexagon" else 4
+            cases = [
+                _flat(name, factor, levels, whole, size, load)
+                for whole, size in [*((False, size) for size in sizes), (True, 0.25)]
+                for load in (3.0, 3.0 * factor**-1.5)
+                if name == "hexagon" or not whole
+            ]
+            title, more = f"{name} squashed to {factor:.0e}", None
+            if factor >= 1e-3:
+                title, more = f"{title}, ≤ {STEPS} CG steps on every mesh", long
+            rows.append(row_of(title, cases, lambda case: False, more or (lambda *_: None)))
     return Group(
         "thin",
         "Thin cells",
-        "A hexagon squashed, triangulated before and after, "
-        f"{levels} meshes, nested and cold. Passed: solved, the same facets in contact and forces "
-        f"right to {EXACT:.0e}.",
+        "Polygons squashed, triangulated before, the hexagon after, too, 3 meshes, 4 of the "
+        "hexagon, nested and cold; f = −3 and a load that brings contact whatever the thickness. "
+        "Passed: solved, the same facets in contact and forces right to "
+        f"{EXACT:.0e}.",
         rows,
     )

@@ -33,13 +33,18 @@ from ..mesh.domain import Domain
 from .pointwise import EPS, evaluate
 
 if TYPE_CHECKING:
-    from .moments import Trace
+    from .moments import Tensor, Trace
 
 Complaint = tuple[tuple[float, ...], str]
 """Where, and what is wrong there."""
 
 SAFETY = 4.0
 """How many times its bound a rounding error may be: the bound is of first order."""
+
+WANTED = "a symmetric positive definite tensor is needed"
+
+MOST_SHOWN = 100
+"""Points that are looked at for the one to be told."""
 
 TOLERANCE = 1e-9
 """What is no difference, in parts of u_D's size: formulas are written with so many digits."""
@@ -585,14 +590,42 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
     if not forms.kappa.ufl_shape:
         said = f"is {values[i, 0, 0]:.10g}; it must be above 0 everywhere"
     else:
-        rows = ", ".join("[" + ", ".join(f"{v:.10g}" for v in row) + "]" for row in values[i])
-        said = f"is [{rows}], which is not symmetric; "
+        said = f"is {_rows(values[i])}, which is not symmetric; "
         if not crooked[i]:
-            said = f"is [{rows}], with the eigenvalue {least[i]:.10g}; "
-        said += "a symmetric positive definite tensor is needed"
+            said = f"is {_rows(values[i])}, with the eigenvalue {least[i]:.10g}; "
+        said += WANTED
     material = _owner(forms, domain, "coefficient")(cells[i])
     key = f"material.{material}" if material else "data"
     return [(where, f"{key}.coefficient: the value at {shown(where)} {said}")]
+
+
+def check_symmetry(kappa: Tensor, domain: Domain) -> None:
+    """Insist on a tensor that is symmetric at the quadrature points of a mesh; collective.
+
+    Nothing is to be done where its formulas say so.
+
+    Raises:
+        InputError: It is not.
+    """
+    if not kappa.skew:
+        return
+    mesh = domain.mesh
+    number = mesh.topology.index_map(mesh.topology.dim).size_local
+    values = kappa.as_given(domain, kappa.rule, slice(0, number))
+    size = np.abs(values).max(axis=(2, 3), initial=0.0)
+    skew = np.abs(values - values.transpose(0, 1, 3, 2)).max(axis=(2, 3), initial=0.0)
+    found = []
+    for cell, point in np.argwhere(skew > TOLERANCE * size)[:MOST_SHOWN]:
+        corners = mesh.geometry.x[cell_nodes(mesh)[cell]]
+        where = place(kappa.rule.hats[:, point] @ corners, mesh)
+        said = f"is {_rows(values[cell, point])}, which is not symmetric; {WANTED}"
+        found.append((where, f"data.coefficient: the value at {shown(where)} {said}"))
+    _raise_first(mesh.comm, found)
+
+
+def _rows(tensor: FloatArray) -> str:
+    """A tensor in a message."""
+    return "[" + ", ".join("[" + ", ".join(f"{v:.10g}" for v in row) + "]" for row in tensor) + "]"
 
 
 def _bad_form(forms: Forms, domain: Domain) -> str | None:

@@ -21,6 +21,7 @@ from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
 from ..mesh.domain import Domain
+from .admissible import check_symmetry
 from .loads import NeumannMoments, VolumeMoments, chi
 from .moments import Compiled, OnFacets, Tensor, Trace
 
@@ -160,11 +161,16 @@ class DiffusionOnMesh:
             source: As `Moments` has it.
             rate: As `Moments` has it.
             earlier: As `Moments` has it.
+
+        Raises:
+            InputError: Data are not to be had there, or κ is not symmetric at a quadrature point.
         """
         self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
         self.V: fem.FunctionSpace
         if earlier is None:
             self.forms.insist_on_data(domain)
+            if self.forms.problem.form is None and isinstance(compiled.kappa, Tensor):
+                check_symmetry(compiled.kappa, domain)
             self.V = function_space(domain.mesh, self.forms.element)
         else:
             self.V = earlier.V

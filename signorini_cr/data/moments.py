@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 from math import factorial
 
 import basix
@@ -28,6 +28,7 @@ from ..fem.cells import BoundaryFacets, Cells
 from ..fem.conditions import Condition
 from ..fem.physics import Imposed
 from ..fem.problem import Forms, number
+from ..fem.simplified import simplified
 from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
 from .jets import Boxes, Enclosure, values
@@ -121,6 +122,7 @@ class Tensor:
 
     Attributes:
         entries: The d² scalars, row by row.
+        skew: κ_ij − κ_ji, i < j, but for those that formulas say are 0.
         rule: What the means are found by.
         fine: What else is integrated by; exact for degree 8.
     """
@@ -130,6 +132,11 @@ class Tensor:
         self._d, self._mesh, self.rule = mesh.geometry.dim, mesh, rule
         pairs, lowered = product(range(self._d), repeat=2), apply_algebra_lowering(expression)
         self.entries = [expand_indices(lowered[i, j]) for i, j in pairs]
+        self.skew = [
+            self.entries[i * self._d + j] - self.entries[j * self._d + i]
+            for i, j in combinations(range(self._d), 2)
+            if not _same(self.entries[i * self._d + j], self.entries[j * self._d + i])
+        ]
         self.fine = Rule(mesh, KAPPA_DEGREE)
         self._compiled: dict[int, fem.Expression] = {}
 
@@ -141,11 +148,15 @@ class Tensor:
 
     def at(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
         """Values at points of some owned cells, the symmetric part, shape (cells, q, d, d)."""
+        found = self.as_given(domain, rule, part)
+        return np.asarray(0.5 * (found + found.transpose(0, 1, 3, 2)))
+
+    def as_given(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
+        """The same with what is not symmetric."""
         self.prepare(rule)
         which = np.arange(part.start, part.stop, dtype=np.int32)
         found = compat.bound(self._compiled[rule.degree], domain.own).eval(domain.mesh, which)
-        found = found.reshape(len(which), len(rule.weights), self._d, self._d)
-        return np.asarray(0.5 * (found + found.transpose(0, 1, 3, 2)))
+        return np.asarray(found.reshape(len(which), len(rule.weights), self._d, self._d))
 
     def means(self, domain: Domain) -> FloatArray:
         """Means over owned cells, shape (cells, d, d)."""
@@ -162,6 +173,11 @@ class Tensor:
         mean = np.exp(np.log(eigenvalues).mean(axis=1, keepdims=True))
         scaled: FloatArray = vectors * np.sqrt(mean / eigenvalues)[:, None]
         return scaled @ vectors.transpose(0, 2, 1)
+
+
+def _same(a: Expr, b: Expr) -> bool:
+    """Tell whether two formulas are the same, as formulas or where they cancel."""
+    return bool(a == b) or number(simplified(a - b)) == 0.0
 
 
 class Coefficient:
@@ -224,10 +240,18 @@ class Coefficient:
             found = range_of(entry, cells)
             if found is None:
                 self.reason = NO_RANGE
-                return
+                break
             row[:] = np.maximum(found[1] - mean, mean - found[0])
+        least = STEADY * np.abs(means).max(axis=(1, 2), initial=0.0)
+        for difference in kappa.skew:
+            found = range_of(difference, cells)
+            if found is None or (np.maximum(-found[0], found[1]) > least).any():
+                self.reason = "the coefficient is a tensor that could not be shown to be symmetric"
+                break
+        if any(cells.comm.allgather(self.reason)):
+            return
         theta = self._by_mean(np.maximum(off, 0.0), cells)
-        varies = bool((off > STEADY * np.abs(means).max(axis=(1, 2), initial=0.0)).any())
+        varies = bool((off > least).any())
         if cells.comm.allreduce(varies, op=MPI.LOR):
             self.tensor, self.rule, self.spread = kappa, kappa.fine, theta
             kappa.prepare(kappa.fine)  # here, as a rank without cells never asks for values

@@ -492,15 +492,19 @@ class Polygon:
         `size`. The same polygon and size give the same mesh.
 
         Args:
-            size: Facet length wanted; from the diameter upwards, the mesh is as coarse as can be.
+            size: Facet length wanted; with the diameter the mesh is as coarse as can be.
             comm: The ranks that share the mesh.
 
         Raises:
-            InputError: The size is no positive number, no edge is contact or none is Dirichlet, or
-                gmsh can't make the mesh.
+            InputError: The size is no positive number or longer than the diameter, no edge is
+                contact or none is Dirichlet, or gmsh can't make the mesh.
         """
         if not (np.isfinite(size) and size > 0):
             raise InputError(f"size is {size}: a positive number is needed")
+        if size > self.diameter * (1 + 1e-9):
+            raise InputError(
+                f"size is {size:g}, longer than the domain, whose diameter is {self.diameter:g}"
+            )
         self.check_parts()
         loops = [self.vertices, *(hole.vertices for hole in self.holes)]
         names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))

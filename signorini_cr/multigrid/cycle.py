@@ -45,8 +45,11 @@ PATIENCE = 40
 A factorisation takes as long as 30 steps of the cycle at 0.02 to 0.3 M dofs and 55 at 1.2 M.
 """
 
-SLOW = 14
-"""CG steps that are many for one linear system; two thirds of that are usual at most."""
+SLOW = 10
+"""CG steps that are many for one linear system where others have taken most of `PATIENCE`.
+
+On cells of any but thin shapes and from cold starts nine are usual at most.
+"""
 
 NEARLY = 0.2
 """Part of the diagonal by which a coarse matrix may differ from the Galerkin product."""

@@ -135,13 +135,13 @@ def contact_facts(
     Args:
         data: The physics on the mesh.
         system: The variational inequality.
-        u: u_h, ghosts up to date.
+        u: u_h less the system's offset, ghosts up to date.
         residual: r = A u_h − b, ghosts up to date.
         iterations: What the solver says about its errors.
     """
     mesh, facets, dofs = data.domain.mesh, system.bounded_facets, system.contact_dofs
     vertices, measure = facet_measures(mesh, facets)
-    at_dofs = _AtDofs.of(system, u, residual)
+    at_dofs = _AtDofs.of(system, u, residual, 0.0 if iterations.extended else NOISE)
     layout, total = Layout.of_space(u.function_space), _Totals(mesh.comm)
     share = np.zeros(len(u.x.array))  # of Γ1 that is a dof's
     np.add.at(share, dofs, (measure / dofs.shape[1])[:, None])
@@ -157,16 +157,17 @@ def contact_facts(
     is_active: BoolArray = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
     below, above = system.obstacles_at_vertices
     local = data.at_vertices(u, facets)
+    offset = system.offset
     means = dofs.shape[1] > 1
     fields: dict[str, npt.NDArray] = {
         "vertices": vertices,
         "measure": measure,
-        "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]),
-        "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]),
-        "u": local.mean(axis=1),
+        "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]) + offset,
+        "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]) + offset,
+        "u": local.mean(axis=1) + offset,
         "pressure": on_facets(pressure).mean(axis=1),
         "active": is_active,
-        "gap_at_vertices": np.minimum(local - below, above - local),
+        "gap_at_vertices": np.minimum(local - (below - offset), above - offset - local),
     }
     table, transitions = along_boundary(mesh, facets, fields)
     of_load = float(np.sqrt(total.sum(at_dofs.left @ at_dofs.left))) / (
@@ -213,8 +214,10 @@ class _AtDofs:
     left: FloatArray
 
     @classmethod
-    def of(cls, system: System, u: fem.Function, residual: fem.Function) -> _AtDofs:
-        """Compare what is there with what rounding makes of it; collective."""
+    def of(
+        cls, system: System, u: fem.Function, residual: fem.Function, rounding: float
+    ) -> _AtDofs:
+        """Compare what is there with what rounding makes of it, in parts; collective."""
         bounded = system.bounded
         with system.vectors(u, residual) as vectors:
             terms = system.operator.magnitude(vectors.x) + np.abs(system.b.x.array[bounded])
@@ -223,7 +226,7 @@ class _AtDofs:
         release(entries)
         x, raw = u.x.array[bounded], residual.x.array[bounded]
         gap, side = system.bounds.gap(x), system.bounds.side(x)
-        force = np.where(np.abs(raw) > NOISE * terms, raw, 0.0)
+        force = np.where(np.abs(raw) > rounding * terms, raw, 0.0)
         left = residual.x.array[: len(diagonal)].copy()
         left[bounded] = np.minimum(side * raw, diagonal[bounded] * gap)
         left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[: len(diagonal)])] = 0.0

@@ -61,6 +61,8 @@ def nested_start(
     ancestor = None if before is None or below is None else Ancestor(before, below)
     values = start.x.array[system.dirichlet].copy()
     start.x.array[:] = prolongate(coarse.u, level.V, level.parents, ancestor)
+    if system.offset:
+        start.x.array[:] -= system.offset
     start.x.array[system.dirichlet] = values
     if coarse.element == "P1":  # a dof has many cells, and no one to change its residual through
         return
@@ -83,7 +85,7 @@ def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
     """
     system = level.system
     values = start.x.array[system.dirichlet].copy()
-    start.x.array[:] = u.x.array
+    start.x.array[:] = u.x.array - system.offset
     start.x.array[system.dirichlet] = values
     bounded, bounds = system.bounded, system.bounds
     x = start.x.array[bounded]

@@ -43,6 +43,12 @@ SETTLING_LIMIT = 1e-3
 FLOOR = 1e-10
 """Residuals below so many times the rounding of A x are not reduced further, whatever is open."""
 
+DIGITS = 1e-6
+"""What a correction may leave of the residual, in parts of it."""
+
+MOST = 100
+"""CG steps of one correction; the next one goes on."""
+
 Reason = PETSc.KSP.ConvergedReason
 
 
@@ -82,6 +88,7 @@ class ReducedSolver:
     """The linear solver of SNES, a KSP of type python that works in the full space.
 
     Attributes:
+        bounds: Of the bounded dofs.
         ksp: The inner solver, CG with the V-cycle unless options say otherwise.
         iterations: Its steps so far.
         active: The active set of the last reduced system.
@@ -113,7 +120,7 @@ class ReducedSolver:
             stiffness: Classes of these dofs.
             loose: How many times more than usual may be wrong with the forces.
         """
-        self._cycle, self._bounds, self._snes = cycle, bounds, snes
+        self._cycle, self.bounds, self._snes = cycle, bounds, snes
         self._x, self._residual, self._b = vectors.x, vectors.residual, vectors.b
         self._stiffness, self._share = stiffness, loose * FORCES
         self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(bounds.lower), dtype=bool))
@@ -172,7 +179,7 @@ class ReducedSolver:
     def _run(self, forces: FloatArray) -> LinearTest:
         """Run the inner solver, and return what its test has found out."""
         system = ReducedSystem(
-            self._cycle.finest, self._stiffness, self.active, self._x, self._bounds, forces
+            self._cycle.finest, self._stiffness, self.active, self._x, self.bounds, forces
         )
         test = LinearTest(system, self._is_cg, self._share, self.reduction)
         if self._uses_cycle and self._cycle.may_give_up:
@@ -182,15 +189,48 @@ class ReducedSolver:
         self.iterations += self.ksp.getIterationNumber()
         return test
 
+    def correction(self, active: ActiveSet, residual: PETSc.Vec) -> PETSc.Vec:
+        """Solve a reduced system to `DIGITS`; collective.
+
+        Args:
+            active: The active set.
+            residual: Right-hand side; what it has in active dofs does not count, and is lost.
+
+        Returns:
+            A vector that is 0 in active dofs, and holds until another system is solved.
+        """
+        residual.array[active.dofs] = 0.0
+        start = 0.0
+
+        def test(_: PETSc.KSP, iteration: int, norm: float) -> int:
+            nonlocal start
+            start = norm if iteration == 0 else start
+            if not np.isfinite(norm):
+                return Reason.DIVERGED_NANORINF
+            if norm <= DIGITS * start:
+                return Reason.CONVERGED_RTOL
+            return Reason.ITERATING if iteration < MOST else Reason.CONVERGED_ITS
+
+        with self._cycle.constrained(active.dofs, deep=self._uses_cycle):
+            self.ksp.setConvergenceTest(test)
+            self.ksp.solve(residual, self._step)
+        self.iterations += self.ksp.getIterationNumber()
+        return self._step
+
+    def moved(self) -> FloatArray:
+        """How far the last step took the bounded dofs, shape (n,)."""
+        moved: FloatArray = np.abs(self._step.array_r[self.active.bounded])
+        return moved
+
     def active_now(self) -> ActiveSet:
         """The active set of the iterate as it is now, which SNES will go on with."""
         bounded = self.active.bounded
-        return ActiveSet.of(bounded, self._bounds.gap(self._x.array_r[bounded]), self.forces())
+        return ActiveSet.of(bounded, self.bounds.gap(self._x.array_r[bounded]), self.forces())
 
     def forces(self) -> FloatArray:
         """The residual in the bounded dofs, above 0 where it pushes them off, shape (n,)."""
         bounded = self.active.bounded
-        return self._bounds.side(self._x.array_r[bounded]) * self._residual.array_r[bounded]
+        return self.bounds.side(self._x.array_r[bounded]) * self._residual.array_r[bounded]
 
 
 @dataclass(frozen=True, eq=False)

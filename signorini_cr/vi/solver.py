@@ -26,9 +26,10 @@ from ..multigrid.cycle import Multigrid
 from ..options import NEWTON, PREFIX, REDUCED_PREFIX, defaults, explained, read, read_number
 from .active import ActiveSet
 from .bounds import Bounds
+from .extended import DataRounding, Extended
 from .reduced import LINEAR_SHARE, SET_SHARE, FullJacobian, ReducedSolver
-from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, Stiffness
-from .system import Vectors
+from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, TOUCHING, Stiffness
+from .system import DATUM, Vectors
 
 SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""
@@ -41,6 +42,9 @@ One less after as many steps: what takes long has been looked at often.
 
 PASSES = 6
 """Newton steps in an active set that does not change any more; they refine the solution."""
+
+SWAPS = 10
+"""Times that dofs may turn out to be in the wrong set when all else is well."""
 
 GAIN = 0.5
 """What a refinement must take away of what is wrong, or rounding is at work."""
@@ -66,6 +70,7 @@ class Iterations:
             of all classes, see `stopping`.
         imbalance: Largest residual of a class of stiffness in parts of its flows; 0 where there is
             one class only.
+        extended: Whether forces are those of u_h to twice the digits, see `extended`.
     """
 
     newton: int
@@ -73,6 +78,24 @@ class Iterations:
     preconditioner: str
     force_error: float = 0.0
     imbalance: float = 0.0
+    extended: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """What is known of the data that make the system.
+
+    Attributes:
+        row_sums: `System.row_sums`.
+        rounding: `System.data_rounding`.
+        rounded: Sum of what that may change, `System.data_rounded`.
+        offset: `System.offset`.
+    """
+
+    row_sums: Callable[[], FloatArray]
+    rounding: DataRounding
+    rounded: float
+    offset: float
 
 
 def solve_vi(
@@ -82,7 +105,7 @@ def solve_vi(
     *,
     tolerance: float = 1e-8,
     monitor: Monitor | None = None,
-    row_sums: Callable[[], FloatArray] | None = None,
+    data: Data | None = None,
 ) -> Iterations:
     """Solve the variational inequality in place; collective.
 
@@ -97,7 +120,8 @@ def solve_vi(
             in rounding, and what is due to the choice of the active set far below; and the contact
             forces and each class of stiffness are converged for themselves, see `stopping`.
         monitor: Called after each step.
-        row_sums: `System.row_sums`; without them all equations are of one class of stiffness.
+        data: What there is to know of the data; without it all equations are of one class of
+            stiffness, and what is lost in rounding stays so.
 
     Raises:
         NotConverged: With the name PETSc gives to the reason, or what is lost in rounding.
@@ -107,17 +131,18 @@ def solve_vi(
     # looked up here, as the linear solver has to know; what is below rounding is all the same to it
     wanted = max(read_number("snes_atol", target), 1e-30 * target)
     snes = PETSc.SNES().create(cycle.matrix.getComm())
-    stiffness = Stiffness(cycle.finest, row_sums)
+    stiffness = Stiffness(cycle.finest, None if data is None else data.row_sums)
+    bounds = Bounds(*(each.array_r[cycle.operator.dofs] for each in (vectors.lower, vectors.upper)))
     linear = ReducedSolver(
         cycle,
-        Bounds(*(each.array_r[cycle.operator.dofs] for each in (vectors.lower, vectors.upper))),
+        bounds,
         snes,
         vectors,
         LINEAR_SHARE * wanted,
         stiffness,
         max(1.0, wanted / target),
     )
-    test = NewtonTest(cycle, vectors.b, linear, stiffness, target)
+    test = NewtonTest(cycle, vectors.b, linear, stiffness, target, data)
     things: tuple[PETSc.Object, ...] = ()
     try:
         things = _prepare(snes, linear, stiffness, vectors, target)
@@ -126,18 +151,24 @@ def solve_vi(
         with explained():
             snes.solve(None, vectors.x)
         reason, inner = snes.getConvergedReason(), linear.ksp.getConvergedReason()
+        extended = test.doubtful and reason > 0
+        if extended:
+            test.settle(vectors, bounds)
+        elif test.touching:
+            vectors.residual.array[linear.active_now().dofs] = 0.0
         iterations = Iterations(
             snes.getIterationNumber(),
             linear.iterations,
             linear.describe(),
             test.force_error,
             test.imbalance,
+            extended,
         )
     finally:
         release(snes, *things)
         linear.free()
         stiffness.free()
-    if reason < 0:
+    if reason < 0 or test.failure:
         raise NotConverged(
             f"{test.failure or _stopped(reason, inner)} after {iterations.newton} Newton steps "
             f"and {iterations.linear} linear iterations"
@@ -206,6 +237,8 @@ class NewtonTest:
     Attributes:
         force_error: What may be wrong with the contact forces, in parts of their sum.
         imbalance: Largest residual of a class of stiffness in parts of its flows.
+        touching: Whether all forces are rounding, and there are none.
+        doubtful: Whether SNES has come as far as it can in double precision, which is not enough.
         failure: Why it can't be done, if it can't.
     """
 
@@ -216,15 +249,17 @@ class NewtonTest:
         linear: ReducedSolver,
         stiffness: Stiffness,
         target: float,
+        data: Data | None,
     ):
         """Start the tests; target is what the residual may be unless options say otherwise."""
         self._cycle, self._b, self._target = cycle, b, target
-        self._linear, self._stiffness = linear, stiffness
-        self._start = np.inf
-        self._for_the_set = self._passes = 0
+        self._linear, self._stiffness, self._data = linear, stiffness, data
+        self._start, self._loose = np.inf, 1.0
+        self._for_the_set = self._passes = self._swaps = 0
         self._forces = linear.forces()
         self.force_error = self.imbalance = np.inf
-        self.failure: str | None = None
+        self.doubtful = self.touching = False
+        self.failure = ""
 
     def __call__(self, snes: PETSc.SNES, step: int, norm: float) -> int:
         """Decide; the same on all ranks."""
@@ -235,14 +270,14 @@ class NewtonTest:
             self._start = norm
         rtol, atol, _, _ = snes.getTolerances()
         small = max(atol, rtol * self._start)
-        loose = max(1.0, small / self._target)  # who sets a tolerance sets them all
+        self._loose = loose = max(1.0, small / self._target)  # who sets a tolerance sets them all
         before, self._forces = self._forces, self._linear.forces()
         if step == 0:
             enough = norm == 0.0 or (loose > 1.0 and norm <= small)
             if enough:
                 self.force_error = self.imbalance = 0.0
             return Reason.CONVERGED_FNORM_ABS if enough else Reason.ITERATING
-        known, solved = self.force_error, self.imbalance
+        known, solved, self.touching = self.force_error, self.imbalance, False
         self.force_error = self.imbalance = np.inf  # what was known of another set says nothing
         x, last = snes.getSolution(), self._linear.active.dofs
         facts = self._contact_facts(before)
@@ -252,14 +287,16 @@ class NewtonTest:
         if self._for_the_set < allowed and facts.misclassified_norm > SET_TOLERANCE * small:
             self._for_the_set += 1
             return Reason.ITERATING
-        errors, noise = self._force_errors(x, norm, facts, loose)
-        self.force_error = float(np.max(errors / np.maximum(facts.forces, 1e-300), initial=0.0))
+        errors, noise = self._force_errors(x, norm, facts)
+        self.force_error = float(errors.max(initial=0.0))
         self.imbalance = self._stiffness.imbalance(x, self._b, snes.getFunction()[0], last)
         if self.force_error <= loose * FORCES and self.imbalance <= loose * FLOWS:
             return Reason.CONVERGED_FNORM_ABS
-        if (facts.misclassified > np.maximum(loose * FORCES * facts.forces, noise)).any():
-            self.force_error = self.imbalance = np.inf  # of another set
-            return Reason.ITERATING
+        if (facts.misclassified > np.maximum(loose * FORCES * facts.sizes, noise)).any():
+            self._swaps += 1
+            if self._swaps < SWAPS:
+                self.force_error = self.imbalance = np.inf  # of another set
+                return Reason.ITERATING
         self._passes += 1
         figures = (self.force_error, known, FORCES), (self.imbalance, solved, FLOWS)
         gains = any(loose * limit < now <= GAIN * last for now, last, limit in figures)
@@ -267,37 +304,99 @@ class NewtonTest:
             reduction = min(1.0, loose * FLOWS / max(self.imbalance, 1e-300))
             self._linear.reduction = SET_SHARE * reduction
             return Reason.ITERATING
+        if self._data is not None:
+            self.doubtful = True
+            return Reason.CONVERGED_FNORM_ABS
         if max(self.force_error, self.imbalance) <= loose * ROUNDED:
             return Reason.CONVERGED_FNORM_ABS
-        self.failure = self._lost_in_rounding(float(x.norm(PETSc.NormType.INFINITY)))
+        self.failure = self._lost_in_rounding(x)
         return DIVERGED_ROUNDING
 
+    def settle(self, vectors: Vectors, bounds: Bounds) -> None:
+        """Go on to twice the digits where double precision is not enough; collective."""
+        assert self._data is not None
+        extended = Extended(self._linear, self._cycle.operator, bounds, self._stiffness, vectors)
+        try:
+            settled = extended.settle(self._data.rounding, self._loose)
+            active = extended.active.dofs
+        except NotConverged as failure:
+            self.failure = failure.reason
+            return
+        finally:
+            extended.free()
+        self.force_error = settled.error
+        x, b, residual = vectors.x, vectors.b, vectors.residual
+        self.imbalance = self._stiffness.imbalance(x, b, residual, active)
+        if not max(self.force_error, self.imbalance) <= self._loose * ROUNDED:  # NaN is neither
+            self.failure = self._lost_in_rounding(x, settled.from_data)
+
     def _force_errors(
-        self, x: PETSc.Vec, norm: float, facts: _ContactFacts, loose: float
+        self, x: PETSc.Vec, norm: float, facts: _ContactFacts
     ) -> tuple[FloatArray, FloatArray]:
-        """What may be wrong with the forces of each class, and what rounding makes of them."""
+        """What may be wrong with the forces of each class, in parts, and what is their rounding."""
+        stiffness, loose = self._stiffness, self._loose
         # the linear solver knows what it left, unless rounding has added to the residual; a
         # misclassified dof has its force there, its neighbours as much, and so may other forces
         left, reached = self._linear.force_errors, self._linear.reached
         sure = norm <= 2.0 * (reached + facts.misclassified_norm) and np.isfinite(left).all()
         errors = (left if sure else facts.moved) + 2.0 * facts.misclassified
-        errors += STORED * self._stiffness.magnitude(x, facts.active.mask)
+        errors += STORED * stiffness.magnitude(x, facts.active.mask)
+        errors += self._close(x, facts.active, moving=not sure)
+        total = facts.forces.sum()
+        of_data = np.where(facts.forces > 0.0, self._of_data(x, facts.active), 0.0)
+        relative = np.maximum(
+            errors / np.maximum(facts.sizes, 1e-300), of_data / max(total, 1e-300)
+        )
         noise = np.zeros_like(errors)
-        if (errors > loose * FORCES * facts.forces).any():
-            noise = LOST * NOISE * self._stiffness.magnitude(x)
-            errors = np.where((errors <= noise) & (facts.forces <= noise), 0.0, errors)
-        return errors, noise
+        if (relative > loose * FORCES).any():
+            noise = LOST * NOISE * stiffness.magnitude(x)
+            # what is lost in rounding is nothing beside all forces, or where there are none
+            lost = (errors <= noise) & (facts.forces <= noise)
+            beside = np.where(lost, noise.sum(), np.inf) / max(total, 1e-300)
+            relative = np.where(beside <= loose * FORCES, beside, relative)
+            if sure and not stiffness.varied and lost.all():
+                made_of = np.maximum(stiffness.made_of, 1e-300)
+                touching = noise / made_of
+                if (touching <= loose * TOUCHING).all():
+                    relative, self.touching = touching, True
+        return relative, noise
 
-    def _lost_in_rounding(self, largest: float) -> str:
-        """What to say to users; u_h is as large as given."""
+    def _close(self, x: PETSc.Vec, active: ActiveSet, moving: bool) -> FloatArray:
+        """The forces of dofs off the obstacle, but not certainly so, by class; collective."""
+        operator, at = self._cycle.operator, x.array_r[active.bounded]
+        reach = DATUM * (x.norm(PETSc.NormType.INFINITY) + self._offset)
+        moved = 2.0 * self._linear.moved() if moving else 0.0
+        gap = self._linear.bounds.gap(at)
+        force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
+        sums = self._stiffness.sums(np.where(active.mask, 0.0, force))
+        found: FloatArray = self._cycle.matrix.getComm().tompi4py().allreduce(sums)
+        return found
+
+    def _of_data(self, x: PETSc.Vec, active: ActiveSet) -> float:
+        """What rounding of the data may add to the forces, all together; collective."""
+        if self._data is None:
+            return 0.0
+        sizes = np.abs(x.array_r[active.bounded]) + self._offset
+        own = float((self._cycle.operator.diagonal * sizes)[active.mask].sum())
+        total = self._cycle.matrix.getComm().tompi4py().allreduce(own)
+        return self._data.rounded + 2.0 * DATUM * float(total)
+
+    @property
+    def _offset(self) -> float:
+        return 0.0 if self._data is None else abs(self._data.offset)
+
+    def _lost_in_rounding(self, x: PETSc.Vec, from_data: bool = False) -> str:
+        """What to say to users."""
         if self.force_error >= self.imbalance:
             known = f"the contact forces are known to {self.force_error:.1e} of their sum only"
         else:
             known = f"equations hold to {self.imbalance:.1e} of what they are made of only"
+        largest = float(x.norm(PETSc.NormType.INFINITY)) + self._offset
+        lost = "hangs on the last digit of the data" if from_data else "is lost in rounding"
         return (
-            f"{known}, {ROUNDED:.0e} is wanted. The rest is lost in rounding, as the stiffness "
-            f"varies by a factor of {self._stiffness.contrast:.1e} and u_h is as large as "
-            f"{largest:.1e}; stopped"
+            f"{known}, {ROUNDED:.0e} is wanted. The rest {lost}, as the stiffness varies by a "
+            f"factor of {self._stiffness.contrast:.1e} and u_h is as large as {largest:.1e}; "
+            "stopped"
         )
 
     def _contact_facts(self, before: FloatArray) -> _ContactFacts:
@@ -315,8 +414,8 @@ class NewtonTest:
         ]
         facts = self._cycle.matrix.getComm().tompi4py().allreduce(np.array(facts))
         squares, sums, moved, wrong = facts
-        sums = np.maximum(sums, self._stiffness.least)
-        return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, moved, wrong)
+        sizes = np.maximum(sums, self._stiffness.least)
+        return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, sizes, moved, wrong)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +426,8 @@ class _ContactFacts:
         active: The active set of the iterate.
         misclassified_norm: Norm of the residual in the dofs that the last system had in the other
             set.
-        forces: Sum of the forces on active dofs, and not less than `Stiffness.least`.
+        forces: Sum of the forces on active dofs.
+        sizes: What errors are measured against: that, and not less than `Stiffness.least`.
         moved: Sum of what they have changed by since the step before.
         misclassified: Sum of the forces on misclassified dofs.
     """
@@ -335,6 +435,7 @@ class _ContactFacts:
     active: ActiveSet
     misclassified_norm: float
     forces: FloatArray
+    sizes: FloatArray
     moved: FloatArray
     misclassified: FloatArray
 

@@ -14,8 +14,9 @@ asked for:
 
 How well forces are known is measured, not concluded from a norm: a step of the linear solver, or
 one more Newton step in the same active set, which refines u_h with its true residual, changes the
-forces by what was wrong with them before. Where rounding does not allow for 2., 1e-6 is enough, and
-what is known less well is an error.
+forces by what was wrong with them before. Where rounding does not allow for 2., or u_h is so near
+the obstacle that rounding decides whether it touches, the solver goes on to twice the digits (see
+`extended`); 1e-6 is enough then, and what is known less well is an error.
 """
 
 from __future__ import annotations
@@ -67,7 +68,11 @@ STORED = NOISE / 32.0
 """What a row of A x is off, in parts of |A| |x|, as x is stored with 53 digits: as measured."""
 
 LOST = 10.0
-"""Forces whose sum is below so many times their rounding are no forces."""
+"""Forces whose sum is below so many times their rounding are lost in it."""
+
+TOUCHING = 1e-10
+"""Forces that are lost are none where rounding is below this part of what their rows are made of:
+u touches without pressing. Elsewhere there may be contact that rounding hides."""
 
 
 class Stiffness:
@@ -81,8 +86,12 @@ class Stiffness:
         number: How many classes of dofs with a bound there are, over all ranks; some may be empty.
         contrast: Largest diagonal entry over the smallest.
         bounded: Class of each dof with a bound, shape (n,).
+        made_of: What the rows of these are made of, summed over each class, shape (classes,).
         least: What forces are measured against at least, shape (classes,).
+        exact: Whether A x is summed up from differences where there is one class only, too.
     """
+
+    exact = False
 
     def __init__(self, grid: Grid, row_sums: Callable[[], FloatArray] | None = None):
         """Sort the dofs; collective, the matrix must be whole.
@@ -103,15 +112,26 @@ class Stiffness:
         self._kinds = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
         self._kind = self._classes(grid.operator.diagonal)
         self.number = self._kinds * LEVELS
-        self.bounded, self.least = LEVELS * self._kind, np.zeros(self.number)
+        self.bounded = LEVELS * self._kind
+        self.made_of: FloatArray = np.zeros(self.number)
+        self.least: FloatArray = np.zeros(self.number)
         self._window: IndexArray | None = None
         self._differences: PETSc.Mat | None = None
+        self._find_row_sums = row_sums
         if row_sums is not None and self._kinds > 1:
             self._free, self._class = free, self._classes(entries)
             self._diagonal = entries.copy()
-            self._row_sums = row_sums()
-            self._differences, self._weights = _differences(grid.matrix)
+            self._take_differences(row_sums)
         release(diagonal)
+
+    @property
+    def varied(self) -> bool:
+        """Whether there are dofs of several magnitudes of stiffness; the same on all ranks."""
+        return self._kinds > 1
+
+    def _take_differences(self, row_sums: Callable[[], FloatArray]) -> None:
+        self._row_sums = row_sums()
+        self._differences, self._weights = _differences(self._grid.matrix)
 
     def _classes(self, diagonal: FloatArray) -> IndexArray:
         decades = np.log10(diagonal / self._smallest) / DECADES
@@ -135,7 +155,8 @@ class Stiffness:
         decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
         level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
         self.bounded = LEVELS * self._kind + level
-        self.least = PART * self._comm.allreduce(self.sums(made_of))
+        self.made_of = self._comm.allreduce(self.sums(made_of))
+        self.least = PART * self.made_of
         self.least[::LEVELS] = 0.0
 
     def sums(self, values: FloatArray) -> FloatArray:
@@ -156,7 +177,9 @@ class Stiffness:
         return total
 
     def residual(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> None:
-        """Compute r = A x − b."""
+        """Compute r = A x − b; collective, where the matrix must be whole for the first time."""
+        if self.exact and self._differences is None and self._find_row_sums is not None:
+            self._take_differences(self._find_row_sums)
         if self._differences is None:
             self._grid.matrix.mult(x, r)
             r.axpy(-1.0, b)
@@ -177,8 +200,24 @@ class Stiffness:
             r: A x − b.
             active: Owned dofs whose equations do not count, local numbers.
         """
-        if self._differences is None:
+        if self._differences is None or not self.varied:
             return 0.0
+        counted = self._free.copy()
+        counted[active] = False
+        facts = [
+            np.bincount(self._class[counted], values[counted] ** 2, minlength=self._kinds)
+            for values in (
+                r.array_r,
+                self.flows(x) + np.abs(self._row_sums * x.array_r - b.array_r),
+                NOISE * self._diagonal * x.array_r,
+            )
+        ]
+        left, flow, noise = np.sqrt(self._comm.allreduce(np.array(facts)))
+        return float(np.max(left / np.maximum(flow, 1e-300), initial=0.0, where=left > noise))
+
+    def flows(self, x: PETSc.Vec) -> FloatArray:
+        """Sum up |a_ij| |x_j − x_i| over j ≠ i for owned dofs i, from differences; collective."""
+        assert self._differences is not None
         sizes, flows = self._differences.createVecs()
         self._differences.mult(x, flows)
         flows.array[:] = np.abs(self._weights * flows.array_r)
@@ -187,19 +226,9 @@ class Stiffness:
         made_of.setValuesCSR(start, column, np.abs(value))
         made_of.assemble()
         made_of.multTranspose(flows, sizes)
-        counted = self._free.copy()
-        counted[active] = False
-        facts = [
-            np.bincount(self._class[counted], values[counted] ** 2, minlength=self._kinds)
-            for values in (
-                r.array_r,
-                sizes.array_r + np.abs(self._row_sums * x.array_r - b.array_r),
-                NOISE * self._diagonal * x.array_r,
-            )
-        ]
+        found: FloatArray = sizes.array_r.copy()
         release(sizes, flows, made_of)
-        left, flow, noise = np.sqrt(self._comm.allreduce(np.array(facts)))
-        return float(np.max(left / np.maximum(flow, 1e-300), initial=0.0, where=left > noise))
+        return found
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free the differences."""

@@ -11,6 +11,7 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.linalg.blas import dasum
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import InputError, raise_together
@@ -25,6 +26,12 @@ from .bounds import Bounds
 
 ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
+
+FAR = 16.0
+"""Values so many times as far from 0 as from one another are told from their middle."""
+
+DATUM = 2.0 * 2.0**-53
+"""Rounding of a mean of data over a facet, or of a load, in parts of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +57,12 @@ class Vectors:
 class System:
     """The variational inequality (1.8) as matrix, vector and bounds.
 
+    Where all values of u_D, or of α where there is no Γ0, lie far from 0 and close together, the
+    unknown is u less their middle, the offset, and b, bounds and u_D are those of this unknown: a_h
+    sees differences, which would have lost the digits that u spends on the offset.
+
     Attributes:
+        offset: What is to be added to the solution to have u; 0 in most cases.
         operator: A as the solver uses it.
         A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
         b: Vector of χ less the Dirichlet values' share, the values themselves in their rows.
@@ -96,6 +108,8 @@ class System:
         self.chi.x.array[:] = data.chi()
         self.b = fem.Function(V)
         self.b.x.array[:] = self.chi.x.array
+        if self.offset and (of_constants := data.of_constants()) is not None:
+            self.b.x.array[:] -= self.offset * of_constants
         fem.apply_lifting(self.b.x.array, [a], [[bc]])
         for vector in (self.chi, self.b):
             layout.shared_sum(vector.x.array)
@@ -120,12 +134,27 @@ class System:
         self.lower = np.where(has_floor & bounded, floor.x.array, PETSc.NINFINITY)
         self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
+        self._take_offset()
         self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
         self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
 
+    def _take_offset(self) -> None:
+        """Choose the offset, and take it off u_D and the bounds; collective."""
+        comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
+        bottom, top = _range(comm, values)
+        if bottom > top:
+            each = np.concatenate([self.lower, self.upper])
+            bottom, top = _range(comm, each[np.abs(each) < PETSc.INFINITY])
+        middle = 0.5 * (bottom + top)
+        self.offset = middle if abs(middle) > FAR * 0.5 * (top - bottom) else 0.0
+        if self.offset:
+            self.u_D.x.array[self.dirichlet] -= self.offset
+            for bound in (self.lower, self.upper):
+                bound[np.abs(bound) < PETSc.INFINITY] -= self.offset
+
     def _take_boundary(self, like: System) -> None:
         """Take values and bounds from a system of the same data."""
-        self.u_D, self.dirichlet = like.u_D, like.dirichlet
+        self.u_D, self.dirichlet, self.offset = like.u_D, like.dirichlet, like.offset
         self.lower, self.upper = like.lower, like.upper
         self.bounded, self.bounds = like.bounded, like.bounds
         self.bounded_facets: Int32Array = like.bounded_facets
@@ -136,18 +165,17 @@ class System:
         """Measure the trivial start's residual; collective."""
         bounded = (self.lower > PETSc.NINFINITY) | (self.upper < PETSc.INFINITY)
         comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
-        top = comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
-        bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
+        bottom, top = _range(comm, values)
         middle = 0.5 * (bottom + top) if bottom <= top else 0.0
         norms = []
-        for number in dict.fromkeys((middle, 0.0)):
+        for number in dict.fromkeys((middle, -self.offset)):
             start, residual = (fem.Function(self.u_D.function_space) for _ in range(2))
             start.x.array[:] = number
             start.x.array[self.dirichlet] = values
             start.x.array[bounded] = np.clip(number, self.lower[bounded], self.upper[bounded])
             norms.append(self.residual(start, residual))
-        scale = max(norms[0], ROUNDING * norms[-1])
-        if not np.isfinite(scale):
+        scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
+        if not np.isfinite(norms).all():
             raise InputError("data: so large that their squares overflow; choose other units")
         return scale
 
@@ -213,8 +241,51 @@ class System:
         sums.x.array[self.dirichlet] = 1.0
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
+    @property
+    def data_rounded(self) -> float:
+        """Bound of what rounding of u_D and of the loads may change in b, summed up; collective."""
+        owned, fixed = self.A.getLocalSize()[0], self.owned_dirichlet
+        b, chi = self.b.x.array[:owned], self.chi.x.array[:owned]
+        # BLAS needs no array for absolute values; on Γ0 b has u_D, which is no force
+        b[fixed], values = 0.0, b[fixed]
+        size = dasum(b) + 2.0 * dasum(chi)  # b − χ is u_D's share
+        b[fixed] = values
+        if self.offset:
+            sums = self.row_sums()
+            sums[fixed] = 0.0
+            size += abs(self.offset) * dasum(sums)
+        return DATUM * float(self.u_D.function_space.mesh.comm.allreduce(float(size)))
+
+    def data_rounding(self, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Draw what rounding may have done to the data; collective.
+
+        Args:
+            seed: For the same numbers again.
+
+        Returns:
+            Changes of b in owned dofs, 0 on Γ0, and of the nearer of the bounds of each bounded
+            dof, infinite ones aside, shape (n,).
+        """
+        V = self.u_D.function_space
+        layout, rng = Layout.of_space(V), np.random.default_rng((seed, V.mesh.comm.rank))
+
+        def drawn(size: FloatArray) -> FloatArray:
+            return DATUM * size * rng.choice([-1.0, 1.0], len(size))
+
+        values, change = fem.Function(V), fem.Function(V)
+        values.x.array[self.dirichlet] = drawn(np.abs(self.u_D.x.array[self.dirichlet]))
+        values.x.array[self.dirichlet] += drawn(np.full(len(self.dirichlet), abs(self.offset)))
+        values.x.scatter_forward()
+        fem.apply_lifting(change.x.array, [self._data.a], [[self._bc(values)]])
+        layout.shared_sum(change.x.array)
+        owned = self.A.getLocalSize()[0]
+        of_load = change.x.array[:owned] + drawn(np.abs(self.chi.x.array[:owned]))
+        of_load[self.owned_dirichlet] = 0.0
+        least = np.minimum(np.abs(self.bounds.lower), np.abs(self.bounds.upper))
+        return of_load, drawn(least + abs(self.offset))
+
     def start(self) -> fem.Function:
-        """The function that is u_D on Γ0 and 0 elsewhere."""
+        """The function that is u_D on Γ0 and 0 elsewhere, but for the offset."""
         u = fem.Function(self.u_D.function_space)
         u.x.array[:] = self.u_D.x.array
         return u
@@ -230,6 +301,12 @@ class System:
             vector.destroy()
         r.x.scatter_forward()
         return norm
+
+
+def _range(comm: MPI.Comm, values: FloatArray) -> tuple[float, float]:
+    """The least and the largest of all ranks' values; ∞ and −∞ where there are none."""
+    bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
+    return bottom, comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
 
 
 def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:

@@ -21,7 +21,7 @@ POINT = (0.3, -0.2)
 
 def expressions():
     """Singular at the point, each with its power and as a function of NumPy."""
-    x = ufl.SpatialCoordinate(MESH.mesh(5.0, MPI.COMM_SELF).mesh)
+    x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
     a, b = x[0] - POINT[0], x[1] - POINT[1]
     r, theta = ufl.sqrt(a**2 + b**2), ufl.atan2(b, a)
     half = lambda r, t: r**-0.5 * np.cos(1.5 * t)  # noqa: E731
@@ -82,7 +82,7 @@ POINT_3 = np.array(POINT)[:, None, None]
 
 
 def test_what_has_no_integral_has_no_bound():
-    x = ufl.SpatialCoordinate(MESH.mesh(5.0, MPI.COMM_SELF).mesh)
+    x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
     r2 = (x[0] - POINT[0]) ** 2 + (x[1] - POINT[1]) ** 2
     corners = np.array([POINT, (0.8, 0.1), (0.2, 0.7)])[:, :, None]
     hats = np.full((3, 1), 1 / 3)
@@ -92,7 +92,7 @@ def test_what_has_no_integral_has_no_bound():
 
 
 def test_points_inside_are_found():
-    x = ufl.SpatialCoordinate(MESH.mesh(5.0, MPI.COMM_SELF).mesh)
+    x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
     expression = lowered(((x[0] - POINT[0]) ** 2 + (x[1] - POINT[1]) ** 2) ** -0.4)
     corners = np.array([(0.0, -0.5), (0.9, -0.4), (0.2, 0.7)])[:, :, None]
     point, which, hats = first_inside(expression, corners)

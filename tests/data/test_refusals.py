@@ -239,6 +239,40 @@ def test_tensors(rows: list, words: str | None):
                 assert words in message
 
 
+def skew_in_a_disc(x):
+    there = ufl.lt((x[0] - 0.5) ** 2 + (x[1] - 0.3) ** 2, 0.1**2)
+    skew = ufl.conditional(there, 0.9, 0.0)
+    return ufl.as_matrix([[1.0, skew], [-skew, 1.0]])
+
+
+def test_a_tensor_that_is_skew_where_the_coarsest_mesh_does_not_look():
+    """A finer mesh does, and is refused; the coarsest has no certificate."""
+    levels = solve_levels(
+        Problem(f=-1.0, obstacle=-0.1, coefficient=skew_in_a_disc),
+        Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ABOVE).mesh(1.0),
+        5,
+    )
+    coarsest = next(levels)
+    assert coarsest.certificate.bound_h1 is None
+    assert "could not be shown to be symmetric" in str(coarsest.certificate.reason)
+    message = refused(lambda: list(levels))
+    assert "which is not symmetric" in message
+    found = np.array([float(v) for v in message.split("(")[1].split(")")[0].split(",")])
+    assert np.linalg.norm(found - [0.5, 0.3]) < 0.1
+
+
+@pytest.mark.parametrize("same", [lambda x: x[0] * x[1], lambda x: ufl.sin(x[0]) / 3])
+def test_tensors_that_are_symmetric_by_their_formulas_cost_nothing(same):
+    def kappa(x):
+        return ufl.as_matrix([[2.0, 0.3 * same(x)], [same(x) * 0.1 + 0.2 * same(x), 2.0]])
+
+    solution = solve(
+        Problem(f=-1.0, obstacle=-0.1, coefficient=kappa), Polygon(RECTANGLE, ABOVE).mesh(0.5)
+    )
+    assert solution.level.physics.compiled.kappa.skew == []
+    assert solution.certificate.bound_h1 is not None
+
+
 def test_a_tensor_that_is_no_coefficient_somewhere():
     domain = Polygon(RECTANGLE, ABOVE).mesh(0.5)
     problem = Problem(coefficient=lambda x: ufl.as_matrix([[1.0, x[1]], [x[1], 1.0]]))

@@ -92,7 +92,7 @@ def test_not_converged_names_the_level():
 # polygons
 
 
-@pytest.mark.parametrize("size", [0.1, 0.5, 10.0])
+@pytest.mark.parametrize("size", [0.1, 0.5, 5**0.5])
 @pytest.mark.parametrize("turn", [1, -1])
 def test_polygon_has_its_lengths_and_area(size: float, turn: int):
     # turned round, edge i runs between the same vertices if the labels are turned and shifted
@@ -102,6 +102,13 @@ def test_polygon_has_its_lengths_and_area(size: float, turn: int):
     assert area(domain) == pytest.approx(2)
     facets = int(np.ceil(2 / size - 1e-9))
     assert counts(domain) == [facets, 2 * max(1, int(np.ceil(1 / size - 1e-9))), facets]
+
+
+def test_a_size_beyond_the_domain_is_refused():
+    polygon = Polygon(RECTANGLE, LABELS)
+    assert counts(polygon.mesh(polygon.diameter)) == [1, 2, 1]
+    message = fails_alike(polygon.mesh, 2.3)
+    assert "size is 2.3, longer than the domain, whose diameter is 2.23607" in message
 
 
 def test_every_exterior_facet_has_one_part():

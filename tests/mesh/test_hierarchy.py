@@ -50,10 +50,10 @@ def domain(request) -> Domain:
     makers = {
         "rectangle": lambda: SHAPES["rectangle"].mesh(0.3),
         "hole": lambda: SHAPES["hole"].mesh(0.2),
-        "few cells": lambda: SHAPES["rectangle"].mesh(9),
+        "few cells": lambda: SHAPES["rectangle"].mesh(2.2),
         "one cell": lambda: Polygon(
             [[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]
-        ).mesh(9),
+        ).mesh(2**0.5),
         "own": lambda: own(none, 5),
         "own, ghosts": lambda: own(shared, 5),
         "own, two cells": lambda: own(shared, 1),

@@ -102,7 +102,8 @@ def test_children_in_a_row_need_not_repeat(seed):
     """Every cell has four children, but not all of them the same four."""
     rng = np.random.default_rng(seed)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) + rng.uniform(-0.3, 0.3, (4, 2))
-    coarse = Polygon(corners, ["contact", "dirichlet", "neumann", "dirichlet"]).mesh(10.0)
+    polygon = Polygon(corners, ["contact", "dirichlet", "neumann", "dirichlet"])
+    coarse = polygon.mesh(polygon.diameter)
     cells = coarse.mesh.topology.index_map(2).size_local
     fine, parent_cell = refine_marked(coarse, np.ones(cells, dtype=bool))
     u, v = (fem.Function(function_space(d.mesh)) for d in (coarse, fine))
@@ -129,7 +130,7 @@ def averaging(coarse, fine, parents):
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("pattern", ["all", "marked"])
-@pytest.mark.parametrize("size", [0.4, 10.0])
+@pytest.mark.parametrize("size", [0.4, TRIANGLE.diameter])
 def test_prolongation_is_its_matrix(element, pattern, size):
     """On few cells, too, when ranks have none."""
     coarse = (CROOKED if size < 1.0 else TRIANGLE).mesh(size)
@@ -149,7 +150,7 @@ def test_prolongation_is_its_matrix(element, pattern, size):
 
 @pytest.mark.parametrize("element", ["CR", "P1", "same mesh"])
 @pytest.mark.parametrize("pattern", ["all", "marked"])
-@pytest.mark.parametrize("size", [0.4, 10.0])
+@pytest.mark.parametrize("size", [0.4, TRIANGLE.diameter])
 def test_transfers_are_their_matrices(element, pattern, size):
     """What they add, restrict and touch, on few cells, too, when ranks have none."""
     coarse = (CROOKED if size < 1.0 else TRIANGLE).mesh(size)
@@ -213,7 +214,7 @@ def tensor(x):
         (lambda: refined(CROOKED.mesh(0.5), "some")[0], tensor),
         (lambda: boxed(create_rectangle(MPI.COMM_WORLD, [[0.0, 0.0], [2.0, 1.0]], [9, 5])), tensor),
         (lambda: boxed(create_unit_cube(MPI.COMM_WORLD, 3, 4, 3)), stiffness),
-        (lambda: TRIANGLE.mesh(3.0), stiffness),  # one rank has all
+        (lambda: TRIANGLE.mesh(TRIANGLE.diameter), stiffness),  # one rank has all
     ],
     ids=["structured", "crooked", "marked", "ghosts", "space", "tiny"],
 )

@@ -32,7 +32,7 @@ def rectangle(mode):
         lambda: create_unit_cube(WORLD, 3, 4, 3, ghost_mode=GhostMode.none),
         lambda: create_unit_cube(WORLD, 3, 4, 3, ghost_mode=GhostMode.shared_facet),
         lambda: refine(exact.S1.mesh(0.3))[0].mesh,
-        lambda: refine(TRIANGLE.mesh(3.0))[0].mesh,  # one rank has all
+        lambda: refine(TRIANGLE.mesh(TRIANGLE.diameter))[0].mesh,  # one rank has all
     ],
     ids=["plane", "plane, ghosts", "space", "space, ghosts", "refined", "tiny"],
 )
