@@ -102,7 +102,7 @@ def draw(upper, middle, lower):
     upper.set_ylabel(r"$\|\nabla_h(u-u_h)\|$", fontsize=13)
     rough = 100 * (quotients["D"][1][-1] - 1)
     middle.set_title(
-        f"It is soon a few percent above it; {rough:.0f} % for D, which has a corner,\n"
+        f"It is soon a few percent above it; {rough:.0f} % for D, which is not in $H^2$,\n"
         "unless meshes adapt (dotted)",
         fontsize=14,
     )

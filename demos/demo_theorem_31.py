@@ -17,19 +17,18 @@
 
 # %%
 import numpy as np
-from study import Study, column, levels_wanted, loglog, orders, run
+from study import Study, called, column, levels_wanted, loglog, orders, run
 
 study = Study("demo_theorem_31", "Theorem 3.1: a rate of at least 3/4 for u in H²")
 levels = levels_wanted(8)
 names = ("S1", "A", "B", "C", "C2", "I")
-label = {"C": "C, $s=7/2$", "C2": "C, $s=11/2$"}
 
 # %% [markdown]
 # ## Solve
 # Six solutions in $H^2$ on squares cut in two, from 4 to 512 squares per unit length.
 
 # %%
-results = {name: run(name, levels=levels) for name in names}
+results = {called(name): run(name, levels=levels) for name in names}
 h = column(results["S1"], "h")
 scaled = {name: column(rows, "h1") / h**0.75 for name, rows in results.items()}
 
@@ -68,7 +67,7 @@ def draw(left, right):
     left.plot(h, top, color="black", linewidth=1.2)
     left.annotate("$h^{3/4}$", (h[-3], top[-3]), xytext=(0, 8), ha="right",
                   textcoords="offset points", fontsize=13)  # fmt: skip
-    curves = {label.get(name, name): (h, column(rows, "h1")) for name, rows in results.items()}
+    curves = {name: (h, column(rows, "h1")) for name, rows in results.items()}
     loglog(
         left,
         curves,
@@ -76,7 +75,7 @@ def draw(left, right):
         title="All errors fall faster than $h^{3/4}$",
         y=r"$\|u-u_h\|_h$",
     )
-    curves = {label.get(name, name): (h, values) for name, values in scaled.items()}
+    curves = {name: (h, values) for name, values in scaled.items()}
     loglog(right, curves, {0.25: "$h^{1/4}$"}, title="With $h^{3/4}$ taken out they still fall",
            y=r"$\|u-u_h\|_h\, /\, h^{3/4}$")  # fmt: skip
 
