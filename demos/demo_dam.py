@@ -25,7 +25,7 @@ from dolfinx import fem
 from scipy.integrate import quad
 from scipy.optimize import root
 from scipy.special import ellipk, ellipkm1
-from study import Study, canvas, comm, levels_wanted
+from study import ENDS, Study, canvas, comm, levels_wanted
 
 from signorini_cr import (
     Contact,
@@ -290,12 +290,13 @@ def draw(field, beside, table):
     )  # fmt: skip
     for k, trial in enumerate(trials):
         beside.plot(x, trial, color=canvas.BLUE, alpha=0.35 if k < len(trials) - 1 else 1.0)
-        if k < 5:
+        if k < 4:
             beside.annotate(f"{k}", (x[-1], trial[-1]), xytext=(4, -4), textcoords="offset points")
     beside.plot(*curve.T, "--", color=canvas.RED)
     beside.set_xlim(0.0, LENGTH)
     beside.set_xlabel("x in m", fontsize=13)
-    beside.set_title("trial surfaces", fontsize=13)
+    beside.set_ylabel("y in m", fontsize=13)
+    beside.set_title("Trial surfaces 0, 1, 2, …; dashed: the closed form", fontsize=13)
     beside.grid(alpha=0.3)
 
 
@@ -307,8 +308,7 @@ study.field(
     units=Units(x="m", u="m", names={"u": "head"}),
     title=f"The dam seeps up to {y[-1]:.1f} m; the lower water ends at {LOW:g} m",
     size=(12.0, 6.0),
-    words={"contact": "seeps"},
+    words={"contact": "seeps", "no contact": "does not", ENDS: "exit point"},
     ncols=2,
-    sharey=True,
 )
 study.finish()
