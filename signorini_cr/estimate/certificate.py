@@ -323,8 +323,11 @@ def _companion(
     lossy = segments.loss > 0.0
     side = segments.facets.picked(lossy)
     of_facets = segments.loss[lossy] * measures(cells, side)
-    masses = Masses(not plain, known.reaction, side, of_facets)
-    v = companion(cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal, masses)
+    toward = segments.target(flux.shed)[:, lossy]
+    masses = Masses(not plain, known.reaction, side, of_facets, toward, segments.given[lossy])
+    v = companion(
+        cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal, highest, masses
+    )
     sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
     if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:

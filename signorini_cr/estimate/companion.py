@@ -21,6 +21,7 @@ from ..data.admissible import differs
 from ..data.loads import reacts
 from ..data.moments import OnFacets, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, sum_rows
+from ..fem.conditions import number
 from .cusps import Cusps
 from .flux import Flux
 from .lifting import Cubic, Lift, affine, joined, lift
@@ -52,12 +53,16 @@ class Masses:
         reaction: c, shape (cells,) or ().
         side: Facets with a b.
         loss: b |F| there, shape (n,).
+        toward: t/b − u_h there, at the ends and the height of a bump, shape (d + 1, n).
+        strong: Where b takes up what g has beyond its mean, and t/b is nearer to u than u_h is.
     """
 
     some: bool
     reaction: FloatArray
     side: BoundaryFacets
     loss: FloatArray
+    toward: FloatArray
+    strong: BoolArray
 
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
         """Add what heights of bumps are pulled by, in units of 8/3, shape (3, n)."""
@@ -70,8 +75,8 @@ class Masses:
 
     def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
         """The same of b, on its facets."""
-        ends = excess[others[self.side.local].T, self.side.cells]
-        return -0.25 * self.loss * ends.sum(axis=0)
+        ends = excess[others[self.side.local].T, self.side.cells] - self.toward[:2]
+        return self.loss * (0.4 * self.toward[2] - 0.25 * ends.sum(axis=0))
 
 
 @dataclass(eq=False)
@@ -136,6 +141,8 @@ class Floors:
         middle: At their midpoints, shape (n,).
         at_vertices: The values of s, and for each the largest bound at each vertex, −∞ for none:
             where parts with obstacles of their own meet, the higher one counts.
+        strong: Where v is drawn to t/b, as near to u as α is: there s v is not below α at the
+            middle, either, and no more is asked for, shape (n,).
         facets: Number of facets.
     """
 
@@ -144,17 +151,22 @@ class Floors:
     ends: FloatArray
     middle: FloatArray
     at_vertices: tuple[tuple[int, FloatArray], ...]
+    strong: BoolArray
     facets: int
 
     @classmethod
-    def of(cls, cells: Cells, bounds: OnParts) -> Floors:
+    def of(cls, cells: Cells, bounds: OnParts, masses: Masses) -> Floors:
         """Collect them; collective."""
         side, signs, ends = bounds.side, bounds.signs, bounds.ends
         limits = []
         for sign in sorted({each.sign for each in bounds.parts}, reverse=True):
             here = signs == sign
             limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
-        return cls(side, signs, ends, bounds.middle, tuple(limits), len(cells.exterior))
+        strong = np.zeros(len(cells.exterior), dtype=bool)
+        strong[masses.side.dofs] = masses.strong
+        return cls(
+            side, signs, ends, bounds.middle, tuple(limits), strong[side.dofs], len(cells.exterior)
+        )
 
     def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The least and the largest heights of bumps that they allow for, by facet dof.
@@ -162,7 +174,12 @@ class Floors:
         Args:
             v: v at the vertices, within the bounds.
         """
-        least = _lowest(self.signs * v[self.side.ends], self.ends, self.middle)
+        above = self.signs * v[self.side.ends]
+        least = np.where(
+            self.strong,
+            self.middle - above.mean(axis=0),
+            _lowest(above, self.ends, self.middle),
+        )
         low, high = np.full(self.facets, -np.inf), np.full(self.facets, np.inf)
         up = self.signs > 0.0
         low[self.side.dofs[up]] = least[up]
@@ -193,6 +210,7 @@ def companion(
     sweeps: int,
     steady: BoolArray,
     goal: float,
+    highest: float,
     masses: Masses,
 ) -> Companion:
     """Make v.
@@ -208,12 +226,12 @@ def companion(
         sweeps: How often the bumps are improved.
         steady: Where κ is constant on the cell, shape (cells,) or ().
         goal: What ‖∇ℓ‖ need not be known better than.
+        highest: The largest κ.
         masses: What E has beside gradients.
     """
     fixed, contact = u_D.side, alpha.side
-    floors, signs = Floors.of(cells, alpha), alpha.signs
-    touching = flux.touching
-    v = _at_vertices(cells, kappa, masses, w, u_D, floors, touching)
+    floors, signs = Floors.of(cells, alpha, masses), alpha.signs
+    v, held = _at_vertices(cells, kappa, masses, w, u_D, floors, flux)
     scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
     scale = max(cells.comm.allgather(scale))
     wrong = [
@@ -231,11 +249,11 @@ def companion(
     if cells.tdim == 2:
         free[fixed.dofs] = False
         ranges = floors.heights(v)
-        free[contact.dofs[touching]] = False
+        free[contact.dofs[held]] = False
         bumps = np.clip(0.0, *ranges)
         bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
         ends = np.where(signs > 0.0, *(limit[contact.dofs] for limit in ranges))
-        bumps[contact.dofs[touching]] = ends[touching]
+        bumps[contact.dofs[held]] = ends[held]
         # A facet's values reach the ranks that share it
         if cells.comm.size > 1:
             cells.share(bumps)
@@ -251,16 +269,16 @@ def companion(
             cells, kappa, masses, excess, bumps, free, (fixed, contact), sweeps
         )
         bumps[contact.dofs] = np.clip(bumps, *ranges)[contact.dofs]
-        held = np.zeros(len(v))
-        held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
-        loose = cells.share(held, 0) == 0.0
+        marks = np.zeros(len(v))
+        marks[fixed.ends] = marks[contact.ends[:, held]] = 1.0
+        loose = cells.share(marks, 0) == 0.0
         promise += _promise(cells, kappa, excess, bumps, loose)
         if promise > PROMISE * energy and not masses.some:
             v[:], bumps[:], cusps = _solved(
                 cells, kappa, steady, w, (v, bumps), (loose, free), floors
             )
             excess = v[cells.vertices] - w
-    boundary = Boundary(u_D, alpha, scale, goal)
+    boundary = Boundary(u_D, alpha, scale, goal, highest)
     above, lifts, reasons = boundary.lifted(cells, flux, v, bumps, np.zeros(len(u)))
     words = [word for word in (*wrong, *reasons) if word]
     words = [word for rank in cells.comm.allgather(words) for word in rank]
@@ -276,12 +294,14 @@ class Boundary:
         alpha: Obstacle on Γ1, seen from the cells.
         scale: Size of the values.
         goal: What ‖∇ℓ‖ need not be known better than.
+        highest: The largest κ.
     """
 
     u_D: OnParts
     alpha: OnParts
     scale: float
     goal: float
+    highest: float
 
     def lifted(
         self, cells: Cells, flux: Flux, v: FloatArray, bumps: FloatArray, thirds: FloatArray
@@ -293,12 +313,7 @@ class Boundary:
         """
         fixed, contact = self.u_D.side, self.alpha.side
         lifts = [
-            joined(
-                [
-                    _lift(cells, part, v, bumps, thirds, self.scale, self.goal, obstacle)
-                    for part in data.parts
-                ]
-            )
+            joined([_lift(cells, part, v, bumps, thirds, self, obstacle) for part in data.parts])
             for data, obstacle in ((self.u_D, False), (self.alpha, True))
         ]
         # y·n is constant on a facet: the mean of v + ℓ − α
@@ -326,9 +341,13 @@ def _at_vertices(
     w: FloatArray,
     u_D: OnParts,
     floors: Floors,
-    touching: BoolArray,
-) -> FloatArray:
-    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D."""
+    flux: Flux,
+) -> tuple[FloatArray, BoolArray]:
+    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D.
+
+    Returns:
+        They, and on which facets of Γ1 they are α or β at both ends, and the bump should be theirs.
+    """
     index_map = cells.domain.mesh.topology.index_map(0)
     size = index_map.size_local + index_map.num_ghosts
     flat = cells.vertices.ravel()
@@ -336,24 +355,38 @@ def _at_vertices(
     def collect(where: Any, values: Any) -> FloatArray:
         return cells.share(np.bincount(where, values, minlength=size).astype(np.float64), 0)
 
+    loss = np.zeros(len(cells.exterior))
+    loss[masses.side.dofs] = masses.loss
     if kappa.ndim or masses.some:
         weights = np.tile(kappa + masses.reaction * cells.volume, (len(w), 1))
-        for ends in cells.others[masses.side.local].T:
+        moved = np.zeros_like(weights)
+        for ends, toward in zip(cells.others[masses.side.local].T, masses.toward[:-1], strict=True):
             np.add.at(weights, (ends, masses.side.cells), masses.loss)
-        v = collect(flat, (weights * w).ravel())
+            np.add.at(moved, (ends, masses.side.cells), masses.loss * toward)
+        v = collect(flat, (weights * w + moved).ravel())
         v /= np.maximum(collect(flat, weights.ravel()), np.finfo(float).tiny)
     else:
         v = collect(flat, w.ravel())
         v /= np.maximum(collect(flat, None), 1.0)
+    at_bound = flux.touching.copy()
     for sign, limit in floors.at_vertices:
-        there = floors.side.ends[:, touching & (floors.signs == sign)]
+        here = flux.touching & (floors.signs == sign)
+        there = floors.side.ends[:, here]
         held = collect(there.ravel(), None) > 0
+        if masses.some:
+            # what leaving u_h for α costs in ‖p − b‖², and what not doing so costs in 4C
+            of_b, of_force = (
+                collect(there.ravel(), np.tile(each[here], len(there)))
+                for each in (loss[floors.side.dofs], 2.0 * (cells.tdim + 1) * flux.contact)
+            )
+            held &= of_b * np.where(held, sign * v - limit, 0.0) <= of_force
         moved = np.where(held, limit, np.maximum(sign * v, limit))
         np.copyto(v, sign * moved, where=limit > -np.inf)
+        at_bound[here] = held[there].all(axis=0)
     ends = u_D.side.ends.ravel()
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ends.ravel()) / np.maximum(count, 1.0), where=count > 0)
-    return v
+    return v, at_bound
 
 
 def _solved(
@@ -453,9 +486,10 @@ def _sweep(
             energy += float(np.sum(volume * distance(excess[:, part], None)))
             slope[:, part] += masses.pull(cells, excess[:, part], part)
             diagonal[part] += volume / 15.0
-    ends = excess[cells.others[masses.side.local].T, masses.side.cells]
+    (first, last, height), at = masses.toward, (masses.side.local, masses.side.cells)
+    ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
     energy += float(np.sum(masses.loss * distance(ends, None)))
-    at = masses.side.local, masses.side.cells
+    energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
     np.add.at(slope, at, masses.pull_on_facets(excess, cells.others))
     lost = np.zeros(len(bumps))
     lost[masses.side.dofs] = 0.4 * masses.loss
@@ -593,18 +627,19 @@ def _lift(
     v: FloatArray,
     bumps: FloatArray,
     thirds: FloatArray,
-    scale: float,
-    goal: float,
+    boundary: Boundary,
     obstacle: bool,
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
     side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
     v, bumps, thirds = (data.sign * values for values in (v, bumps, thirds))
     if cells.tdim != 2:
-        return affine(cells, side, trace, v[side.ends], ends, scale)
+        return affine(cells, side, trace, v[side.ends], ends, boundary.scale)
     third = cells.ways_between(*side.ends) * thirds[side.dofs]
     companion = Cubic(v[side.ends], bumps[side.dofs], third)
-    base = None
-    if obstacle and len(data.condition.bounds) == 1:
+    base, lossy = None, data.condition.loss
+    loss = 0.0 if lossy is None else number(lossy) or 0.0
+    if obstacle and len(data.condition.bounds) == 1 and loss == 0.0:
         base = Cubic(ends, middle - ends.mean(axis=0), third)
-    return lift(cells, side, trace, base, companion, scale, goal, obstacle)
+    ratio = loss / boundary.highest
+    return lift(cells, side, trace, base, companion, boundary.scale, boundary.goal, obstacle, ratio)

@@ -115,6 +115,7 @@ def lift(
     scale: float,
     goal: float,
     obstacle: bool,
+    ratio: float = 0.0,
 ) -> Lift:
     """Enclose data less a polynomial, and bound the lifting; collective.
 
@@ -127,6 +128,7 @@ def lift(
         scale: Size of the values, by which rounding is told.
         goal: What ‖∇ℓ‖ need not be known better than.
         obstacle: Whether δ is the positive part of the difference.
+        ratio: b over the largest κ, by which ‖ℓ‖²_F counts beside ‖∇ℓ‖²_T.
     """
     n, name = len(side.cells), "α" if obstacle else "u_D"
     if trace.constant is not None:
@@ -145,8 +147,15 @@ def lift(
         return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
 
     def steepness(pieces: Pieces) -> FloatArray:
-        bound = _bounds(trace, pieces, base or v, cells, length, scale)
-        return np.stack([parts(pieces, *bound[:2]).sum(axis=0), *bound])
+        size, steep, least = _bounds(trace, pieces, base or v, cells, length, scale)
+        if obstacle and base is None:
+            # δ is a positive part, and 0 where the difference is shown to be negative
+            signed = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0]
+            size = np.fmin(size, np.maximum(signed, 0.0))
+            steep = np.where(signed <= 0.0, 0.0, steep)
+        square = parts(pieces, size, steep).sum(axis=0)
+        square = square + 2.0 * ratio / height[pieces.parent] * size**2
+        return np.stack([square, size, steep, least])
 
     weights = np.zeros((4, n))
     weights[0] = 0.5 * height * length / goal**2
@@ -159,10 +168,10 @@ def lift(
         jumps = _jump_at_ends(trace, whole, base or v, cells, JUMP * scale, obstacle)
         clear = np.zeros(n, dtype=bool)
         if obstacle:
-            below = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0] <= 0
+            below = size <= 0.0
+            if base is not None:
+                below = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0] <= 0
             clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
-            if base is None:
-                size, steep = (np.where(below, 0.0, values) for values in (size, steep))
     except Unknown as error:
         return Lift.none(np.zeros(n), NO_RANGE.format(name, error))
 

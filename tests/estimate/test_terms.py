@@ -75,6 +75,20 @@ class Pointwise:
         return [(cell, to_facets.links(cell).tolist().index(facet)) for cell, facet in own]
 
 
+def smallest_curl(gradients, local, reference, weights):
+    """Root of the mean of |∇ψ|², ψ = λ_j λ_k (1 + β λ_i) with the best β, i the local vertex."""
+    hats = np.column_stack([1 - reference.sum(axis=1), reference])
+    i, (j, k) = local, [one for one in range(3) if one != local]
+    a, b, c = (hats[:, [one]] for one in (i, j, k))
+    by_a, by_b, by_c = gradients.T[[i, j, k]]
+    bump = c * by_b + b * by_c
+    bubble = a * bump + b * c * by_a
+    squares = [
+        weights @ (p * q).sum(axis=1) for p, q in ((bump,) * 2, (bump, bubble), (bubble,) * 2)
+    ]
+    return np.sqrt(squares[0] - squares[1] ** 2 / squares[2])
+
+
 def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=False, phi=None):
     """What the certificate should say where f and g are affine and κ is constant on the cells.
 
@@ -153,6 +167,10 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
                 c = poincare * at.h[cell]
                 c = np.sqrt(measure / at.volume[cell] * c * (c + 2 * at.h[cell] / d))
                 on_edge[cell] = c * np.sqrt(measure * facet_weights @ off**2)
+                if d == 2:  # g is affine: the curl of a cubic has its flux
+                    small = smallest_curl(at.gradients[cell], local, reference, weights)
+                    small *= np.sqrt(3.0 * at.volume[cell] * facet_weights @ off**2) * measure
+                    on_edge[cell] = min(on_edge[cell], small)
                 rise = potential(np.array([[cell]]), where)[0] / k[cell]
                 of_flux[cell] += measure * facet_weights @ (off * rise)
                 change = measure * facet_weights @ (off * (v_F - u_F)[:, 0])
