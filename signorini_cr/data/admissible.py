@@ -116,7 +116,7 @@ def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
 
 
 def _negative(datum: _Values, at: tuple[FloatArray, Int32Array], name: str) -> list[Complaint]:
-    """Where a datum is below 0 that must not be."""
+    """Find where a datum is below 0 that must not be."""
     x, cells = at
     found = datum.at(x, cells, datum.precision.points)
     if found is None:
@@ -245,7 +245,7 @@ class _Facets:
 
 
 def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
-    """Where u_D jumps, within a facet or between two that touch; collective.
+    """Find where u_D jumps, within a facet or between two that touch; collective.
 
     Every facet is looked at in intervals. Where u_D is far from affine on one, it is cut in two,
     until the digits of the coordinates end. What is continuous has fallen by then, however steep it
@@ -330,14 +330,14 @@ def _halves(triples: FloatArray, cuts: FloatArray) -> FloatArray:
 
 
 def _roughness(u: FloatArray) -> FloatArray:
-    """How far u, at ends and middles, is from affine; 0 where it is not finite."""
+    """Tell how far u, at ends and middles, is from affine; 0 where it is not finite."""
     with np.errstate(all="ignore"):
         difference = np.abs((1.0 - MIDDLE) * u[0] - u[1] + MIDDLE * u[2])
     return np.where(np.isfinite(difference), difference, 0.0)
 
 
 def _noise(e: FloatArray) -> FloatArray:
-    """What rounding may make of three values: one of them may lie where nothing can be known."""
+    """Bound what rounding makes of three values; one may lie where nothing can be known."""
     return 3.0 * np.median(e, axis=0)
 
 
@@ -411,7 +411,7 @@ def _crossing(
     sign: int,
     other: str = "dirichlet",
 ) -> list[Complaint]:
-    """Where Γ0 meets Γ1 with α above u_D, or −β above −u_D, so that K is empty; collective.
+    """Find where Γ0 meets Γ1 with α above u_D, or −β above −u_D: K is empty; collective.
 
     In the place of u_D there may be the opposite bound of another part of Γ1.
     """
@@ -453,7 +453,7 @@ def _crossed(
     contact: _Facets,
     label: str,
 ) -> list[Complaint]:
-    """Where α is above β, at vertices and midpoints; β comes with the other sign."""
+    """Find where α is above β, at vertices and midpoints; β comes with the other sign."""
     room = _Values(upper + lower, domain)
     complaints = []
     for x in (contact.x.mean(axis=1), *np.moveaxis(contact.x, 1, 0)):
@@ -468,7 +468,7 @@ def _crossed(
 
 
 def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
-    """Where κ is not symmetric, or not positive definite, at vertices and midpoints of cells."""
+    """Find where κ is not symmetric or positive definite, at vertices and midpoints of cells."""
     mesh = domain.mesh
     if forms.uniform:
         return []
@@ -505,7 +505,7 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
 
 
 def _bad_form(forms: Forms, domain: Domain) -> str | None:
-    """What is wrong with the matrix of the user's form, the same on all ranks; collective."""
+    """Say what is wrong with the matrix of the user's form, the same on all ranks; collective."""
     V = function_space(domain.mesh, forms.element)
     A = assemble_matrix(forms.a.on(domain, [V, V]))
     A.assemble()

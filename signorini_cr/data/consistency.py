@@ -86,7 +86,7 @@ class _Solution:
         return said
 
     def _on_contact(self, contact: Condition, sign: int, bound: Any) -> str | None:
-        """What is wrong with one bound: sign u must not be below it."""
+        """Say what is wrong with one bound: sign u must not be below it."""
         x, cells, n = self._facets(contact.number)
         u, alpha = self._values(self.u, x, cells), self._values(bound, x, cells)
         pressure = self._flux(contact, x, cells, n)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,87 +21,57 @@ from ..mesh.domain import Domain, is_by_cells
 from .loads import NeumannMoments, VolumeMoments, chi
 from .moments import Compiled, OnFacets, Tensor
 
+ONE = np.array(1.0)
+"""A rate that changes nothing."""
 
-class DiffusionOnMesh:
-    """A problem's data on one mesh, each sampled when first asked for, and kept.
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """A mesh as arrays and the loads integrated on it: large, and each made when first asked for.
+
+    They live as long as a mesh is worked on. χ asks for them first and the certificate last; then
+    whoever has the mesh's level calls its `tidy`, as a solution does after its certificate and the
+    drivers do before they make the next mesh, and there is a new, empty object in this one's place.
 
     Attributes:
         compiled: The data, whatever the mesh.
-        forms: Their forms.
         domain: Mesh and boundary parts.
         V: The discrete space.
         source: A function of CR by dof that f has beside what the problem says, ghosts included;
             None for nothing.
         rate: What it is multiplied by on owned cells, shape (cells,) or ().
+        earlier: The same problem with other source and rate, which keeps what cannot have changed
+            since; None if there is no such.
     """
 
-    source: FloatArray | None = None
-    rate: FloatArray = np.array(1.0)
-
-    def __init__(self, compiled: Compiled, domain: Domain):
-        """Make the space; collective."""
-        self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
-        self.forms.insist_on_data(domain)
-        self.V = function_space(domain.mesh, self.forms.element)
+    compiled: Compiled
+    domain: Domain
+    V: fem.FunctionSpace
+    source: FloatArray | None
+    rate: FloatArray
+    earlier: DiffusionOnMesh | None
 
     @cached_property
     def cells(self) -> Cells:
         """The mesh as arrays, for the Crouzeix-Raviart element."""
-        fixed = [condition.number for condition in self.forms.fixed]
-        return Cells(self.domain, self.V, fixed, self.forms.sinks, self._stretch())
-
-    def _stretch(self) -> FloatArray | None:
-        kappa = self.compiled.kappa
-        return kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
-
-    def renewed(self, source: FloatArray | None, rate: FloatArray) -> DiffusionOnMesh:
-        """The same with data as they are now; a_h must be what it was.
-
-        Data that hold neither Constants nor Functions are what they were, and not sampled anew.
-
-        Args:
-            source: As above.
-            rate: As above.
-        """
-        other = copy(self)
-        for name in ("load", *self._changing):
-            other.__dict__.pop(name, None)
-        other.source, other.rate = source, rate
-        return other
-
-    @cached_property
-    def _changing(self) -> tuple[str, ...]:
-        """What is made from data that may change."""
-        forms = self.forms
-        made = {
-            ("of_f",): [forms.f],
-            ("edges",): [condition.flux for condition in forms.natural],
-            ("u_D", "fixed"): [condition.fixed for condition in forms.fixed],
-            ("alpha", "bounds"): [each for c in forms.bounded for _, each in c.bounds],
-        }
-        return tuple(
-            name for names, data in made.items() if any(map(may_change, data)) for name in names
-        )
+        if self.earlier is not None:
+            return self.earlier.cells
+        forms, kappa = self.compiled.forms, self.compiled.kappa
+        fixed = [condition.number for condition in forms.fixed]
+        stretch = kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
+        return Cells(self.domain, self.V, fixed, forms.sinks, stretch)
 
     @cached_property
     def of_f(self) -> VolumeMoments:
         """Moments of f."""
+        if self.earlier is not None and not may_change(self.compiled.forms.f):
+            return self.earlier.of_f
         return VolumeMoments.of(self.compiled.f, self.cells)
 
     @cached_property
     def load(self) -> VolumeMoments:
         """Moments of f and what it has beside."""
         return self.with_source(self.of_f)
-
-    @property
-    def reaction(self) -> FloatArray:
-        """C on owned cells, shape (cells,), or () where it is a number."""
-        c = self.forms.reaction
-        if not is_by_cells(c):
-            return np.array(number(c) or 0.0)
-        own = self.domain.own(c)
-        dofs = own.function_space.dofmap.list[: self.cells.number, 0]
-        return np.asarray(own.x.array[dofs], dtype=np.float64)
 
     def with_source(self, load: VolumeMoments) -> VolumeMoments:
         """Moments of f, as given, and what it has beside."""
@@ -112,21 +82,122 @@ class DiffusionOnMesh:
     @cached_property
     def edges(self) -> tuple[NeumannMoments, ...]:
         """Moments of the fluxes that are known, one for each condition."""
-        sampled = self._sampled(self.forms.natural, lambda condition: condition.flux)
+        natural = self.compiled.forms.natural
+        if self.earlier is not None and not any(may_change(each.flux) for each in natural):
+            return self.earlier.edges
+        sampled = (
+            OnFacets.of(each, self.compiled.trace(each.flux), self.domain) for each in natural
+        )
         return tuple(NeumannMoments(on_facets, self.cells) for on_facets in sampled)
+
+
+class DiffusionOnMesh:
+    """A problem's data on one mesh, each sampled when first asked for, and kept.
+
+    Attributes:
+        compiled: The data, whatever the mesh.
+        forms: Their forms.
+        domain: Mesh and boundary parts.
+        V: The discrete space.
+        moments: What is large, and kept for a while only.
+    """
+
+    def __init__(
+        self,
+        compiled: Compiled,
+        domain: Domain,
+        source: FloatArray | None = None,
+        rate: FloatArray = ONE,
+        earlier: DiffusionOnMesh | None = None,
+    ):
+        """Make the space, where there is none yet; collective.
+
+        Args:
+            compiled: The data, whatever the mesh.
+            domain: Mesh and boundary parts.
+            source: As `Moments` has it.
+            rate: As `Moments` has it.
+            earlier: As `Moments` has it.
+        """
+        self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
+        self.V: fem.FunctionSpace
+        if earlier is None:
+            self.forms.insist_on_data(domain)
+            self.V = function_space(domain.mesh, self.forms.element)
+        else:
+            self.V = earlier.V
+        self._earlier = earlier
+        self.moments = Moments(compiled, domain, self.V, source, rate, earlier)
+
+    def renewed(self, source: FloatArray | None, rate: FloatArray) -> DiffusionOnMesh:
+        """Return the same with data as they are now; a_h must be what it was.
+
+        Data that hold neither Constants nor Functions are what they were, and not sampled anew.
+
+        Args:
+            source: A function of CR by dof that f has beside what the problem says, ghosts
+                included; None for nothing.
+            rate: What it is multiplied by on owned cells, shape (cells,) or ().
+        """
+        return DiffusionOnMesh(self.compiled, self.domain, source, rate, self._earlier or self)
+
+    def tidy(self) -> None:
+        """Make room: what is large is made again, should anybody ask for it."""
+        self.moments = replace(self.moments)
+
+    @property
+    def cells(self) -> Cells:
+        """The mesh as arrays, for the Crouzeix-Raviart element."""
+        return self.moments.cells
+
+    @property
+    def of_f(self) -> VolumeMoments:
+        """Moments of f."""
+        return self.moments.of_f
+
+    @property
+    def load(self) -> VolumeMoments:
+        """Moments of f and what it has beside."""
+        return self.moments.load
+
+    @property
+    def edges(self) -> tuple[NeumannMoments, ...]:
+        """Moments of the fluxes that are known, one for each condition."""
+        return self.moments.edges
+
+    @property
+    def reaction(self) -> FloatArray:
+        """The reaction c on owned cells, shape (cells,), or () where it is a number."""
+        c = self.forms.reaction
+        if not is_by_cells(c):
+            return np.array(number(c) or 0.0)
+        own = self.domain.own(c)
+        dofs = own.function_space.dofmap.list[: self.cells.number, 0]
+        return np.asarray(own.x.array[dofs], dtype=np.float64)
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:
         """What u is set to on Γ0, one for each condition."""
-        return self._sampled(self.forms.fixed, lambda condition: condition.fixed)
+        data = [(condition, 1, condition.fixed) for condition in self.forms.fixed]
+        return self._sampled(data, lambda earlier: earlier.u_D)
 
     @cached_property
     def alpha(self) -> tuple[OnFacets, ...]:
         """What s u must not be below on Γ1, one for each condition's each bound."""
+        data = [(each, sign, datum) for each in self.forms.bounded for sign, datum in each.bounds]
+        return self._sampled(data, lambda earlier: earlier.alpha)
+
+    def _sampled(
+        self,
+        data: Sequence[tuple[Condition, int, object]],
+        before: Callable[[DiffusionOnMesh], tuple[OnFacets, ...]],
+    ) -> tuple[OnFacets, ...]:
+        """Sample data on facets, with their signs, unless they are what they were."""
+        if self._earlier is not None and not any(may_change(datum) for *_, datum in data):
+            return before(self._earlier)
         return tuple(
             OnFacets.of(condition, self.compiled.trace(datum), self.domain, sign)
-            for condition in self.forms.bounded
-            for sign, datum in condition.bounds
+            for condition, sign, datum in data
         )
 
     # what the system asks for
@@ -134,6 +205,8 @@ class DiffusionOnMesh:
     @cached_property
     def a(self) -> fem.Form:
         """a_h."""
+        if self._earlier is not None:
+            return self._earlier.a
         return self.forms.a.on(self.domain, [self.V, self.V])
 
     @cached_property
@@ -148,7 +221,7 @@ class DiffusionOnMesh:
 
     def chi(self) -> FloatArray:
         """χ (1.10) by dof, this rank's cells' share."""
-        if self.forms.element == "CR" and (self.forms.loaded or self.source is not None):
+        if self.forms.element == "CR" and (self.forms.loaded or self.moments.source is not None):
             found = chi(self.load, self.edges, self.cells)
         else:
             found = self._assembled(self.forms.chi)
@@ -190,19 +263,6 @@ class DiffusionOnMesh:
         if kernel is not None:
             fem.assemble_vector(values, kernel.on(self.domain, [self.V]))
         return values
-
-    def tidy(self) -> None:
-        """Drop what only solution and certificate needed; it is made again if asked for."""
-        for name in ("cells", "of_f", "load", "edges"):
-            self.__dict__.pop(name, None)
-
-    def _sampled(
-        self, conditions: tuple[Condition, ...], datum: Callable[[Condition], object]
-    ) -> tuple[OnFacets, ...]:
-        return tuple(
-            OnFacets.of(condition, self.compiled.trace(datum(condition)), self.domain)
-            for condition in conditions
-        )
 
 
 def diffusion(data: OnMesh) -> DiffusionOnMesh:

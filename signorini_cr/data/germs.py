@@ -234,7 +234,7 @@ class _Germs:
         return high > 0, low < 0
 
     def _truth(self, e: Any) -> tuple[BoolArray, BoolArray]:
-        """Where a condition can hold, and where it can fail, but for null sets."""
+        """Tell where a condition can hold, and where it can fail, but for null sets."""
         if isinstance(e, classes.NotCondition):
             return self._truth(e.ufl_operands[0])[::-1]
         if isinstance(e, classes.AndCondition | classes.OrCondition):
@@ -326,7 +326,7 @@ def allowance(
 
 
 def may_be_singular(expression: Any) -> bool:
-    """Whether there is an operator in the expression that can take something finite to infinity."""
+    """Tell whether an operator in the expression can take something finite to infinity."""
     return any(
         isinstance(e, classes.Division | classes.Ln)
         or (isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1]))
@@ -335,7 +335,7 @@ def may_be_singular(expression: Any) -> bool:
 
 
 def _is_positive(e: Any) -> bool:
-    """Whether it is a positive number, whatever values constants may get."""
+    """Tell whether it is a positive number, whatever values constants may get."""
     return isinstance(e, classes.ScalarValue) and float(e) > 0
 
 

@@ -150,7 +150,7 @@ def lowered(expression: Any) -> Any:
 
 
 def is_local(expression: Any) -> bool:
-    """Whether the expression depends on more than x, so that it differs from cell to cell."""
+    """Tell whether the expression depends on more than x: it differs from cell to cell."""
     kinds = (fem.Function, classes.GeometricQuantity)
     return any(
         isinstance(e, kinds) and not isinstance(e, classes.SpatialCoordinate)
@@ -159,7 +159,7 @@ def is_local(expression: Any) -> bool:
 
 
 def has_conditions(expression: Any) -> bool:
-    """Whether the expression may jump: by a choice between two others, or as an angle."""
+    """Tell whether the expression may jump: by a choice between two others, or as an angle."""
     return any(
         isinstance(e, classes.Conditional | classes.Atan2)
         for e in ufl.corealg.traversal.unique_pre_traversal(expression)
@@ -508,7 +508,7 @@ class Enclosure:
         return jet
 
     def truth(self, e: Any) -> Truth:
-        """Where in the boxes a condition can hold and where it can fail, but for null sets."""
+        """Tell where in the boxes a condition can hold and can fail, but for null sets."""
         if isinstance(e, classes.NotCondition):
             return self.truth(e.ufl_operands[0])[::-1]
         if isinstance(e, classes.AndCondition | classes.OrCondition):
@@ -811,7 +811,7 @@ _COMPARISONS = (*_ORDERED, classes.EQ, classes.NE)
 
 @cache
 def _agree(condition: Any, first: Any, second: Any) -> bool:
-    """Whether the branches are seen to be equal where the condition changes."""
+    """Tell whether the branches are seen to be equal where the condition changes."""
     if not isinstance(condition, _ORDERED):
         return False
     if _is_extreme(condition, first, second):
@@ -829,7 +829,7 @@ def _agree(condition: Any, first: Any, second: Any) -> bool:
 
 
 def _is_extreme(condition: Any, first: Any, second: Any) -> bool:
-    """Whether the conditional is the larger or the smaller of two numbers."""
+    """Tell whether the conditional is the larger or the smaller of two numbers."""
     if not isinstance(condition, _ORDERED):
         return False
     a, b = condition.ufl_operands
@@ -837,7 +837,7 @@ def _is_extreme(condition: Any, first: Any, second: Any) -> bool:
 
 
 def _is_maximum(condition: Any, first: Any) -> bool:
-    """Whether it is the larger, if it is one of them."""
+    """Tell whether it is the larger, if it is one of them."""
     return bool(
         (first == condition.ufl_operands[0]) == isinstance(condition, classes.GT | classes.GE)
     )

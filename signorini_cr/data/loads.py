@@ -219,7 +219,7 @@ def mean_to_norm(
 
 
 def reacts(reaction: FloatArray) -> bool:
-    """Whether there is a reaction; the same on all ranks."""
+    """Tell whether there is a reaction; the same on all ranks."""
     return reaction.ndim > 0 or bool(reaction > 0.0)
 
 
@@ -583,7 +583,7 @@ class Segments:
         return found[0], found[1], found[2]
 
     def change(self, vertices: FloatArray, bumps: FloatArray) -> float:
-        """How far ∫_Γg q v may be from ∫_Γg g v, v by vertices and bumps; this rank's share."""
+        """Bound |∫_Γg (g − q) v|, v by vertices and bumps; this rank's share."""
         ends = vertices[self.facets.ends]
         area = np.bincount(self.place, self.measure, minlength=len(self.through))
         bump = np.abs(bumps[self.facets.dofs]) if len(ends) == 2 else 0.0

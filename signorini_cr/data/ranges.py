@@ -729,7 +729,7 @@ def chunks(n: int) -> list[slice]:
 
 
 def errors_on(pieces: Pieces, errors: Errors, cells: Cells, decide: bool = True) -> FloatArray:
-    """What is to be known, on the boxes around pieces; for `decide` see `Boxes.corners`."""
+    """Work out what is to be known on boxes around pieces; for `decide` see `Boxes.corners`."""
     n = len(pieces.part)
     if n > CHUNK:
         parts_of = [errors_on(pieces[part], errors, cells, decide) for part in chunks(n)]

@@ -24,13 +24,13 @@ from ..data.moments import Coefficient, OnParts
 from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from .beyond import Beyond
-from .companion import Companion, Lifted, Masses, companion, on_facet
+from .companion import Companion, Functional, Lifted, Masses, companion, on_facet
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
-from .sums import Sums
+from .sums import Sums, Totals
 
 if TYPE_CHECKING:
     from ..vi.level import Level
@@ -207,7 +207,7 @@ def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) 
     base = solution if flux_from is None else flux_from
     try:
         known = _equilibrated(solution, base)
-        v, sums = _companion(solution, base, known, sweeps)
+        v, sums = _companion(solution, known, sweeps)
         certificate = _added_up(known, v, sums)
     except _NoBound as why:
         certificate = Certificate(reason=str(why))
@@ -279,7 +279,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     size = _size(cells, kappa, w, flux)
     certain = Certain.of(data.compiled.f, data.of_f, cells, kappa.low, size, reaction)
     _insist(certain.reason)
-    certain = replace(certain, load=data.with_source(certain.load))
+    certain = replace(certain, load=data.moments.with_source(certain.load))
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
     # y is to have the means that f and g have now
@@ -300,9 +300,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
 
 
-def _companion(
-    solution: Solved, base: Solved, known: _Known, sweeps: int
-) -> tuple[Companion, Sums]:
+def _companion(solution: Solved, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
     """Make v, improve y where that promises much, and integrate the gap; collective."""
     cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     if solution.element != "CR":
@@ -315,19 +313,9 @@ def _companion(
     data = diffusion(known.level.data)
     u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
     plain = data.forms.of_one is None
-    steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
-    u = base.u.x.array
-    segments = known.segments
-    lossy = segments.loss > 0.0
-    side = segments.facets.picked(lossy)
-    of_facets = segments.loss[lossy] * measures(cells, side)
-    toward = segments.target(flux.shed)[:, lossy]
-    masses = Masses(not plain, known.reaction, side, of_facets, toward, segments.given[lossy])
-    v = companion(
-        cells, kappa.mean, known.w, u, flux, u_D, alpha, sweeps, steady, goal, highest, masses
-    )
+    v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal, highest)
     sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
     if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
@@ -342,92 +330,163 @@ def _companion(
     return v, sums
 
 
+def _functional(known: _Known, plain: bool) -> Functional:
+    """Say what v is to make small; plain tells that there are gradients only, on all ranks."""
+    cells, kappa, segments = known.cells, known.kappa, known.segments
+    steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
+    lossy = segments.loss > 0.0
+    side = segments.facets.picked(lossy)
+    loss = segments.loss[lossy] * measures(cells, side)
+    toward, strong = segments.target(known.flux.shed)[:, lossy], segments.given[lossy]
+    masses = Masses(not plain, known.reaction, side, loss, toward, strong)
+    return Functional(cells, known.w, kappa.mean, steady, masses)
+
+
 def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     """Add up the bounds and the energy's bracket; collective.
 
     Raises:
         _NoBound: With the reason.
     """
-    cells, kappa, flux, w = known.cells, known.kappa, known.flux, known.w
-    certain, segments = known.certain, known.segments
-    edge_square = integrate_edge(
-        cells, kappa, w, certain.load, segments, flux, v, sums, known.reaction
+    cells, kappa, segments = known.cells, known.kappa, known.segments
+    totals, load = sums.totals, known.certain.load
+    totals.loose = integrate_edge(
+        cells, kappa, known.w, load, segments, known.flux, v, sums, known.reaction
     )
-    lift, lift_energy, lift_far, lift_near = _lifted(known, v, sums)
+    totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
+    totals.energy_slack += more_energy
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
-    edge_energy = segments.measure @ (segments.weights @ (segments.values * on_edge))
+    of_edge = segments.measure @ (segments.weights @ (segments.values * on_edge))
+    totals.energy -= float(of_edge)
+    totals.contact = float(np.sum(v.contact))
+    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
+    totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
     hidden, hidden_energy = _hidden(known, v, sums)
-    rounding = _rounding(cells, kappa, known.reaction, w, certain.load, flux)
-    total = sums.totals.over_ranks(cells)
-    contact, edge_square, edge_energy, lift, lift_energy, lift_far, lift_near = cells.total(
-        np.sum(v.contact), edge_square, edge_energy, lift, lift_energy, lift_far, lift_near
-    )
-    of_gradients, steep = cells.total(
-        np.sum(np.maximum(sums.middle, 0.0) / kappa.least), np.sum(np.maximum(sums.steepness, 0.0))
-    )
+    rounding = _rounding(cells, kappa, known.reaction, known.w, load, known.flux)
+    total = totals.over_ranks(cells)
 
-    # ‖p + κ^{-1/2}σ ∓ b‖ and the ball around (y + κ∇v)/2 that has κ∇u in it
-    loose = np.sqrt(edge_square) + known.left + hidden + rounding
-    same = total.flux + total.companion + total.load + 2 * (total.load_flux + total.slack)
-    mixed = 2 * (total.cross + total.load_companion)
-    far = np.sqrt(max(same - mixed + total.far, 0.0) + lift_far) + loose
-    near = np.sqrt(max(same + mixed + total.near, 0.0) + lift_near) + rounding
-    radius = loose / 2 + np.sqrt(far**2 / 4 + contact)
-    bound = near / 2 + radius
-    bound_h1 = np.sqrt(of_gradients) / 2 + (rounding / 2 + radius) / np.sqrt(kappa.smallest)
+    ball = _Ball.of(total, known.left, hidden, rounding)
     _insist(v.reason or (ADRIFT if np.isposinf(known.left) else None))
-    _insist(None if np.isfinite(bound) else HUGE)
-
-    energy = total.energy - edge_energy
-    unsure = lift_energy + hidden_energy + total.energy_slack
-    unsure += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
-    lift = np.sqrt(lift)
+    _insist(None if np.isfinite(ball.bound) else HUGE)
+    bound_h1 = np.sqrt(total.of_gradients) / 2
+    bound_h1 += (rounding / 2 + ball.radius) / np.sqrt(kappa.smallest)
+    lift = np.sqrt(total.lift)
     return Certificate(
-        bound_h1=float(min(bound_h1, bound / np.sqrt(kappa.smallest))),
-        bound_energy_norm=float(bound),
-        bound_companion=float((far + np.sqrt(far**2 + 4 * contact)) / 2 + lift),
-        energy=(float(energy - unsure - far**2 / 2 - contact), float(energy + unsure)),
+        bound_h1=float(min(bound_h1, ball.bound / np.sqrt(kappa.smallest))),
+        bound_energy_norm=float(ball.bound),
+        bound_companion=float(ball.of_companion + lift),
+        energy=_bracket(total, ball, hidden_energy, rounding),
         parts={
             "flux": float(np.sqrt(total.flux)),
             "companion": float(np.sqrt(total.companion)),
-            "contact": float(np.sqrt(contact)),
+            "contact": float(np.sqrt(total.contact)),
             "load": float(np.sqrt(total.load) + hidden),
             "neumann": float(np.sqrt(total.neumann)),
             "boundary": float(lift),
             "solver": float(known.left + known.carried),
         },
         indicators=sums.indicators,
-        _made=Made(
-            level=known.level,
-            w=w,
-            kappa=kappa.mean,
-            stretch=cells.stretch,
-            hats=certain.load.hats,
-            segments=segments,
-            varies=kappa.varies,
-            excess=flux.excess,
-            beyond=flux.beyond,
-            vertices=v.vertices,
-            bumps=v.bumps,
-            thirds=v.thirds,
-            cusps=v.cusps,
-            reaction=known.reaction,
-            left=flux.left,
-            taken_up=flux.taken_up,
-            shed=flux.shed,
-            forces=_forces(v.boundary.alpha, flux),
-            missed=float(segments.missed.sum())
-            + (0.0 if certain.missed is None else float(certain.missed.sum())),
-            reach=float(bound - near / 2 + loose + lift / 2),
-            loose=float(loose + lift),
-            lift=v.lift,
-            bounded=v.boundary.alpha.side.dofs,
-        ),
+        _made=_made(known, v, ball, lift),
+    )
+
+
+@dataclass(frozen=True)
+class _Ball:
+    """The ball around (y + κ∇v)/2 that has κ∇u in it.
+
+    Attributes:
+        far: Bound of ‖p + κ^{-1/2}σ − b‖, what is loose included.
+        near: Bound of ‖p + κ^{-1/2}σ + b‖.
+        loose: What is known of −div y = f and y·n = g by its size alone, and rounding.
+        contact: The contact term.
+    """
+
+    far: float
+    near: float
+    loose: float
+    contact: float
+
+    @classmethod
+    def of(cls, total: Totals, left: float, hidden: float, rounding: float) -> _Ball:
+        """Put it together.
+
+        Args:
+            total: The integrals over all ranks' cells.
+            left: What is left of −div y = f.
+            hidden: What quadrature may have missed of f and g.
+            rounding: What rounding may do.
+        """
+        loose = np.sqrt(total.loose) + left + hidden + rounding
+        same = total.flux + total.companion + total.load + 2 * (total.load_flux + total.slack)
+        mixed = 2 * (total.cross + total.load_companion)
+        far = np.sqrt(max(same - mixed + total.far, 0.0) + total.lift_far) + loose
+        near = np.sqrt(max(same + mixed + total.near, 0.0) + total.lift_near) + rounding
+        return cls(far, near, loose, total.contact)
+
+    @property
+    def radius(self) -> float:
+        """Its radius."""
+        return float(self.loose / 2 + np.sqrt(self.far**2 / 4 + self.contact))
+
+    @property
+    def bound(self) -> float:
+        """How far its points are from κ∇u_h, at most."""
+        return self.near / 2 + self.radius
+
+    @property
+    def of_companion(self) -> float:
+        """How far its points are from κ∇v, at most."""
+        return float((self.far + np.sqrt(self.far**2 + 4 * self.contact)) / 2)
+
+
+def _bracket(total: Totals, ball: _Ball, hidden: float, rounding: float) -> tuple[float, float]:
+    """Two numbers with J(u) between them: J(v) is above it, by the gap at most.
+
+    Args:
+        total: The integrals over all ranks' cells.
+        ball: What the gap is made of.
+        hidden: What quadrature may have missed of J(v).
+        rounding: What rounding may do to norms.
+    """
+    steep, energy = total.steepness, total.energy
+    unsure = hidden + total.energy_slack
+    unsure += rounding * (2.0 * np.sqrt(steep) + rounding) + 1e-14 * (steep + abs(energy))
+    return float(energy - unsure - ball.far**2 / 2 - ball.contact), float(energy + unsure)
+
+
+def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
+    """Keep what y and v are made of, and the ball, lift being ℓ's norm."""
+    flux, certain, segments, alpha = known.flux, known.certain, known.segments, v.boundary.alpha
+    missed = 0.0 if certain.missed is None else float(certain.missed.sum())
+    return Made(
+        level=known.level,
+        w=known.w,
+        kappa=known.kappa.mean,
+        stretch=known.cells.stretch,
+        hats=certain.load.hats,
+        segments=segments,
+        varies=known.kappa.varies,
+        excess=flux.excess,
+        beyond=flux.beyond,
+        vertices=v.vertices,
+        bumps=v.bumps,
+        thirds=v.thirds,
+        cusps=v.cusps,
+        reaction=known.reaction,
+        left=flux.left,
+        taken_up=flux.taken_up,
+        shed=flux.shed,
+        forces=_forces(alpha, flux),
+        missed=float(segments.missed.sum()) + missed,
+        reach=float(ball.bound - ball.near / 2 + ball.loose + lift / 2),
+        loose=float(ball.loose + lift),
+        lift=v.lift,
+        bounded=alpha.side.dofs,
     )
 
 
 def _forces(alpha: OnParts, flux: Flux) -> dict[int, float]:
-    """This rank's share of the contact force on each part, by the part's number."""
+    """Return this rank's share of the contact force on each part, by the part's number."""
     found: dict[int, float] = {}
     first = 0
     for part in alpha.parts:
@@ -440,7 +499,7 @@ def _forces(alpha: OnParts, flux: Flux) -> dict[int, float]:
 
 
 def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
-    """About how large the bound will be: ‖p‖, but for κ within cells; collective.
+    """Estimate the bound: ‖p‖, but for κ within cells; collective.
 
     Where that is next to nothing, as without a load, the jumps of u_h tell.
     """
@@ -472,7 +531,7 @@ def _rounding(
     load: VolumeMoments,
     flux: Flux,
 ) -> float:
-    """What rounding may do to ‖p ± b‖; collective.
+    """Bound what rounding may do to ‖p ± b‖; collective.
 
     Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
     is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
@@ -499,7 +558,7 @@ def _rounding(
 
 
 def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
-    """What quadrature may have missed of f and g: its shares of ω and of J(v); collective.
+    """Bound what quadrature may have missed of f and g: shares of ω and of J(v); collective.
 
     On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
     on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise. Whatever the signs of the first
@@ -536,7 +595,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
 
 
 def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, float, float]:
-    """Bounds of what ℓ changes, this rank's shares.
+    """Bound what ℓ changes, this rank's shares.
 
     Returns:
         ℓ's energy norm squared, how far J(v + ℓ) may be from J(v), and what ‖p − b‖² and ‖p + b‖²
@@ -545,25 +604,19 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     at, slope, size, edge = v.lift
     if not len(at):
         return 0.0, 0.0, 0.0, 0.0
-    cells, kappa, certain, reaction = known.cells, known.kappa, known.certain, known.reaction
+    cells, kappa = known.cells, known.kappa
     which, place = np.unique(at, return_inverse=True)
     high = kappa.most[which] if kappa.most.ndim else kappa.most
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
-    load = certain.load
-    f = np.abs(load.mean[which])
-    if load.variance is not None:
-        f = np.hypot(f, np.sqrt(load.variance[which]))
-    if certain.rough is not None:
-        f += certain.rough[which] / np.sqrt(cells.volume[which])
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
-    change = before * steep + np.sqrt(cells.volume[which]) * f * area
+    change = before * steep + np.sqrt(cells.volume[which]) * _mean_square(known, which) * area
     if sums.apart is not None:
-        c = pick(reaction, which)
+        c = pick(known.reaction, which)
         steep = np.hypot(steep, np.sqrt(c) * area)
         change += np.sqrt(c * sums.apart[which]) * area
     # on facets of Γ1 with a flux that is known
     loss, known_flux, apart = known.segments.at_facets(v.vertices, v.bumps, known.w)
-    there, on_contact = v.boundary.alpha.side.dofs, place[-len(edge) :] if len(edge) else place[:0]
+    there, on_contact = v.boundary.alpha.side.dofs, place[len(place) - len(edge) :]
     more = edge * (known_flux[there] + loss[there] * apart[there])
     change += np.bincount(on_contact, more, minlength=len(which))
     steep = steep + np.bincount(on_contact, np.sqrt(loss[there]) * edge, minlength=len(which))
@@ -578,3 +631,14 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     sums.middle[which] = np.maximum(sums.middle[which], 0.0) + near
     sums.indicators[which] += steep**2
     return float(np.sum(steep**2)), float(np.sum(change)), float(np.sum(far)), float(np.sum(near))
+
+
+def _mean_square(known: _Known, which: IndexArray) -> FloatArray:
+    """Bound |T|^{-1/2}‖f − c u_h‖_T on some cells, shape (n,)."""
+    load, rough = known.certain.load, known.certain.rough
+    f = np.abs(load.mean[which])
+    if load.variance is not None:
+        f = np.hypot(f, np.sqrt(load.variance[which]))
+    if rough is not None:
+        f += rough[which] / np.sqrt(known.cells.volume[which])
+    return f

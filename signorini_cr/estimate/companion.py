@@ -23,6 +23,7 @@ from ..data.moments import OnFacets, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, sum_rows
 from ..fem.conditions import number
 from .cusps import Cusps
+from .descent import descend, nonzero
 from .flux import Flux
 from .lifting import Cubic, Lift, affine, joined, lift
 from .nearest import Slopes, nearest
@@ -65,7 +66,7 @@ class Masses:
     strong: BoolArray
 
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
-        """Add what heights of bumps are pulled by, in units of 8/3, shape (3, n)."""
+        """Return what c pulls heights of bumps by, in units of 8/3, shape (3, n)."""
         return (
             pick(self.reaction, part)
             * cells.volume[part]
@@ -74,9 +75,35 @@ class Masses:
         )
 
     def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
-        """The same of b, on its facets."""
+        """Return the same of b, on its facets."""
         ends = excess[others[self.side.local].T, self.side.cells] - self.toward[:2]
         return self.loss * (0.4 * self.toward[2] - 0.25 * ends.sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Functional:
+    """What v is to make small: E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses.
+
+    Attributes:
+        cells: The mesh.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        kappa: Mean of κ, shape (cells,) or ().
+        steady: Where κ is constant on the cell, shape (cells,) or ().
+        masses: What E has beside gradients.
+    """
+
+    cells: Cells
+    w: FloatArray
+    kappa: FloatArray
+    steady: BoolArray
+    masses: Masses
+
+    def excess(self, v: FloatArray) -> FloatArray:
+        """Return v − u_h at the cells' vertices from v at the vertices, shape (d + 1, cells)."""
+        out = np.empty_like(self.w)
+        for part in blocks(self.cells.number):
+            np.subtract(v[self.cells.vertices[:, part]], self.w[:, part], out=out[:, part])
+        return out
 
 
 @dataclass(eq=False)
@@ -200,89 +227,113 @@ def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArr
 
 
 def companion(
-    cells: Cells,
-    kappa: FloatArray,
-    w: FloatArray,
-    u: FloatArray,
+    functional: Functional,
     flux: Flux,
     u_D: OnParts,
     alpha: OnParts,
     sweeps: int,
-    steady: BoolArray,
     goal: float,
     highest: float,
-    masses: Masses,
 ) -> Companion:
-    """Make v.
+    """Make v; collective.
 
     Args:
-        cells: The mesh.
-        kappa: Mean of κ, shape (cells,) or ().
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        u: u_h by facet dof.
+        functional: What it is to make small.
         flux: y.
         u_D: Values on Γ0, seen from the cells.
         alpha: Obstacle on Γ1, seen from the cells.
         sweeps: How often the bumps are improved.
-        steady: Where κ is constant on the cell, shape (cells,) or ().
         goal: What ‖∇ℓ‖ need not be known better than.
         highest: The largest κ.
-        masses: What E has beside gradients.
     """
-    fixed, contact = u_D.side, alpha.side
-    floors, signs = Floors.of(cells, alpha, masses), alpha.signs
-    v, held = _at_vertices(cells, kappa, masses, w, u_D, floors, flux)
-    scale = max(1e-300, float(np.abs(v).max(initial=0.0)))
-    scale = max(cells.comm.allgather(scale))
-    wrong = [
-        JUMP
-        if differs(cells, fixed, np.abs(v[fixed.ends] - u_D.ends), scale, *u_D.traces)
-        else None,
-        BELOW
-        if differs(
-            cells, contact, alpha.ends - signs * v[contact.ends], scale, *u_D.traces, *alpha.traces
-        )
-        else None,
-    ]
-    bumps = np.zeros(len(u))
-    free = np.ones(len(u), dtype=bool)
+    cells, floors = functional.cells, Floors.of(functional.cells, alpha, functional.masses)
+    draft = _started(functional, u_D, floors, flux)
+    largest = max(1e-300, float(np.abs(draft.vertices).max(initial=0.0)))
+    boundary = Boundary(u_D, alpha, max(cells.comm.allgather(largest)), goal, highest)
+    wrong = boundary.contradictions(cells, draft.vertices)
+    excess, cusps = functional.excess(draft.vertices), None
+    if cells.tdim == 2 and sweeps > 0:
+        poor = _improved(functional, draft, excess, u_D.side, floors, sweeps)
+        if poor and not functional.masses.some:
+            draft.vertices, draft.bumps, cusps = _solved(functional, draft, floors)
+            excess = functional.excess(draft.vertices)
+    above, lifts, reasons = boundary.lifted(
+        cells, flux, draft.vertices, draft.bumps, np.zeros(len(draft.bumps))
+    )
+    words = [word for rank in cells.comm.allgather(wrong + reasons) for word in rank if word]
+    reason = words[0] if words else None
+    return Companion(draft.vertices, draft.bumps, excess, above, lifts, reason, boundary, cusps)
+
+
+@dataclass(eq=False)
+class Draft:
+    """v on the way.
+
+    Attributes:
+        vertices: v at the vertices, ghosts included.
+        bumps: Heights of v's bumps by facet dof, ghosts included.
+        loose: Which values at vertices may be changed.
+        free: Which heights may be changed.
+    """
+
+    vertices: FloatArray
+    bumps: FloatArray
+    loose: BoolArray
+    free: BoolArray
+
+
+def _started(functional: Functional, u_D: OnParts, floors: Floors, flux: Flux) -> Draft:
+    """Make a v that is admissible, with bumps where data ask for them; collective.
+
+    Args:
+        functional: What v is to make small.
+        u_D: Values on Γ0, seen from the cells.
+        floors: What the bounds ask of v.
+        flux: y, which knows where there is contact.
+    """
+    cells, fixed, contact = functional.cells, u_D.side, floors.side
+    v, touching = _at_vertices(functional, u_D, floors, flux)
+    held = np.zeros(len(v))
+    held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
+    bumps, taken = np.zeros((2, floors.facets))
     if cells.tdim == 2:
-        free[fixed.dofs] = False
         ranges = floors.heights(v)
-        free[contact.dofs[held]] = False
         bumps = np.clip(0.0, *ranges)
         bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
-        ends = np.where(signs > 0.0, *(limit[contact.dofs] for limit in ranges))
-        bumps[contact.dofs[held]] = ends[held]
-        # A facet's values reach the ranks that share it
-        if cells.comm.size > 1:
-            cells.share(bumps)
-            taken = np.zeros(len(u))
-            taken[~free] = 1.0
-            free = cells.share(taken) == 0.0
-    excess = np.empty_like(w)
-    for part in blocks(cells.number):
-        np.subtract(v[cells.vertices[:, part]], w[:, part], out=excess[:, part])
-    cusps = None
-    if cells.tdim == 2 and sweeps > 0:
-        energy, promise = _sweep(
-            cells, kappa, masses, excess, bumps, free, (fixed, contact), sweeps
-        )
-        bumps[contact.dofs] = np.clip(bumps, *ranges)[contact.dofs]
-        marks = np.zeros(len(v))
-        marks[fixed.ends] = marks[contact.ends[:, held]] = 1.0
-        loose = cells.share(marks, 0) == 0.0
-        promise += _promise(cells, kappa, excess, bumps, loose)
-        if promise > PROMISE * energy and not masses.some:
-            v[:], bumps[:], cusps = _solved(
-                cells, kappa, steady, w, (v, bumps), (loose, free), floors
-            )
-            excess = v[cells.vertices] - w
-    boundary = Boundary(u_D, alpha, scale, goal, highest)
-    above, lifts, reasons = boundary.lifted(cells, flux, v, bumps, np.zeros(len(u)))
-    words = [word for word in (*wrong, *reasons) if word]
-    words = [word for rank in cells.comm.allgather(words) for word in rank]
-    return Companion(v, bumps, excess, above, lifts, words[0] if words else None, boundary, cusps)
+        ends = np.where(floors.signs > 0.0, *(limit[contact.dofs] for limit in ranges))
+        bumps[contact.dofs[touching]] = ends[touching]
+        taken[fixed.dofs] = taken[contact.dofs[touching]] = 1.0
+        # a facet's values reach the ranks that share it
+        cells.share(bumps)
+    return Draft(v, bumps, cells.share(held, 0) == 0.0, cells.share(taken) == 0.0)
+
+
+def _improved(
+    functional: Functional,
+    draft: Draft,
+    excess: FloatArray,
+    fixed: BoundaryFacets,
+    floors: Floors,
+    sweeps: int,
+) -> bool:
+    """Improve the bumps, d = 2; collective.
+
+    Args:
+        functional: What v is to make small.
+        draft: v, of which the heights are changed.
+        excess: v − u_h at the cells' vertices without the bumps, shape (3, cells).
+        fixed: The facets of Γ0.
+        floors: What the bounds ask of v.
+        sweeps: How often.
+
+    Returns:
+        Whether much would be gained by solving for v.
+    """
+    contact, bumps = floors.side, draft.bumps
+    energy, promise = _sweep(functional, excess, bumps, draft.free, (fixed, contact), sweeps)
+    bumps[contact.dofs] = np.clip(bumps, *floors.heights(draft.vertices))[contact.dofs]
+    promise += _promise(functional.cells, functional.kappa, excess, bumps, draft.loose)
+    return promise > PROMISE * energy
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,6 +353,15 @@ class Boundary:
     scale: float
     goal: float
     highest: float
+
+    def contradictions(self, cells: Cells, v: FloatArray) -> list[str | None]:
+        """Tell which data no function can satisfy, from v at the vertices; this rank's facets."""
+        fixed, contact, u_D, alpha = self.u_D.side, self.alpha.side, self.u_D, self.alpha
+        jump = np.abs(v[fixed.ends] - u_D.ends)
+        below = alpha.ends - alpha.signs * v[contact.ends]
+        jumps = differs(cells, fixed, jump, self.scale, *u_D.traces)
+        is_below = differs(cells, contact, below, self.scale, *u_D.traces, *alpha.traces)
+        return [JUMP if jumps else None, BELOW if is_below else None]
 
     def lifted(
         self, cells: Cells, flux: Flux, v: FloatArray, bumps: FloatArray, thirds: FloatArray
@@ -335,19 +395,14 @@ class Boundary:
 
 
 def _at_vertices(
-    cells: Cells,
-    kappa: FloatArray,
-    masses: Masses,
-    w: FloatArray,
-    u_D: OnParts,
-    floors: Floors,
-    flux: Flux,
+    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux
 ) -> tuple[FloatArray, BoolArray]:
     """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D.
 
     Returns:
         They, and on which facets of Γ1 they are α or β at both ends, and the bump should be theirs.
     """
+    cells, w, kappa, masses = functional.cells, functional.w, functional.kappa, functional.masses
     index_map = cells.domain.mesh.topology.index_map(0)
     size = index_map.size_local + index_map.num_ghosts
     flat = cells.vertices.ravel()
@@ -355,8 +410,6 @@ def _at_vertices(
     def collect(where: Any, values: Any) -> FloatArray:
         return cells.share(np.bincount(where, values, minlength=size).astype(np.float64), 0)
 
-    loss = np.zeros(len(cells.exterior))
-    loss[masses.side.dofs] = masses.loss
     if kappa.ndim or masses.some:
         weights = np.tile(kappa + masses.reaction * cells.volume, (len(w), 1))
         moved = np.zeros_like(weights)
@@ -368,21 +421,22 @@ def _at_vertices(
     else:
         v = collect(flat, w.ravel())
         v /= np.maximum(collect(flat, None), 1.0)
-    at_bound = flux.touching.copy()
+    at_bound, loss = flux.touching.copy(), np.zeros(floors.facets)
+    loss[masses.side.dofs] = masses.loss
     for sign, limit in floors.at_vertices:
         here = flux.touching & (floors.signs == sign)
         there = floors.side.ends[:, here]
         held = collect(there.ravel(), None) > 0
         if masses.some:
-            # what leaving u_h for α costs in ‖p − b‖², and what not doing so costs in 4C
+            # what leaving t/b for α costs in ‖p − b‖², and what not doing so costs in 4C
             of_b, of_force = (
                 collect(there.ravel(), np.tile(each[here], len(there)))
                 for each in (loss[floors.side.dofs], 2.0 * (cells.tdim + 1) * flux.contact)
             )
             held &= of_b * np.where(held, sign * v - limit, 0.0) <= of_force
+        at_bound[here] = held[there].all(axis=0)
         moved = np.where(held, limit, np.maximum(sign * v, limit))
         np.copyto(v, sign * moved, where=limit > -np.inf)
-        at_bound[here] = held[there].all(axis=0)
     ends = u_D.side.ends.ravel()
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ends.ravel()) / np.maximum(count, 1.0), where=count > 0)
@@ -390,32 +444,23 @@ def _at_vertices(
 
 
 def _solved(
-    cells: Cells,
-    kappa: FloatArray,
-    steady: BoolArray,
-    w: FloatArray,
-    start: tuple[FloatArray, FloatArray],
-    loosened: tuple[BoolArray, BoolArray],
-    floors: Floors,
+    functional: Functional, draft: Draft, floors: Floors
 ) -> tuple[FloatArray, FloatArray, Cusps | None]:
-    """The best v of degree 2, with cusps where they are called for, by solving; collective.
+    """Solve for the best v of degree 2, with cusps where they are called for; collective.
 
     Args:
-        cells: The mesh.
-        kappa: Mean of κ, shape (cells,) or ().
-        steady: Where κ is constant on the cell, shape (cells,) or ().
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        start: v at the vertices and the heights of its bumps, to begin with.
-        loosened: Which values at vertices and which heights may be changed.
+        functional: What v is to make small.
+        draft: v to begin with, and what of it may be changed.
         floors: What the bounds ask of v.
 
     Returns:
         v at the vertices, the heights, and the cusps.
     """
-    (v, bumps), (loose, free), bounded = start, loosened, floors.side.dofs
+    cells, kappa, bounded = functional.cells, functional.kappa, floors.side.dofs
+    v, bumps, loose, free = draft.vertices, draft.bumps, draft.loose, draft.free
     cusps: Cusps | None = None
     best = v, bumps, cusps
-    slopes = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
+    slopes = Slopes.of(cells, kappa, functional.excess(v), bumps)
     least = cells.total(np.sum(slopes.energies))[0]
     for turn in range(ROUNDS):
         step = nearest(cells, kappa, slopes, loose, free)
@@ -430,10 +475,10 @@ def _solved(
         bumps[bounded] = np.clip(bumps, low, high)[bounded]
         free[out] = False
         loose = loose & ~down
-        excess = v[cells.vertices] - w
+        excess = functional.excess(v)
         slopes = Slopes.of(cells, kappa, excess, bumps)
         if turn == 0:
-            cusps = Cusps.of(cells, kappa, steady, slopes.energies)
+            cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
         if cusps is not None:
             cusps = cusps.fitted(cells, excess, bumps)
             slopes.energies[cusps.at] += cusps.gains(cells, excess, bumps)
@@ -450,21 +495,17 @@ def _solved(
 
 
 def _sweep(
-    cells: Cells,
-    kappa: FloatArray,
-    masses: Masses,
+    functional: Functional,
     excess: FloatArray,
     bumps: FloatArray,
     free: BoolArray,
     bumped: tuple[BoundaryFacets, ...],
     steps: int,
 ) -> tuple[float, float]:
-    """Conjugate gradients for E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses in the heights of the bumps.
+    """Make E smaller by conjugate gradients in the heights of the bumps; collective.
 
     Args:
-        cells: The mesh.
-        kappa: Mean of κ, shape (cells,) or ().
-        masses: What E has beside that.
+        functional: E.
         excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
         bumps: Heights, improved in place.
         free: Which of them may be.
@@ -474,74 +515,124 @@ def _sweep(
     Returns:
         E, and what it would fall by if each height were put right as if it were alone.
     """
-    slope, diagonal = np.empty_like(excess), np.empty(cells.number)
-    energy, c, reacting = 0.0, masses.reaction, reacts(masses.reaction)
-    for part in blocks(cells.number):
-        k = pick(kappa, part)
-        diagonal[part] = k * cells.trace(part)
-        np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
-        energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
-        if reacting:
-            volume = pick(c, part) * cells.volume[part]
-            energy += float(np.sum(volume * distance(excess[:, part], None)))
-            slope[:, part] += masses.pull(cells, excess[:, part], part)
-            diagonal[part] += volume / 15.0
-    (first, last, height), at = masses.toward, (masses.side.local, masses.side.cells)
-    ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
-    energy += float(np.sum(masses.loss * distance(ends, None)))
-    energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
-    np.add.at(slope, at, masses.pull_on_facets(excess, cells.others))
-    lost = np.zeros(len(bumps))
-    lost[masses.side.dofs] = 0.4 * masses.loss
+    cells, held = functional.cells, np.flatnonzero(~free)
+    matrix = _OfHeights(functional)
+    energy, local = matrix.without_bumps(excess)
+    energy += matrix.with_bumps(bumps, bumped, local)
 
-    def image_of(height: FloatArray, part: slice | IndexArray) -> FloatArray:
-        """The matrix of E, but for b, times heights of local bumps, which are lost."""
-        image = _across(cells, height, part)
-        image *= 2.0 * pick(kappa, part)
-        if reacting:
-            image += pick(c, part) * cells.volume[part] / 15.0 * sum_rows(height)
-        height *= diagonal[part]
+    def assembled(local: FloatArray) -> FloatArray:
+        out = cells.over_facets(local)
+        out[held] = 0.0
+        return out
+
+    def image(way: FloatArray) -> FloatArray:
+        matrix.multiply(way, local)
+        return assembled(local)
+
+    down = assembled(local)
+    fall, square = descend(cells, image, bumps, down, matrix.diagonal(), steps)
+    return float(cells.total(energy)[0] - 4 / 3 * fall), float(4 / 3 * square)
+
+
+class _OfHeights:
+    """E as a quadratic functional of the heights of bumps, in units of 4/3.
+
+    On a cell its matrix is 2κ|T| ∇λ_i·∇λ_j outside the diagonal and κ|T| Σ|∇λ_k|² on it, and to
+    each entry c|T|/15 is added, on the diagonal twice.
+
+    Attributes:
+        functional: E.
+        own: κ|T| Σ|∇λ_k|² + c|T|/15, shape (cells,).
+        lost: What b adds to the diagonal, by facet dof.
+        at: Local numbers and cells of the facets with a b.
+    """
+
+    def __init__(self, functional: Functional):
+        """Take what is on the diagonal."""
+        cells, masses = functional.cells, functional.masses
+        self.functional, self.own = functional, np.empty(cells.number)
+        self.lost = np.zeros(len(cells.exterior))
+        self.lost[masses.side.dofs] = 0.4 * masses.loss
+        self.at = masses.side.local, masses.side.cells
+        self._reacts = reacts(masses.reaction)
+        for part in blocks(cells.number):
+            self.own[part] = pick(functional.kappa, part) * cells.trace(part)
+            if self._reacts:
+                self.own[part] += self._mass(part) / 15.0
+
+    def _mass(self, part: slice | IndexArray) -> FloatArray:
+        """c|T|, shape (n,)."""
+        cells, c = self.functional.cells, self.functional.masses.reaction
+        return np.asarray(pick(c, part) * cells.volume[part])
+
+    def without_bumps(self, excess: FloatArray) -> tuple[float, FloatArray]:
+        """Return E for no bumps, this rank's share, and −½ its slope on each cell.
+
+        Args:
+            excess: v − u_h at the cells' vertices, shape (3, cells).
+        """
+        cells, kappa, masses = self.functional.cells, self.functional.kappa, self.functional.masses
+        slope, energy = np.empty_like(excess), 0.0
+        for part in blocks(cells.number):
+            k = pick(kappa, part)
+            np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
+            energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
+            if self._reacts:
+                mass = self._mass(part)
+                energy += float(np.sum(mass * distance(excess[:, part], None)))
+                slope[:, part] += masses.pull(cells, excess[:, part], part)
+        first, last, height = masses.toward
+        ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
+        energy += float(np.sum(masses.loss * distance(ends, None)))
+        energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
+        np.add.at(slope, self.at, masses.pull_on_facets(excess, cells.others))
+        return energy, slope
+
+    def with_bumps(
+        self, bumps: FloatArray, bumped: tuple[BoundaryFacets, ...], slope: FloatArray
+    ) -> float:
+        """Return what E changes by with some bumps, this rank's share.
+
+        Args:
+            bumps: Heights by facet dof.
+            bumped: The facets on which there are some.
+            slope: −½ E's slope on each cell, shape (3, cells), changed in place.
+        """
+        cells, side = self.functional.cells, self.functional.masses.side
+        near = np.unique(np.concatenate([each.cells for each in (*bumped, side)]))
+        flow, height = slope[:, near], bumps[cells.facets[:, near]]
+        change = self._times(height.copy(), near)
+        slope[:, near] = flow - change
+        energy = -4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
+        lost, height = self.lost[side.dofs], bumps[side.dofs]
+        np.subtract.at(slope, self.at, lost * height)
+        return energy + 4 / 3 * float(np.sum(lost * height**2))
+
+    def multiply(self, heights: FloatArray, out: FloatArray) -> None:
+        """Put the cells' matrices times heights by facet dof into an array, shape (3, cells)."""
+        cells, side = self.functional.cells, self.functional.masses.side
+        for part in blocks(cells.number):
+            out[:, part] = self._times(heights[cells.facets[:, part]], part)
+        np.add.at(out, self.at, self.lost[side.dofs] * heights[side.dofs])
+
+    def _times(self, height: FloatArray, part: slice | IndexArray) -> FloatArray:
+        """The matrices, but for b, times heights of local bumps, which are lost."""
+        image = _across(self.functional.cells, height, part)
+        image *= 2.0 * pick(self.functional.kappa, part)
+        if self._reacts:
+            image += self._mass(part) / 15.0 * sum_rows(height)
+        height *= self.own[part]
         image += height
         return image
 
-    near = np.unique(np.concatenate([side.cells for side in (*bumped, masses.side)]))
-    flow, height = slope[:, near], bumps[cells.facets[:, near]]
-    change = image_of(height.copy(), near)
-    slope[:, near] = flow - change
-    energy -= 4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
-    on_lossy = bumps[masses.side.dofs]
-    energy += 4 / 3 * float(np.sum(lost[masses.side.dofs] * on_lossy**2))
-    np.subtract.at(slope, at, lost[masses.side.dofs] * on_lossy)
-    held = np.flatnonzero(~free)
-    down = cells.over_facets(slope)
-    down[held] = 0.0
-    weight = np.tile(diagonal, (len(excess), 1))
-    if reacting:
-        weight += c * cells.volume / 15.0
-    np.add.at(weight, at, lost[masses.side.dofs])
-    weight = cells.over_facets(weight)
-    weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
-    owned = slice(cells.owned_facets())
-    way = down / weight
-    energy, square = cells.total(energy, down[owned] @ way[owned])
-    for _ in range(steps):
-        if not square > 0:
-            break
-        for part in blocks(cells.number):
-            slope[:, part] = image_of(way[cells.facets[:, part]], part)
-        np.add.at(slope, at, lost[masses.side.dofs] * way[masses.side.dofs])
-        image = cells.over_facets(slope)
-        image[held] = 0.0
-        length = square / cells.total(way[owned] @ image[owned])[0]
-        bumps += length * way
-        image *= length
-        down -= image
-        energy -= 4 / 3 * length * square
-        straight = down / weight
-        before, square = square, cells.total(down[owned] @ straight[owned])[0]
-        way *= square / before
-        way += straight
-    return float(energy), float(4 / 3 * square)
+    def diagonal(self) -> FloatArray:
+        """The diagonal by facet dof; collective."""
+        cells = self.functional.cells
+        local = np.tile(self.own, (3, 1))
+        if self._reacts:
+            local += self._mass(slice(0, cells.number)) / 15.0
+        np.add.at(local, self.at, self.lost[self.functional.masses.side.dofs])
+        return nonzero(cells.over_facets(local))
 
 
 def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
@@ -563,7 +654,7 @@ def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
 def _promise(
     cells: Cells, kappa: FloatArray, excess: FloatArray, bumps: FloatArray, loose: BoolArray
 ) -> float:
-    """What ‖κ^{1/2}(∇v − ∇u_h)‖² would fall by if each vertex were put right as if it were alone.
+    """Return what ‖κ^{1/2}(∇v − ∇u_h)‖² would fall by if each vertex were put right alone.
 
     Args:
         cells: The mesh.

@@ -83,7 +83,7 @@ def _of_data(data: OnFacets) -> FloatArray:
 
 
 def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> FloatArray:
-    """What brings ∇v nearest to ∇u_h, to be added to the heights of inner facets; collective."""
+    """Find what brings ∇v nearest to ∇u_h, to be added to inner facets' heights; collective."""
     hats, weights = quadrature()
     matrix, pull = np.zeros((3, 3, cells.number)), np.zeros((3, cells.number))
     for part in blocks(cells.number):

@@ -31,7 +31,7 @@ HELD = 0.1
 
 
 def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
-    """Whether y on thin cells makes up much of the bound; collective.
+    """Tell whether y on thin cells makes up much of the bound; collective.
 
     Args:
         cells: The mesh.

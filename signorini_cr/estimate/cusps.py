@@ -170,7 +170,7 @@ class Cusps:
         return out
 
     def gains(self, cells: Cells, excess: FloatArray, bumps: FloatArray) -> FloatArray:
-        """What ψ adds to ∫_T κ|∇(v − u_h)|², mostly less than 0, shape (n,)."""
+        """Return what ψ adds to ∫_T κ|∇(v − u_h)|², mostly less than 0, shape (n,)."""
         return self._products(cells, 2.0 * self.before(cells, excess, bumps) + self.slope)
 
     def pulls(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
@@ -262,7 +262,7 @@ def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _vertices(cells: Cells, steady: BoolArray, energies: FloatArray) -> BoolArray | None:
-    """Which local vertices get a cusp; None if none do on any rank."""
+    """Choose the local vertices that get a cusp; None if none do on any rank."""
     total = cells.total(np.sum(energies))[0]
     around = cells.over_vertices(np.tile(energies, (cells.tdim + 1, 1)))
     unsteady = cells.over_vertices(np.tile(~steady, (cells.tdim + 1, 1)).astype(np.float64))

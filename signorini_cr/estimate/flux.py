@@ -18,7 +18,9 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import NOTHING, Known, VolumeMoments, reacts, to_cells
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..vi.active import touching
 from .beyond import Beyond
+from .descent import descend, nonzero
 
 if TYPE_CHECKING:
     from ..vi.level import Level
@@ -104,12 +106,11 @@ def equilibrate(
     for part in blocks(cells.number):
         excess[:, part] -= half[cells.facets[:, part]]
     there = on_contact.local, on_contact.cells
-    # In contact: the primal-dual criterion with the facet's diagonal entry of A
     diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
     force, through = fluxes[there] - known[on_contact.dofs], known[on_contact.dofs]
     force *= signs
-    touching = force > np.maximum(diagonal * gap, 0.0)
-    contact = np.where(touching, force, 0.0)
+    in_contact = touching(gap, force, diagonal)
+    contact = np.where(in_contact, force, 0.0)
     excess[there] += through - fluxes[there]
     np.add.at(excess, there, signs * contact)
     natural = ~edge.bounded
@@ -117,7 +118,7 @@ def equilibrate(
     excess[there] += known[side.dofs[natural]] - fluxes[there]
     left = sum_rows(excess)
     left += cells.volume * load.mean
-    return Flux(excess, contact, touching, left, steepness)
+    return Flux(excess, contact, in_contact, left, steepness)
 
 
 def relax(
@@ -155,63 +156,114 @@ def relax(
     if cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
         return None
     takers = np.broadcast_to(reaction > 0.0, cells.number)
-    held, lossy = cells.exterior.astype(np.float64), np.zeros(len(cells.exterior))
+    # in contact the force takes up what changes, and b nothing
+    loss, in_contact = np.zeros(len(cells.exterior)), on_contact.dofs[flux.touching]
+    loss[edge.side.dofs] = edge.loss
+    loss[in_contact] = 0.0
+    held = cells.exterior.astype(np.float64)
     for part in cells.fixed:
         held[cells.sides[part].dofs] = 0.0
-    lossy[edge.side.dofs] = edge.loss
-    touched = on_contact.dofs[flux.touching]
-    held[on_contact.dofs] = lossy[on_contact.dofs] == 0.0
-    held[touched] = lossy[touched] = 0.0
+    held[on_contact.dofs] = loss[on_contact.dofs] == 0.0
+    held[in_contact] = 0.0
     if reaction.ndim:
         held[cells.facets[:, ~takers]] = 1.0
-    sides = edge.side.local, edge.side.cells
-    loss = lossy[edge.side.dofs] * measures(cells, edge.side)
-    of_edge = np.divide(1.0, loss, out=np.zeros_like(loss), where=loss > 0.0)
     free = cells.share(held) == 0.0
-    owned, mass = slice(cells.owned_facets()), reaction * cells.volume
-    weight = np.divide(1.0, mass, out=np.zeros_like(mass), where=takers)
-    # a flux counts as positive out of one of the facet's two cells, the same on all ranks
-    sign = cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]])
-
-    def slopes(P: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
-        local = _field_slopes(cells, P) / kappa + weight * left
-        np.add.at(local, sides, of_edge * shed)
-        return sign * local
+    squares = _Relaxed.of(cells, kappa, reaction, edge.side, loss)
 
     def assembled(local: FloatArray) -> FloatArray:
         return np.where(free, cells.over_facets(local), 0.0)
 
-    units = np.eye(3)[:, :, None] * np.ones(cells.number)
-    scale = np.stack([field_squares(cells, unit) for unit in units]) / kappa + weight
-    np.add.at(scale, sides, of_edge)
-    scale = cells.over_facets(scale)
-    scale[scale == 0.0] = 1.0  # no cell of this rank has the facet
-    down = -assembled(slopes(flux.excess, flux.left, np.zeros_like(loss)))
-    change, way = np.zeros_like(down), np.zeros_like(down)
-    before = first = np.inf
-    for _ in range(STEPS):
-        straight = down / scale
-        now = float(cells.total(down[owned] @ straight[owned])[0])
-        first = min(first, now)
-        if not now > RELAXED * first:
-            break
-        way = straight + now / before * way
-        fluxes = sign * way[cells.facets]
-        image = assembled(slopes(fluxes, sum_rows(fluxes), fluxes[sides]))
-        step = now / float(cells.total(way[owned] @ image[owned])[0])
-        change += step * way
-        down -= step * image
-        before = now
-    fluxes = sign * change[cells.facets]
+    def image(way: FloatArray) -> FloatArray:
+        fluxes = squares.sign * way[cells.facets]
+        return assembled(squares.slopes(fluxes, sum_rows(fluxes), fluxes[squares.sides]))
+
+    down = -assembled(squares.slopes(flux.excess, flux.left, np.zeros(len(edge.loss))))
+    change = np.zeros_like(down)
+    descend(cells, image, change, down, squares.diagonal(), STEPS)
+    fluxes = squares.sign * change[cells.facets]
     there = on_contact.local[flux.touching], on_contact.cells[flux.touching]
-    off = signs[flux.touching]
-    force = np.maximum(flux.contact[flux.touching] + off * fluxes[there], 0.0)
-    fluxes[there] = off * (force - flux.contact[flux.touching])
+    off, before = signs[flux.touching], flux.contact[flux.touching]
+    force = np.maximum(before + off * fluxes[there], 0.0)
+    fluxes[there] = off * (force - before)
     flux.contact[flux.touching] = force
-    flux.shed = np.where(loss > 0.0, -fluxes[sides], 0.0)
+    flux.shed = np.where(squares.of_edge > 0.0, -fluxes[squares.sides], 0.0)
     flux.excess += fluxes
     flux.left += sum_rows(fluxes)
     return takers
+
+
+@dataclass(frozen=True, eq=False)
+class _Relaxed:
+    """The sum of squares that `relax` makes small, as a functional of fluxes.
+
+    Attributes:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        of_cells: 1/(c|T|), 0 where there is no c, shape (cells,).
+        sides: Local numbers and cells of facets with a g or a b.
+        of_edge: 1/(b|F|) on them, 0 where b takes up nothing, shape (n,).
+        sign: 1 where a flux that counts as positive leaves the cell, −1 where it enters, shape
+            (3, cells): of a facet's two cells it leaves one, the same on all ranks.
+    """
+
+    cells: Cells
+    kappa: FloatArray
+    of_cells: FloatArray
+    sides: tuple[IndexArray, IndexArray]
+    of_edge: FloatArray
+    sign: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        cells: Cells,
+        kappa: FloatArray,
+        reaction: FloatArray,
+        side: BoundaryFacets,
+        loss: FloatArray,
+    ) -> _Relaxed:
+        """Weigh what c and b take up.
+
+        Args:
+            cells: The mesh.
+            kappa: Mean of κ, shape (cells,) or ().
+            reaction: c, shape (cells,) or ().
+            side: Facets with a g or a b.
+            loss: b by facet dof, 0 where it takes up nothing.
+        """
+        return cls(
+            cells,
+            kappa,
+            _inverse(reaction * cells.volume),
+            (side.local, side.cells),
+            _inverse(loss[side.dofs] * measures(cells, side)),
+            cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]]),
+        )
+
+    def slopes(self, excess: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
+        """½ ∂ by the flux through each cell's facets, shape (3, cells).
+
+        Args:
+            excess: Fluxes of y − κ∇u_h out of the cells, shape (3, cells).
+            left: ∫_T (f + div y), shape (cells,).
+            shed: What y·n has beyond g − b u_h on the facets of `sides`, shape (n,).
+        """
+        local = _field_slopes(self.cells, excess) / self.kappa + self.of_cells * left
+        np.add.at(local, self.sides, self.of_edge * shed)
+        return self.sign * local
+
+    def diagonal(self) -> FloatArray:
+        """½ ∂² by each flux, by facet dof; collective."""
+        units = np.eye(3)[:, :, None] * np.ones(self.cells.number)
+        local = np.stack([field_squares(self.cells, unit) for unit in units]) / self.kappa
+        local += self.of_cells
+        np.add.at(local, self.sides, self.of_edge)
+        return nonzero(self.cells.over_facets(local))
+
+
+def _inverse(masses: FloatArray) -> FloatArray:
+    """1 over what is positive, 0 for the rest."""
+    return np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0.0)
 
 
 def _field_slopes(cells: Cells, fluxes: FloatArray) -> FloatArray:
@@ -301,8 +353,6 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
 
 STRONG = 3.0
 """c h_T²/κ from which on c takes up what y lacks."""
-RELAXED = 1e-8
-"""Part of the way, squared, at which the flux is good enough that need not balance the load."""
 STEPS = 30
 """Of conjugate gradients, for a small field of given divergence."""
 WORTH = 1e-3
@@ -368,7 +418,7 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     They are those of `equilibrate` for the load left_T/|T| and no contact. A few steps of conjugate
     gradients are enough where there are few cells, and of use on any mesh.
     """
-    d, owned = cells.tdim, cells.owned_facets()
+    d = cells.tdim
     fixed = np.zeros(len(cells.exterior))
     for part in cells.fixed:
         fixed[cells.sides[part].dofs] = 1.0
@@ -380,22 +430,11 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     def assembled(local: FloatArray) -> FloatArray:
         return np.where(free, cells.over_facets(local), 0.0)
 
-    def product(a: FloatArray, b: FloatArray) -> float:
-        return float(cells.total(a[:owned] @ b[:owned])[0])
-
     load = np.tile(left / (d + 1), (d + 1, 1))
-    diagonal = cells.over_facets(d**2 * kappa * cells.squares(slice(0, cells.number)))
-    r, before = assembled(load), np.inf
-    z, p = np.zeros_like(r), np.zeros_like(r)
-    for _ in range(STEPS):
-        s = r / diagonal
-        now = product(r, s)
-        if now == 0.0:
-            break
-        p = s + now / before * p
-        Ap = assembled(residuals(p))
-        step = now / product(p, Ap)
-        z, r, before = z + step * p, r - step * Ap, now
+    diagonal = nonzero(cells.over_facets(d**2 * kappa * cells.squares(slice(0, cells.number))))
+    down = assembled(load)
+    z = np.zeros_like(down)
+    descend(cells, lambda way: assembled(residuals(way)), z, down, diagonal, STEPS)
     fluxes = residuals(z) - load
     half = 0.5 * cells.over_facets(fluxes)
     half[cells.exterior] = 0.0

@@ -72,7 +72,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
 
 
 def flux(solution: Certified, *parts: str) -> Interval:
-    """What flows into Ω through parts of the boundary, between two numbers; collective.
+    """Put what flows into Ω through parts of the boundary between two numbers; collective.
 
     On a Dirichlet part that is ∫ κ∂ₙu, on a contact part the contact force, as in `force_bounds`.
 
@@ -95,7 +95,7 @@ def flux(solution: Certified, *parts: str) -> Interval:
 
 
 def _certified(solution: Certified) -> Made:
-    """What the certificate is made of; an error where there is none."""
+    """Return what the certificate is made of; an error where there is none."""
     certificate = solution.certificate
     if certificate._made is None or certificate.bound_h1 is None:
         raise InputError(f"{NO_BOUNDS}: {certificate.reason}")
@@ -201,7 +201,7 @@ def square(made: Made, cells: Cells, at: FloatArray) -> float:
 
 
 def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
-    """About a in P1, with data in functions: the same form for all problems, compiled once."""
+    """Return about a in P1, with data in functions: one form for all problems, compiled once."""
     mesh, edge = V.mesh, made.segments
     constants = fem.functionspace(mesh, ("DG", 0))
     reaction, loss = fem.Function(constants), fem.Function(constants)

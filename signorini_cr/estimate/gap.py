@@ -492,7 +492,7 @@ def _add_loss(
 
 
 def _swollen(squares: FloatArray, more: FloatArray) -> FloatArray:
-    """What (a + b)² is at most above a² + b², a² and b² given."""
+    """Bound what (a + b)² has beyond a² + b², a² and b² given."""
     return 2.0 * np.sqrt(np.maximum(squares, 0.0) * more)
 
 
@@ -558,7 +558,7 @@ def _exact(
 def _by_quadrature(
     cells: Cells, kappa: Coefficient, part: slice, flux: Flux, v: Companion, w: FloatArray
 ) -> tuple[FloatArray, ...]:
-    """The same for any κ and any y, and how far it may be from the truth.
+    """Integrate the same for any κ and any y, and bound what that misses.
 
     Returns:
         The fields of `_Products`, in their order.
@@ -594,7 +594,7 @@ def _of_tensor(
     w: FloatArray,
     gap: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """What a tensor that varies within cells does to the gap.
+    """Bound what a tensor that varies within cells does to the gap.
 
     For F = y − κ∇z, z = v or 2u_h − v, and with N the root of the rule's ∫ |·|² / k where lengths
     are stretched, ‖κ^{-1/2}F‖ ≤ (1 − θ)^{-1/2} (N(F) + 2ϱ N(k∇z)): the rule is exact for the

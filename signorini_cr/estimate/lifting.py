@@ -263,7 +263,7 @@ def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
 def _jump_at_ends(
     trace: Trace, whole: Pieces, base: Cubic, cells: Cells, jump: float, obstacle: bool
 ) -> BoolArray:
-    """Where δ does not vanish at a facet's end: the data's limit there is not the value there."""
+    """Tell where δ does not vanish at a facet's end: the data's limit is not the value there."""
     found = np.zeros(len(whole.parent), dtype=bool)
     for end in (0, 1):
         corners = whole.corners.copy()

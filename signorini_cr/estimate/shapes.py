@@ -7,6 +7,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import Cells
+from .descent import descend, nonzero
 
 STEPS = 200
 """Of conjugate gradients, at most."""
@@ -53,20 +54,12 @@ def best_heights(cells: Cells, matrix: FloatArray, pull: FloatArray, free: BoolA
         pull: Those of the right side, shape (3, cells).
         free: Which heights need not be 0, by facet dof.
     """
+    diagonal = nonzero(cells.over_facets(np.stack([matrix[i, i] for i in range(3)])))
     down = cells.over_facets(pull) * free
-    weight = cells.over_facets(np.stack([matrix[i, i] for i in range(3)]))
-    weight[weight == 0.0] = 1.0  # no cell of this rank has the facet
-    owned, heights = slice(cells.owned_facets()), np.zeros_like(down)
-    way = down / weight
-    first = square = cells.total(down[owned] @ way[owned])[0]
-    for _ in range(STEPS):
-        if not square > SHARE * first:
-            break
-        image = cells.over_facets(np.einsum("ijn,jn->in", matrix, way[cells.facets])) * free
-        length = square / cells.total(way[owned] @ image[owned])[0]
-        heights += length * way
-        down -= length * image
-        straight = down / weight
-        before, square = square, cells.total(down[owned] @ straight[owned])[0]
-        way = straight + square / before * way
+    heights = np.zeros_like(down)
+
+    def image(way: FloatArray) -> FloatArray:
+        return cells.over_facets(np.einsum("ijn,jn->in", matrix, way[cells.facets])) * free
+
+    descend(cells, image, heights, down, diagonal, STEPS, SHARE)
     return heights

@@ -24,9 +24,16 @@ class Totals:
         load_flux: ∫ κ^{-1/2}σ·p.
         load_companion: ∫ κ^{-1/2}σ·b.
         slack: How far load_flux may be from the truth.
-        energy: ½∫ κ|∇v|² + c v² − ∫ f v.
+        energy: J(v) without ℓ: ½∫ κ|∇v|² + c v² − ∫ f v, and likewise on facets.
         energy_slack: How far this may be from the truth.
         neumann: The part of load that comes from g alone.
+        loose: Square of what g has beyond its means, where it does not count as load.
+        contact: The contact term.
+        lift: ‖κ^{1/2}∇ℓ‖², terms without gradients included.
+        lift_far: What ‖p − b‖² grows by with ℓ.
+        lift_near: The same of ‖p + b‖².
+        of_gradients: Bound of ‖κ^{-1/2}(p + κ^{-1/2}σ + b)‖².
+        steepness: ∫ κ|∇v|².
     """
 
     flux: float = 0.0
@@ -41,6 +48,13 @@ class Totals:
     energy: float = 0.0
     energy_slack: float = 0.0
     neumann: float = 0.0
+    loose: float = 0.0
+    contact: float = 0.0
+    lift: float = 0.0
+    lift_far: float = 0.0
+    lift_near: float = 0.0
+    of_gradients: float = 0.0
+    steepness: float = 0.0
 
     def over_ranks(self, cells: Cells) -> Totals:
         """The same of all ranks' cells; collective."""

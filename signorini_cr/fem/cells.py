@@ -14,12 +14,12 @@ from types import MappingProxyType
 
 import numpy as np
 from dolfinx import fem, la
-from petsc4py import PETSc
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import DIRICHLET, Domain
-from .space import facet_entities, ghosted, shared_sum
+from .space import facet_entities, largest, shared_sum
+from .space import measures as simplex_measures
 
 BLOCK = 1 << 14
 """Cells that are worked on at a time: as many as the processor's cache holds."""
@@ -314,12 +314,7 @@ class Cells:
         index_map = self.domain.mesh.topology.index_map(0)
         found: FloatArray = np.full(index_map.size_local + index_map.num_ghosts, -np.inf)
         np.maximum.at(found, ends, values)
-        if self.comm.size > 1:
-            vector = ghosted(self.comm, index_map, found)
-            vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
-            vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-            vector.destroy()
-        return found
+        return largest(self.comm, index_map, found)
 
     @cached_property
     def between(self) -> IndexArray:
@@ -418,9 +413,7 @@ def corner_points(cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, Float
 def measures(cells: Cells, side: BoundaryFacets) -> FloatArray:
     """|F|, shape (n,)."""
     _, ends = corner_points(cells, side)
-    edges = ends[1:] - ends[:1]
-    gram = np.einsum("ind,jnd->nij", edges, edges)
-    return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, cells.tdim))
+    return simplex_measures(ends.transpose(1, 0, 2))
 
 
 def _rows(table: Int32Array) -> IndexArray:

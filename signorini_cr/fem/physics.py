@@ -84,7 +84,7 @@ class OnMesh(Protocol):
         """a_h(u, u), this rank's cells' share."""
 
     def tidy(self) -> None:
-        """Drop what only solution and certificate needed."""
+        """Make room: drop what is large and needed until a solution is certified."""
 
 
 class Physics(Protocol):

@@ -121,7 +121,7 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
 
 
 def measures(x: FloatArray) -> FloatArray:
-    """Measures of simplices with vertices x, shape (n, vertices, 3)."""
+    """Measures of simplices with vertices x, shape (n, vertices, gdim)."""
     edges = x[:, 1:] - x[:, :1]
     gram = np.einsum("nid,njd->nij", edges, edges)
     return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, x.shape[1]))
@@ -194,7 +194,14 @@ def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
 
 def shared_maximum(V: fem.FunctionSpace, array: FloatArray) -> None:
     """Give every copy of a shared dof, in place, the largest value any rank has for it."""
-    vector = ghosted_vector(V, array)
-    vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
-    vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-    vector.destroy()
+    largest(V.mesh.comm, V.dofmap.index_map, array, V.dofmap.index_map_bs)
+
+
+def largest(comm: MPI.Comm, index_map: Any, array: FloatArray, block: int = 1) -> FloatArray:
+    """Find, in place, the largest of what ranks have for each shared entity; see `shared_sum`."""
+    if comm.size > 1:
+        vector = ghosted(comm, index_map, array, block)
+        vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        vector.destroy()
+    return array

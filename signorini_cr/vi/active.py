@@ -1,4 +1,7 @@
-"""Which dofs the obstacle holds: decided by one criterion, here, for everyone who asks."""
+"""Which dofs the obstacle holds: decided here, for everyone who asks.
+
+The solver goes by `ActiveSet.of`; who knows a solution only by its gaps and forces, by `touching`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,22 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import BoolArray, FloatArray, Int32Array
+
+
+def touching(gap: FloatArray, force: FloatArray, diagonal: FloatArray | float) -> BoolArray:
+    """Tell where there is contact by the primal-dual criterion: A_ii (u − α)_i < (A u − b)_i > 0.
+
+    That is for those who take a solution as they find it, as the certificate does. Its gap need not
+    be exactly 0 where the solver held it, for α has been sampled anew, nor has it to be converged;
+    but a gap that is nothing against the force is none. Where all gaps are 0 or less, and else for
+    what a solver has finished, it says the same as `ActiveSet.of`.
+
+    Args:
+        gap: u − α, shape (n,).
+        force: A u − b, shape (n,).
+        diagonal: A's entries, shape (n,) or ().
+    """
+    return np.asarray(force > np.maximum(diagonal * gap, 0.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,10 @@ class Level:
         return self.meshes[-1].data
 
     def tidy(self) -> None:
-        """Drop what only assembly and certificate needed; for the level's owner, a solution."""
+        """Drop what only assembly and certificate needed; for the level's owner.
+
+        That is the solution, once it has its certificate, and the driver that makes the next mesh.
+        """
         self.data.tidy()
 
     @cached_property

@@ -839,12 +839,13 @@ def test_energy_of_a_function_of_degree_two():
     curvature = 4 / 3 * cells.over_facets(np.tile(traces, (3, 1)))
     rim_without = BoundaryFacets.joined([], 2), np.empty(0), np.empty((3, 0)), np.empty(0, bool)
     none = companion.Masses(False, np.array(0.0), *rim_without)
-    found, promise = companion._sweep(cells, kappa, none, excess, bumps.copy(), free, rim, 0)
+    functional = companion.Functional(cells, None, kappa, None, none)
+    found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, whole)
     assert np.isclose(promise, np.sum(falls[free] ** 2 / curvature[free]))
     # In as many steps as there are heights it finds the least
     best = bumps.copy()
-    found, promise = companion._sweep(cells, kappa, none, excess, best, free, rim, 60)
+    found, promise = companion._sweep(functional, excess, best, free, rim, 60)
     after = Slopes.of(cells, kappa, excess, best)
     assert np.isclose(found, after.energies.sum()) and promise < 1e-12
     assert np.abs(cells.over_facets(after.facets)[free]).max() < 1e-6
@@ -1047,10 +1048,11 @@ def test_energy_with_masses():
     # heights that are known beforehand are those on the rim
     bumps[~cells.exterior] = 0.0
     rim = tuple(cells.sides.values())
-    found, promise = companion._sweep(cells, kappa, masses, excess, bumps.copy(), free, rim, 0)
+    functional = companion.Functional(cells, None, kappa, None, masses)
+    found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, energy(bumps)) and promise > 0.0
     best = bumps.copy()
-    found, promise = companion._sweep(cells, kappa, masses, excess, best, free, rim, 80)
+    found, promise = companion._sweep(functional, excess, best, free, rim, 80)
     assert np.isclose(found, energy(best)) and promise < 1e-12
     for facet in np.flatnonzero(free):
         for step in (1e-3, -1e-3):
@@ -1159,13 +1161,12 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     signs = np.ones(len(contact.cells))
     limits = ((1, cells.largest_at_vertices(contact.ends, alpha[0])),)
     floors = companion.Floors(contact, signs, *alpha, limits, signs < 0.0, len(cells.exterior))
-    start = np.zeros(len(rim)), np.zeros(len(free))
-    v, bumps, found = companion._solved(
-        cells, kappa, np.array(True), w, start, (loose, free), floors
-    )
+    start = companion.Draft(np.zeros(len(rim)), np.zeros(len(free)), loose, free)
+    functional = companion.Functional(cells, w, kappa, np.array(True), None)
+    v, bumps, found = companion._solved(functional, start, floors)
     assert found is None
     after = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
-    before = Slopes.of(cells, kappa, -w, start[1])
+    before = Slopes.of(cells, kappa, -w, start.bumps)
     assert after.energies.sum() < before.energies.sum()
     pulls = cells.over_vertices(after.vertices), cells.over_facets(after.facets)
     inside = loose.copy()

@@ -466,9 +466,9 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
 
     make = module._companion
 
-    def unknown_above(solution, base, known, sweeps):
+    def unknown_above(solution, known, sweeps):
         """What is known of κ from above makes no difference to gradients."""
-        made = make(solution, base, known, sweeps)
+        made = make(solution, known, sweeps)
         known.kappa.high = 2 * known.kappa.high
         return made
 
