@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.mesh import Mesh, compute_midpoints, entities_to_geometry
 from mpi4py import MPI
 
-from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
@@ -251,76 +251,126 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     until the digits of the coordinates end. What is continuous has fallen by then, however steep it
     is; a jump is as high as before. (|t|^s falls far enough for s > 0.05, near 0.)
     """
-    comm = u_D.mesh.comm
+    comm, error = u_D.mesh.comm, u_D.precision.points
     start, end, cells = fixed.paths
     total = comm.allreduce(len(start))
     if u_D.constant or not total:
         return []
-    pieces = int(np.clip(SAMPLES // total, LEAST, MOST))
-    t = np.arange(pieces)[:, None] + [0.0, MIDDLE]
-    t = np.append(t, pieces) / pieces
     way = end - start
-    error = u_D.precision.points
-    found = u_D.at(start[:, None] + t[:, None] * way[:, None], cells, error)
-    if comm.allreduce(found is None, op=MPI.LOR):
+    pieces = int(np.clip(SAMPLES // total, LEAST, MOST))
+    intervals = _sampled(u_D, fixed, pieces)
+    if intervals is None:
         return []
-    assert found is not None
-    values, errors = found
-    # Vertices are where they are: next to a pole of the angle, its value there can be trusted
-    ends = u_D.at(np.stack([start, end], axis=1), cells, 0.0)
-    assert ends is not None
-    errors[:, [0, -1]] = ends[1]
-    finite = np.abs(values[np.isfinite(values)])
+    finite = np.abs(intervals.u[np.isfinite(intervals.u)])
     largest = comm.allreduce(float(finite.max(initial=0.0)), op=MPI.MAX)
     scale = TOLERANCE * largest
     complaints = _between([(u_D, fixed)], scale, key) if u_D.tied else []
 
-    segment: IndexArray = np.repeat(np.arange(len(start)), pieces)
     length = np.linalg.norm(way, axis=1)
     longest = max(comm.allgather(float(length.max(initial=0.0)))) / pieces
     shortest = SHORTEST * error
     halfway = 16.0 * math.sqrt(longest * shortest)
+    while len(intervals.segment):
+        segment, s, u = intervals.segment, intervals.s, intervals.u
+        rough, width = _roughness(u), (s[2] - s[0]) * length[segment]
+        roughest = np.where(width <= halfway, np.maximum(rough, intervals.roughest), 0.0)
+        middle = start[segment] + s[1][:, None] * way[segment]
+        for i in np.flatnonzero(np.abs(u).max(axis=0) > HUGE * largest):
+            complaints.append(_pole_message(key, u_D.mesh, middle[i]))
+        level, short = np.maximum(scale, _noise(intervals.e)), width < shortest
+        height = np.abs(u[2] - u[0])
+        for i in np.flatnonzero(short & (height > np.maximum(level, roughest))):
+            complaints.append(_jump_message(key, u_D.mesh, middle[i], u[0, i], u[2, i]))
+        rest = replace(intervals, roughest=roughest).picked(~short & (rough > level))
+        cuts = rest.cuts
+        x = start[rest.segment] + cuts[:, :, None] * way[rest.segment]
+        found = u_D.at(x.swapaxes(0, 1), cells[rest.segment], error)
+        assert found is not None
+        intervals = rest.halved(cuts, found[0].T, found[1].T)
+        if len(intervals.segment) > AT_A_TIME:
+            intervals = intervals.rougher()
+    return complaints
+
+
+@dataclass(frozen=True, eq=False)
+class _Intervals:
+    """Parts of segments on which a datum is looked at, with their ends and a middle.
+
+    Attributes:
+        segment: Which segment each is of, shape (n,).
+        s: Places on the segment, from 0 to 1, shape (3, n).
+        u: Values there, shape (3, n).
+        e: What they may be off by, shape (3, n).
+        roughest: How far from affine any was of which this is a part, from some length on, shape
+            (n,).
+    """
+
+    segment: IndexArray
+    s: FloatArray
+    u: FloatArray
+    e: FloatArray
+    roughest: FloatArray
+
+    @property
+    def cuts(self) -> FloatArray:
+        """The middles of both parts of each, shape (2, n)."""
+        return np.asarray(self.s[:2] + MIDDLE * np.diff(self.s, axis=0))
+
+    def picked(self, which: BoolArray | IndexArray) -> _Intervals:
+        """Return some of them."""
+        return _Intervals(
+            self.segment[which],
+            self.s[:, which],
+            self.u[:, which],
+            self.e[:, which],
+            self.roughest[which],
+        )
+
+    def halved(self, cuts: FloatArray, u: FloatArray, e: FloatArray) -> _Intervals:
+        """Cut all in two; the first parts come first.
+
+        Args:
+            cuts: The middles of both parts, shape (2, n).
+            u: Values there, shape (2, n).
+            e: What they may be off by, shape (2, n).
+        """
+        return _Intervals(
+            np.tile(self.segment, 2),
+            _halves(self.s, cuts),
+            _halves(self.u, u),
+            _halves(self.e, e),
+            np.tile(self.roughest, 2),
+        )
+
+    def rougher(self) -> _Intervals:
+        """Keep of both parts, the first ones first, that which is farther from affine."""
+        half = len(self.segment) // 2
+        first = _roughness(self.u[:, :half]) >= _roughness(self.u[:, half:])
+        return self.picked(np.where(first, np.arange(half), np.arange(half, 2 * half)))
+
+
+def _sampled(u_D: _Values, fixed: _Facets, pieces: int) -> _Intervals | None:
+    """Cut facets into intervals; None where u_D has no values there on some rank; collective."""
+    start, end, cells = fixed.paths
+    t = np.arange(pieces)[:, None] + [0.0, MIDDLE]
+    t = np.append(t, pieces) / pieces
+    x = start[:, None] + t[:, None] * (end - start)[:, None]
+    found = u_D.at(x, cells, u_D.precision.points)
+    if u_D.mesh.comm.allreduce(found is None, op=MPI.LOR):
+        return None
+    assert found is not None
+    values, errors = found
+    # vertices are where they are: next to a pole of the angle, its value there can be trusted
+    at_ends = u_D.at(np.stack([start, end], axis=1), cells, 0.0)
+    assert at_ends is not None
+    errors[:, [0, -1]] = at_ends[1]
 
     def triples(array: FloatArray) -> FloatArray:
-        """Ends and middles of the intervals, shape (3, intervals)."""
         return np.stack([array[:, :-2:2], array[:, 1:-1:2], array[:, 2::2]]).reshape(3, -1)
 
-    # Parameters, values and their errors of all intervals, how rough those were from halfway on
-    s, u, e = triples(np.broadcast_to(t, values.shape)), triples(values), triples(errors)
-    roughest: FloatArray = np.zeros(len(segment))
-    while len(segment):
-        rough = _roughness(u)
-        width = (s[2] - s[0]) * length[segment]
-        roughest = np.where(width <= halfway, np.maximum(rough, roughest), 0.0)
-        x = start[segment] + s[1][:, None] * way[segment]
-        for i in np.flatnonzero(np.abs(u).max(axis=0) > HUGE * largest):
-            complaints.append(_pole_message(key, u_D.mesh, x[i]))
-        level = np.maximum(scale, _noise(e))
-        height = np.abs(u[2] - u[0])
-        short = width < shortest
-        for i in np.flatnonzero(short & (height > np.maximum(level, roughest))):
-            complaints.append(_jump_message(key, u_D.mesh, x[i], u[0, i], u[2, i]))
-        kept = np.flatnonzero(~short & (rough > level))
-        s, u, e, segment, roughest = (
-            s[:, kept],
-            u[:, kept],
-            e[:, kept],
-            segment[kept],
-            roughest[kept],
-        )
-        cuts = s[:2] + MIDDLE * np.diff(s, axis=0)
-        where = start[segment] + cuts[:, :, None] * way[segment]
-        found = u_D.at(where.swapaxes(0, 1), cells[segment], error)
-        assert found is not None
-        s, u, e = (_halves(old, new) for old, new in ((s, cuts), (u, found[0].T), (e, found[1].T)))
-        segment, roughest = np.tile(segment, 2), np.tile(roughest, 2)
-        if len(segment) > AT_A_TIME:
-            half = len(segment) // 2
-            first = _roughness(u[:, :half]) >= _roughness(u[:, half:])
-            kept = np.where(first, np.arange(half), np.arange(half, 2 * half))
-            s, u, e = s[:, kept], u[:, kept], e[:, kept]
-            segment, roughest = segment[kept], roughest[kept]
-    return complaints
+    segment: IndexArray = np.repeat(np.arange(len(start)), pieces)
+    places = triples(np.broadcast_to(t, values.shape))
+    return _Intervals(segment, places, triples(values), triples(errors), np.zeros(len(segment)))
 
 
 def _halves(triples: FloatArray, cuts: FloatArray) -> FloatArray:

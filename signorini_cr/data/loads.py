@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -371,13 +371,14 @@ class Segments:
         found = [cls.of(edge, cells, low, size) for edge in edges]
         first = np.cumsum([0, *(len(each.through) for each in found)])
 
-        def rows(name: str, axis: int = -1) -> FloatArray:
-            return np.concatenate([getattr(each, name) for each in found], axis=axis)
+        def rows(datum: Callable[[Segments], FloatArray]) -> FloatArray:
+            return np.concatenate([datum(each) for each in found], axis=-1)
 
         facets = BoundaryFacets.joined([each.facets for each in found], cells.tdim)
-        loss, hats, values, through = rows("loss"), rows("hats"), rows("values"), rows("through")
+        loss, hats = rows(lambda each: each.loss), rows(lambda each: each.hats)
+        values, through = rows(lambda each: each.values), rows(lambda each: each.through)
         place = np.concatenate([e.place + k for e, k in zip(found, first[:-1], strict=True)])
-        measure = rows("measure")
+        measure = rows(lambda each: each.measure)
         if loss.any():
             ends = trace_of(cells, facets, w)
             lost = loss[place] * np.einsum("qdn,dn->qn", hats, ends[:, place])
@@ -395,10 +396,10 @@ class Segments:
             measure,
             values,
             through,
-            rows("missed"),
-            rows("rough"),
+            rows(lambda each: each.missed),
+            rows(lambda each: each.rough),
             loss,
-            rows("bounded") > 0,
+            np.concatenate([each.bounded for each in found]),
             low,
             next((each.reason for each in found if each.reason), None),
         )

@@ -91,19 +91,18 @@ class Lift:
 
     @classmethod
     def none(cls, least: FloatArray, reason: str | None = None) -> Lift:
-        """Nothing to lift, or nothing that can be."""
+        """Say that there is nothing to lift, or nothing that can be."""
         zero = np.zeros_like(least)
         return cls(zero, zero, zero, least, zero, reason)
 
 
 def joined(lifts: Sequence[Lift]) -> Lift:
-    """Those of several parts, one after the other; with one reason, if there is one."""
-    rows = {
-        name: np.concatenate([np.empty(0), *(getattr(each, name) for each in lifts)])
-        for name in ("steep", "area", "beyond", "least", "edge")
-    }
+    """Put those of several parts one after the other; with one reason, if there is one."""
+    rows = [(each.steep, each.area, each.beyond, each.least, each.edge) for each in lifts]
+    columns = zip([np.empty(0)] * 5, *rows, strict=True)
+    steep, area, beyond, least, edge = (np.concatenate(column) for column in columns)
     reason = next((each.reason for each in lifts if each.reason), None)
-    return Lift(**rows, reason=reason)
+    return Lift(steep, area, beyond, least, edge, reason)
 
 
 def lift(
@@ -133,68 +132,148 @@ def lift(
     n, name = len(side.cells), "α" if obstacle else "u_D"
     if trace.constant is not None:
         return Lift.none(np.full(n, trace.constant))
-    apex, (a, b) = corner_points(cells, side)
-    length = np.linalg.norm(b - a, axis=1)
-    height = 2.0 * cells.volume[side.cells] / length
-    foot = np.einsum("nk,nk->n", a - apex, b - a) / length
-    whole = Pieces.of_facets(cells, side)
-
-    def parts(pieces: Pieces, size: FloatArray, steep: FloatArray) -> FloatArray:
-        """Bounds of |δ'|² + (kδ − sδ')²/H²: what goes with 1, k and k²."""
-        at = pieces.parent
-        reach = np.maximum(*np.abs(foot[at] + pieces.hats[:, 1] * length[at])) / height[at]
-        size = size / height[at]
-        return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
-
-    def steepness(pieces: Pieces) -> FloatArray:
-        size, steep, least = _bounds(trace, pieces, base or v, cells, length, scale)
-        if obstacle and base is None:
-            # δ is a positive part, and 0 where the difference is shown to be negative
-            signed = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0]
-            size = np.fmin(size, np.maximum(signed, 0.0))
-            steep = np.where(signed <= 0.0, 0.0, steep)
-        square = parts(pieces, size, steep).sum(axis=0)
-        square = square + 2.0 * ratio / height[pieces.parent] * size**2
-        return np.stack([square, size, steep, least])
-
-    weights = np.zeros((4, n))
-    weights[0] = 0.5 * height * length / goal**2
+    seen = _Triangles.of(cells, side)
+    length, height = seen.length, seen.height
     try:
-        pieces = whole
-        for _ in range(QUARTERS):
-            pieces = pieces.halves()
-        room = 8 * cells.comm.allreduce(n) + 1000
-        pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
-        jumps = _jump_at_ends(trace, whole, base or v, cells, JUMP * scale, obstacle)
-        clear = np.zeros(n, dtype=bool)
-        if obstacle:
-            below = size <= 0.0
-            if base is not None:
-                below = _bounds(trace, pieces, v, cells, length, scale, signed=True)[0] <= 0
-            clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
+        found = _enclosed(cells, side, trace, base, v, scale, goal, obstacle, ratio, seen)
     except Unknown as error:
         return Lift.none(np.zeros(n), NO_RANGE.format(name, error))
+    pieces = found.pieces
 
     def mean(values: FloatArray) -> FloatArray:
         sums = np.bincount(pieces.parent, pieces.part * values, minlength=n)
         return np.asarray(sums, dtype=np.float64)
 
     with np.errstate(invalid="ignore", divide="ignore"):
-        rows = (*parts(pieces, size, steep), size, size**2)
-        one, k, two, beyond, norm = (np.where(clear, 0.0, mean(row)) for row in rows)
+        rows = (*seen.parts(pieces, found.size, found.steep), found.size, found.size**2)
+        one, k, two, beyond, norm = (np.where(found.clear, 0.0, mean(row)) for row in rows)
         power = np.clip(np.nan_to_num(np.sqrt(one / two), nan=1.0), *POWERS)
         squares = one / power + k + power * two
-    reason = None
-    if not np.isfinite(squares).all() or (jumps & ~clear).any():
-        reason = ROUGH.format(name)
+    rough = not np.isfinite(squares).all() or (found.jumps & ~found.clear).any()
     return Lift(
         np.sqrt(0.5 * height * length * squares),
         np.sqrt(height * length * norm / (2.0 * power + 2.0)),
         beyond * length,
-        mean(least),
+        mean(found.least),
         np.sqrt(length * norm),
-        reason,
+        ROUGH.format(name) if rough else None,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Triangles:
+    """Triangles as they are seen from one of their facets each, of shape (n,).
+
+    Attributes:
+        length: |F|.
+        height: H, P's distance from the facet's line.
+        foot: How far from P's foot on that line the facet begins.
+    """
+
+    length: FloatArray
+    height: FloatArray
+    foot: FloatArray
+
+    @classmethod
+    def of(cls, cells: Cells, side: BoundaryFacets) -> _Triangles:
+        """Measure them."""
+        apex, (a, b) = corner_points(cells, side)
+        length = np.linalg.norm(b - a, axis=1)
+        foot = np.einsum("nk,nk->n", a - apex, b - a) / length
+        return cls(length, 2.0 * cells.volume[side.cells] / length, foot)
+
+    def parts(self, pieces: Pieces, size: FloatArray, steep: FloatArray) -> FloatArray:
+        """Bound |δ'|² + (kδ − sδ')²/H² on pieces of the facets: what goes with 1, k and k².
+
+        Args:
+            pieces: The pieces.
+            size: Bounds of |δ|.
+            steep: Bounds of |δ'|.
+        """
+        at = pieces.parent
+        ends = self.foot[at] + pieces.hats[:, 1] * self.length[at]
+        reach, size = np.maximum(*np.abs(ends)) / self.height[at], size / self.height[at]
+        return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Enclosed:
+    """What is known of δ, and of the data.
+
+    Attributes:
+        pieces: Pieces of the facets.
+        size: Bounds of |δ| on them, shape (pieces,).
+        steep: Bounds of |δ'|.
+        least: Lower bounds of the data's means.
+        jumps: Facets at whose ends δ does not vanish, shape (n,).
+        clear: Facets on which the companion is above the obstacle, shape (n,).
+    """
+
+    pieces: Pieces
+    size: FloatArray
+    steep: FloatArray
+    least: FloatArray
+    jumps: BoolArray
+    clear: BoolArray
+
+
+def _enclosed(
+    cells: Cells,
+    side: BoundaryFacets,
+    trace: Trace,
+    base: Cubic | None,
+    v: Cubic,
+    scale: float,
+    goal: float,
+    obstacle: bool,
+    ratio: float,
+    seen: _Triangles,
+) -> _Enclosed:
+    """Enclose δ piece by piece, as finely as `goal` asks for; collective.
+
+    Args:
+        cells: As for `lift`, and so are the next eight.
+        side: The facets.
+        trace: The data.
+        base: α_I.
+        v: The companion.
+        scale: Size of the values.
+        goal: What ‖∇ℓ‖ need not be known better than.
+        obstacle: Whether δ is the positive part of the difference.
+        ratio: b over the largest κ.
+        seen: The cells, as they are seen from the facets.
+
+    Raises:
+        Unknown: The data hold an operator that has no enclosure.
+    """
+    n, polynomial, whole = len(side.cells), base or v, Pieces.of_facets(cells, side)
+
+    def steepness(pieces: Pieces) -> FloatArray:
+        size, steep, least = _bounds(trace, pieces, polynomial, cells, seen.length, scale)
+        if obstacle and base is None:
+            # δ is a positive part, and 0 where the difference is shown to be negative
+            signed = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0]
+            size = np.fmin(size, np.maximum(signed, 0.0))
+            steep = np.where(signed <= 0.0, 0.0, steep)
+        square = seen.parts(pieces, size, steep).sum(axis=0)
+        square = square + 2.0 * ratio / seen.height[pieces.parent] * size**2
+        return np.stack([square, size, steep, least])
+
+    weights = np.zeros((4, n))
+    weights[0] = 0.5 * seen.height * seen.length / goal**2
+    pieces = whole
+    for _ in range(QUARTERS):
+        pieces = pieces.halves()
+    room = 8 * cells.comm.allreduce(n) + 1000
+    pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
+    jumps = _jump_at_ends(trace, whole, polynomial, cells, JUMP * scale, obstacle)
+    clear = np.zeros(n, dtype=bool)
+    if obstacle:
+        below = size <= 0.0
+        if base is not None:
+            below = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0] <= 0
+        clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
+    return _Enclosed(pieces, size, steep, least, jumps, clear)
 
 
 def _bounds(
