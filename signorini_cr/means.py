@@ -27,6 +27,7 @@ from .vi.level import Level
 from .vi.solver import Iterations
 
 NO_MEAN = "the mean has no bounds"
+AFLOAT = "nothing but contact holds a part of the domain, and no energy tells how high it is"
 ROUNDING = 1e-14
 """What rounding may do to a mean, in parts of the mean of |u|."""
 
@@ -52,6 +53,8 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
+    if made.on_contact_alone:
+        raise InputError(f"{NO_MEAN}: {AFLOAT}")
     cells = made.cells()
     size, *integrals = map(float, cells.total(*_integrals(made, cells, solution.u.x.array, where)))
     if not size > 0.0:

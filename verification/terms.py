@@ -353,6 +353,47 @@ class Layered(Case):
         return replace(super().problem(), coefficient=west, reaction=first, materials=materials)
 
 
+class Alone(Case):
+    """Contact presses on one to four edges, nothing else holds u.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        pressed = False
+        while not pressed:
+            super().__init__(rng)
+            self.c = 0.0
+            kinds = ["contact" if side.kind == "contact" else "neumann" for side in self.sides]
+            bounds = str(rng.choice(["lower", "upper"]))
+            self.sides = [
+                replace(side, kind=kind, b=0.0, bounds=bounds)
+                for side, kind in zip(self.sides, kinds, strict=True)
+            ]
+            forces = [exact_flux(self, i) for i, kind in enumerate(kinds) if kind == "contact"]
+            pressed = abs(sum(forces)) > 0.1 * self.kappa
+
+
+class OneHolds(Layered):
+    """A reaction on one side of x = ½ holds all.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        super().__init__(rng)
+        c = float(rng.choice([1e-2, 1.0, 1e4, 1e8]))
+        self.masses = ((c, 0.0), (0.0, c))[rng.integers(2)]
+        self.sides = [
+            replace(
+                side, kind="neumann" if side.kind in ("dirichlet", "robin") else side.kind, b=0.0
+            )
+            for side in self.sides
+        ]
+
+
 EAST = [[0.5, 0.0], [1.0, 0.0], [1.0, 1.0], [0.5, 1.0]]
 
 
@@ -488,6 +529,8 @@ REFERENCE = "u in closed form, written anew; Gauss's rules on triangles and edge
 DRAWN = "c and b up to 1e8, one to four contact parts, bounds on either side"
 TENSORS = "the same with κ a tensor, its eigenvalues up to 1 : 10⁴, in two fifths with waves"
 
+ALONE = "contact alone holds u, on one to four edges"
+ONE_HOLDS = "a reaction in one half, up to 1e8, and no Γ0"
 LAYERS = "the same with κ, up to 1 : 10⁴, and c, up to 1e8 or 0, of their own left and right"
 
 
@@ -615,6 +658,8 @@ def terms(seed: int, quick: bool) -> Group:
             told(_drawn(seed, 4 if quick else 500, Case, DRAWN)),
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
             told(_drawn(seed, 2 if quick else 150, Layered, LAYERS)),
+            told(_drawn(seed, 2 if quick else 60, Alone, ALONE)),
+            told(_drawn(seed, 2 if quick else 60, OneHolds, ONE_HOLDS)),
             *(
                 told(_smooth(1 if quick else 4, bounds))
                 for bounds in (None, "lower", "upper", "both")

@@ -382,8 +382,9 @@ class Boundary:
         if cells.tdim == 2:
             above += signs * 2.0 / 3.0 * bumps[contact.dofs]
         above += lifts[1].beyond / measures(cells, contact)
+        force = flux.contact if flux.carried is None else flux.contact + flux.carried
         return (
-            np.where(flux.contact > 0, flux.contact * np.maximum(above, 0.0), 0.0),
+            np.where(force > 0, force * np.maximum(above, 0.0), 0.0),
             (
                 np.concatenate([fixed.cells, contact.cells]),
                 np.concatenate([lift.steep for lift in lifts]),

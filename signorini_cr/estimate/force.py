@@ -124,12 +124,13 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
             side = cells.sides[condition.number]
             force += float(np.sum(made.through(cells)[side.local, side.cells]))
     at_fixed = any(condition.fixed is not None for condition in conditions)
+    exits = at_fixed or made.on_contact_alone
     value, middle, energy, unsure = cells.total(
         force,
         force + 0.5 * work,
         square(made, cells, at),
         # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
-        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if at_fixed else 0.0,
+        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if exits else 0.0,
     )
     reach = made.reach * np.sqrt(energy) + unsure
     # a force off one bound only has its sign

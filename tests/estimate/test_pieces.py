@@ -651,6 +651,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     v = SimpleNamespace(vertices=vertices, bumps=bumps, cusps=SimpleNamespace(at=at, means=means))
     sums = SimpleNamespace(steepness=steepness)
     known = SimpleNamespace(
+        flux=SimpleNamespace(carried=None),
         level=level,
         cells=cells,
         kappa=kappa,
@@ -715,9 +716,9 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     assert least < other and np.isclose(other, least + apart, rtol=1e-7)
     # A few steps, and what is left carried as a walk does, are between the two
     monkeypatch.setattr(flux, "STEPS", 10)
-    found = flux._carried(cells, left, kappa, 0.0)
+    found = flux._carried(cells, left, kappa, 0.0, np.array(0.0))
     assert np.sqrt(least) < found < np.sqrt(other)
-    assert np.isclose(flux._carried(cells, left, kappa, np.inf), np.sqrt(other))
+    assert np.isclose(flux._carried(cells, left, kappa, np.inf, np.array(0.0)), np.sqrt(other))
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3, 1e9])
@@ -1000,7 +1001,8 @@ def test_contact_term_with_liftings(monkeypatch):
     bumps = rng.normal(size=len(cells.exterior))
     v = rng.normal(size=cells.vertices.max() + 1) + 1.0
     through = rng.uniform(size=3) * [1, 1, 0]
-    y = SimpleNamespace(contact=through)
+    more = np.array([0.5, 0.0, 0.0])
+    y = SimpleNamespace(contact=through, carried=more)
     boundary = companion.Boundary(u_D, alpha, 1.0, 1e-3, 1.0)
     contact, (at, steep, area, edge), reasons = boundary.lifted(cells, y, v, bumps, 0 * bumps)
     side, found = sides[True], lifts[True]
@@ -1008,7 +1010,7 @@ def test_contact_term_with_liftings(monkeypatch):
         a, b = v[side.ends[:, i]]
         above = (a + b) / 2 + 2 / 3 * bumps[side.dofs[i]] - found.least[i]
         above += found.beyond[i] / np.ptp(corner_points(cells, side)[1][:, i, 0])
-        assert np.isclose(contact[i], through[i] * max(above, 0.0))
+        assert np.isclose(contact[i], (through[i] + more[i]) * max(above, 0.0))
     assert np.array_equal(at, np.concatenate([sides[kind].cells for kind in (False, True)]))
     assert np.array_equal(steep, np.concatenate([lifts[kind].steep for kind in (False, True)]))
     assert np.array_equal(area, np.concatenate([lifts[kind].area for kind in (False, True)]))

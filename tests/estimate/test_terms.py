@@ -12,7 +12,7 @@ from dolfinx.la import InsertMode
 from dolfinx.mesh import compute_midpoints, create_box, exterior_facet_indices, meshtags
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, Polygon, Problem, solve, solve_levels
+from signorini_cr import Contact, Domain, InputError, Neumann, Polygon, Problem, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.diffusion import Diffusion
@@ -20,6 +20,7 @@ from signorini_cr.estimate import certificate as module
 from signorini_cr.estimate import cusps
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.force import _weight, force_bounds
+from signorini_cr.means import mean
 from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
@@ -550,3 +551,46 @@ def test_tetrahedra():
         level = Level((NestedMesh(Diffusion(Problem(**data, **curved), mesh), domain),))
         solution.level, solution.u = level, fem.Function(level.V)
         assert "affine on the facets" in certify(solution).reason
+
+
+def pressed(f=-1.0, rule=4):
+    """A rectangle with insulated sides that lies on an obstacle."""
+    sides = ("floor", "wall", "wall", "wall")
+    polygon = Polygon([[0, 0], [2, 0], [2, 1], [0, 1]], sides, names=("floor", "wall"))
+    conditions = {"floor": Contact(0.0), "wall": Neumann()}
+    return Problem(f=f, quadrature_degree=rule, conditions=conditions), polygon
+
+
+def test_contact_alone_holds_the_domain():
+    """u = y²/2 − y above 0 for f = −1: contact everywhere, the force is 2."""
+    problem, polygon = pressed()
+    exact = lambda x: x[1] ** 2 / 2 - x[1]  # noqa: E731
+    for solution in solve_levels(problem, polygon.mesh(0.3), 3):
+        certificate, x = solution.certificate, ufl.SpatialCoordinate(solution.domain.mesh)
+        off = ufl.grad(solution.u - exact(x))
+        square = WORLD.allreduce(fem.assemble_scalar(fem.form(ufl.inner(off, off) * ufl.dx)))
+        assert np.sqrt(square) <= certificate.bound_energy_norm <= 1.1 * np.sqrt(square)
+        low, high = certificate.energy  # ½∫|∇u|² − ∫ f u = −½ ∫ (y − 1)² over the rectangle
+        assert low <= -1 / 3 <= high
+        low, high = force_bounds(solution)
+        assert low <= 2.0 * (1 + 1e-12) and high >= 2.0 * (1 - 1e-12) and high - low < 1e-6
+        with pytest.raises(InputError, match="how high it is"):
+            mean(solution)
+
+
+def test_contact_alone_with_a_load_that_is_enclosed():
+    """What quadrature misses of f goes to where there is contact."""
+    problem, polygon = pressed(lambda x: -ufl.exp(x[1]) - ufl.sin(x[0]) ** 2, rule=2)
+    solution = solve(problem, polygon.mesh(0.2))
+    exact = 2 * (np.e - 1) + 1 - np.sin(4) / 4
+    low, high = force_bounds(solution)
+    assert low <= exact <= high and high - low < 0.1
+    assert solution.certificate.parts["solver"] < 0.1 * solution.certificate.bound_energy_norm
+
+
+def test_contact_that_does_not_press_holds_nothing():
+    """A solver that never began has no forces, and no bound."""
+    problem, polygon = pressed()
+    solution = solve(problem, polygon.mesh(0.3))
+    solution.u.x.array[:] = 1.0
+    assert "no contact whose force" in certify(solution).reason
