@@ -149,7 +149,9 @@ class Made:
     ball around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and
     ‖Aℓ‖ alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last
     row is about. on_contact_alone tells that part of the domain is held by contact alone: (2) is
-    then for functions that vanish there.
+    then for functions that vanish there. contact are y's forces off each bound, facet by facet,
+    above bounds what they make of v + ℓ − α, and complementary is a bound of what λ makes of that
+    and they make of u − α.
     """
 
     level: Level
@@ -176,6 +178,9 @@ class Made:
     lift: Lifted
     bounded: IndexArray
     on_contact_alone: bool
+    contact: FloatArray
+    complementary: float
+    above: float
 
     def cells(self) -> Cells:
         """The mesh's geometry."""
@@ -501,6 +506,9 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         lift=v.lift,
         bounded=alpha.side.dofs,
         on_contact_alone=flux.carried is not None,
+        contact=flux.contact if flux.carried is None else flux.contact - flux.carried,
+        complementary=float(ball.contact + ball.far**2 / 4),
+        above=float(ball.contact),
     )
 
 

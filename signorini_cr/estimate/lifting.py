@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
 from ..data.jets import Enclosure, Jet, Unknown
-from ..data.moments import Trace
+from ..data.moments import OnParts, Trace
 from ..data.ranges import Pieces, refine
 from ..fem.cells import BoundaryFacets, Cells, corner_points
 
@@ -274,6 +274,47 @@ def _enclosed(
             below = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0] <= 0
         clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
     return _Enclosed(pieces, size, steep, least, jumps, clear)
+
+
+def gaps(
+    cells: Cells, bounds: OnParts, v: FloatArray, bumps: FloatArray, thirds: FloatArray | None
+) -> FloatArray:
+    """Bound from below how far v is off its bounds on each facet, d = 2, shape (n,); collective.
+
+    Args:
+        cells: The mesh.
+        bounds: α and −β on Γ1, seen from the cells.
+        v: v at the vertices.
+        bumps: Heights of its bumps.
+        thirds: Those of its cubics; or None.
+    """
+    found: list[FloatArray] = [np.zeros(0)]
+    for data in bounds.parts:
+        side, trace = data.side(cells), data.trace
+        third: FloatArray = np.zeros(len(side.cells))
+        if thirds is not None:
+            third = cells.ways_between(*side.ends) * thirds[side.dofs]
+        own = Cubic(data.sign * v[side.ends], data.sign * bumps[side.dofs], data.sign * third)
+        pieces = Pieces.of_facets(cells, side)
+        for _ in range(QUARTERS):
+            pieces = pieces.halves()
+        above: FloatArray
+        if trace.constant is not None:
+            s = pieces.hats[:, 1]
+            ends = np.stack([own.at(pieces.parent, t) for t in s])
+            width = np.abs(s[1] - s[0])
+            bend = 4.0 * np.abs(own.height) + 3.0 * np.abs(own.third)
+            off = trace.constant - ends.min(axis=0) + bend[pieces.parent] * width**2 / 4.0
+            above = np.asarray(off)
+        else:
+            length = _Triangles.of(cells, side).length
+            try:
+                above = _bounds(trace, pieces, own, cells, length, 1.0, signed=True)[0]
+            except Unknown:
+                above = np.full(pieces.parent.shape, np.inf)
+        found.append(np.full(len(side.cells), np.inf))
+        np.minimum.at(found[-1], pieces.parent, -above)
+    return np.concatenate(found)
 
 
 def _bounds(

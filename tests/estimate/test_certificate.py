@@ -36,8 +36,8 @@ from signorini_cr.data.ranges import range_of
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.flux import unbalanced
-from signorini_cr.estimate.force import flux, force_bounds
 from signorini_cr.fem.cells import Cells
+from signorini_cr.force import flux, force_bounds
 from signorini_cr.means import mean
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level

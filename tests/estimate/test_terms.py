@@ -19,7 +19,8 @@ from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate as module
 from signorini_cr.estimate import cusps
 from signorini_cr.estimate.certificate import certify
-from signorini_cr.estimate.force import _weight, force_bounds
+from signorini_cr.estimate.force import _weight
+from signorini_cr.force import force_bounds
 from signorini_cr.means import mean
 from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
