@@ -67,7 +67,7 @@ _MODULES = {
     "families": "mesh.families",
     "plots": "output.plots",
     "notebook": "output.notebook",
-    "force": "estimate.force",
+    "force": "force",
     "means": "means",
 }
 __all__ = [  # noqa: RUF022, in the order in which one meets them

@@ -9,24 +9,19 @@ from dolfinx import fem
 
 from .arrays import FloatArray
 from .data.diffusion import diffusion
-from .diffusion import Diffusion
+from .dual import certified
 from .errors import InputError
-from .estimate.certificate import Certificate, Made, certify
+from .estimate.certificate import Certificate, Made
 from .estimate.force import Interval, against, extended, square
 from .fem.cells import Cells, measures, sum_rows
 from .fem.conditions import Condition, Contact, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Material, Problem
-from .fem.space import function_space, ghosted_vector, shared_sum
-from .garbage import release
+from .fem.space import function_space, shared_sum
 from .mesh.domain import Domain
-from .multigrid.hierarchy import NestedMesh
-from .options import ESTIMATE_PREFIX, MEAN, solve_once
 from .solution import Solution
-from .vi.contact import contact_facts
-from .vi.level import Level
-from .vi.solver import Iterations
 
 NO_MEAN = "the mean has no bounds"
+AFLOAT = "nothing but contact holds a part of the domain, and no energy tells how high it is"
 ROUNDING = 1e-14
 """What rounding may do to a mean, in parts of the mean of |u|."""
 
@@ -52,13 +47,16 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
+    if made.on_contact_alone:
+        raise InputError(f"{NO_MEAN}: {AFLOAT}")
     cells = made.cells()
     size, *integrals = map(float, cells.total(*_integrals(made, cells, solution.u.x.array, where)))
     if not size > 0.0:
         raise InputError(f"{NO_MEAN}: {where!r} has no extent")
     value, middle, lift, scale = (integral / size for integral in integrals)
-    dual = _solved(_dual(forms, where), level)
-    assert dual.energy is not None
+    dual = certified(_dual(forms, where), level)
+    if dual.energy is None:
+        raise InputError(f"{NO_MEAN}: {dual.reason}")
     # with the energy norm, that of the functional is the dual solution's, its square −2 J(z)
     norm = np.sqrt(max(-2.0 * dual.energy[0], 0.0))
     known = [(0.0, float(norm * bound)), *_corrected(made, cells, bound, dual)]
@@ -109,31 +107,6 @@ def _dual(forms: Forms, where: str | None) -> Problem:
         materials=materials,
         quadrature_degree=problem.quadrature_degree,
     )
-
-
-def _solved(dual: Problem, level: Level) -> Certificate:
-    """Find what is certain about z, with a companion in P1 where that will do.
-
-    It is true for whatever comes of a linear solve, in which Γ1 counts for nothing.
-    """
-    coarsest = level.meshes[0].domain
-    physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
-    meshes = (NestedMesh(physics, each.domain, each.parents) for each in level.meshes)
-    level = Level(tuple(meshes))
-    system = level.system
-    u, residual = system.start(), fem.Function(level.V)
-    load, found = (ghosted_vector(level.V, each.x.array) for each in (system.b, u))
-    solve_once(system.A, load, found, MEAN, ESTIMATE_PREFIX)
-    u.x.scatter_forward()
-    system.residual(u, residual)
-    release(load, found)
-    contact = contact_facts(level.data, system, u, residual, Iterations(0, 0, ""))
-    z = Solution(level, u, residual, contact, 0.0, Iterations(0, 0, ""))
-    certificate = certify(z, sweeps=0)
-    level.tidy()
-    if certificate.energy is None:
-        raise InputError(f"{NO_MEAN}: {certificate.reason}")
-    return certificate
 
 
 def _corrected(

@@ -66,6 +66,7 @@ def test_the_first_demo_prints_a_row_a_level(studies):
             {"adaptive-l-shape-error", "adaptive-hole-mesh", "adaptive-convergence"},
         ),
         ("demo_frost.py", {"frost", "frost-night"}),
+        ("demo_dam.py", {"dam"}),
         ("demo_seepage.py", {"seepage", "seepage-heads"}),
         ("demo_wall.py", {"wall", "wall-strip"}),
     ],

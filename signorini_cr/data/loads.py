@@ -508,16 +508,55 @@ class Segments:
         """‖q − g_F‖²_F, shape (facets,)."""
         return self._over_facets(self.measure * (self.weights @ self.rest**2))
 
+    @cached_property
+    def bend(self) -> FloatArray:
+        """The c with q − g_F nearest to a (λ_j − λ_k) + c (6 λ_j λ_k − 1), shape (facets,)."""
+        test = 6.0 * self.hats[:, 0] * self.hats[:, 1] - 1.0
+        moments = self.measure * (self.weights @ (self.rest * test))
+        return np.asarray(5.0 * self._over_facets(moments) / self._over_facets(self.measure))
+
+    def target(self, shed: FloatArray | None) -> FloatArray:
+        """What t/b − u_h is like: a quadratic's values at the ends and its bump.
+
+        Where b takes nothing up, and for d = 3, it is 0.
+
+        Args:
+            shed: Integrals that b takes up beside q − g_F, shape (facets,); None for nothing.
+
+        Returns:
+            Shape (d + 1, facets).
+        """
+        d = self.hats.shape[1]
+        found = np.zeros((d + 1, len(self.loss)))
+        if d != 2 or not self.given.any():
+            return found
+        inverse = np.divide(1.0, self.loss, out=np.zeros_like(self.loss), where=self.given)
+        mean = 0.0 if shed is None else shed / self._over_facets(self.measure)
+        found[0], found[1] = (mean + s * self.slope - self.bend for s in (1.0, -1.0))
+        found[2] = 1.5 * self.bend
+        return np.asarray(found * inverse)
+
     def oscillation(self, carried: bool) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg and Σ_F c_F ‖q − g_F‖_F for each, where b does not take that up.
+        """Cells at Γg and Σ_F ‖σ‖_T for each, where b does not take up q − g_F.
+
+        That is c_F ‖q − g_F‖_F at most, or for d = 2 what a quadratic part has of its own, and c_F
+        times what is left.
 
         Args:
             carried: Whether y carries q's affine part, and what is left of q − g_F is meant.
         """
         squares = np.where(self.given, 0.0, self.squares)
+        if self.cells.tdim != 2:
+            return self._by_cell(np.sqrt(squares))
+        area = self._over_facets(self.measure)
+        a, c = (np.where(self.given, 0.0, each) for each in (self.slope, self.bend))
         if carried:
-            squares = squares - self._over_facets(self.measure) * self.slope**2 / 3.0
-        return self._by_cell(np.sqrt(np.maximum(squares, 0.0)))
+            squares, a = squares - area * a**2 / 3.0, np.zeros_like(a)
+        rest = squares - area * (a**2 / 3.0 + c**2 / 5.0)
+        known = _of_quadratic(self.cells, self.facets, a, c)
+        known = known / _trace_constant(self.cells, self.facets)
+        rest, squares = np.maximum(rest, 0.0), np.maximum(squares, 0.0)
+        return self._by_cell(np.minimum(np.sqrt(squares), known + np.sqrt(rest)))
 
     def beyond(self) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""
@@ -563,6 +602,29 @@ def _trace_constant(cells: Cells, side: BoundaryFacets) -> FloatArray:
     d, h = cells.tdim, np.sqrt(cells.diameter2[side.cells])
     c = poincare(d) * h
     return np.sqrt(measures(cells, side) / cells.volume[side.cells] * c * (c + 2.0 * h / d))
+
+
+def _of_quadratic(cells: Cells, side: BoundaryFacets, a: FloatArray, c: FloatArray) -> FloatArray:
+    """Bound ‖σ‖_T of the gradient σ with σ·n = a (λ_j − λ_k) + c (6 λ_j λ_k − 1), shape (n,).
+
+    d = 2, j and k are the ends of F, and on the other facets σ·n = 0. No field without divergence
+    and with these fluxes is smaller, and curl ψ is one, for
+    ψ = |F| λ_j λ_k (a (1 + β λ_i) + c (λ_k − λ_j)), with the best β for c = 0.
+    """
+    at = side.cells
+    s = np.zeros((3, 3, len(at)))
+    for (p, q), each in zip(cells.pairs, cells.stiffness[:, at], strict=True):
+        s[p, q], s[q, p] = each, each
+        s[p, p] -= each
+        s[q, q] -= each
+    j, k = cells.others[side.local].T
+    row = np.arange(len(at))
+    jj, kk, jk = s[j, j, row], s[k, k, row], s[j, k, row]
+    trace = s[0, 0] + s[1, 1] + s[2, 2]
+    square = a**2 * (trace / 12.0 - jk**2 / (5.0 * trace))
+    square += a * c * (jj - kk) * (1.0 / 15.0 + 2.0 * jk / (15.0 * trace))
+    square += c**2 * (2.0 * (jj + kk) + jk) / 45.0
+    return np.asarray(measures(cells, side) * np.sqrt(np.maximum(square, 0.0)))
 
 
 def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> FloatArray:

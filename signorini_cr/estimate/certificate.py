@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
@@ -29,7 +30,7 @@ from .companion import Companion, Functional, Lifted, Masses, companion, on_face
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
-from .flux import Flux, balance, equilibrate, field_squares, relax, unbalanced
+from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
 from .sums import Sums, Totals
 
@@ -146,7 +147,10 @@ class Made:
     numbers, missed that of what quadrature may have missed of f and g. reach is the radius of the
     ball around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and
     ‖Aℓ‖ alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last
-    row is about.
+    row is about. on_contact_alone tells that part of the domain is held by contact alone: (2) is
+    then for functions that vanish there. contact are y's forces off each bound, facet by facet,
+    above bounds what they make of v + ℓ − α, and complementary is a bound of what λ makes of that
+    and they make of u − α.
     """
 
     level: Level
@@ -172,6 +176,10 @@ class Made:
     loose: float
     lift: Lifted
     bounded: IndexArray
+    on_contact_alone: bool
+    contact: FloatArray
+    complementary: float
+    above: float
 
     def cells(self) -> Cells:
         """The mesh's geometry."""
@@ -190,7 +198,10 @@ LIFT_SHARE = 1e-2
 """What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
-ADRIFT = "part of the domain has no way to Γ0"
+ADRIFT = (
+    "part of the domain has no way to a place where u is held: there is no Γ0, no heat loss and no"
+    " reaction, and no contact whose force is larger than what is left of the equation"
+)
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
@@ -294,6 +305,18 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
         carried = balance(cells, flux, kappa.low, size, left)
         if carried:
             left = unbalanced(level, cells, flux.loose, kappa.least, size, reaction)
+    if np.isposinf(left):
+        left, flux.carried = 0.0, np.zeros_like(flux.contact)
+        missed = _missed(cells, certain, segments)
+        for amounts, signed in ((flux.loose, True), (missed, False)):
+            norm, change = carried_to_contact(
+                cells, flux, amounts, kappa.least, contact, reaction, signed
+            )
+            left += norm
+            flux.carried += change
+        enough = bool((flux.carried <= flux.contact).all())
+        if not cells.comm.allreduce(enough, op=MPI.LAND):
+            left = np.inf
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
@@ -314,7 +337,7 @@ def _companion(solution: Solved, known: _Known, sweeps: int) -> tuple[Companion,
     plain = data.forms.of_one is None
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
-    v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal)
+    v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal, highest)
     sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
     if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
@@ -336,9 +359,9 @@ def _functional(known: _Known, plain: bool) -> Functional:
     lossy = segments.loss > 0.0
     side = segments.facets.picked(lossy)
     loss = segments.loss[lossy] * measures(cells, side)
-    return Functional(
-        cells, known.w, kappa.mean, steady, Masses(not plain, known.reaction, side, loss)
-    )
+    toward, strong = segments.target(known.flux.shed)[:, lossy], segments.given[lossy]
+    masses = Masses(not plain, known.reaction, side, loss, toward, strong)
+    return Functional(cells, known.w, kappa.mean, steady, masses)
 
 
 def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
@@ -481,6 +504,10 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         loose=float(ball.loose + lift),
         lift=v.lift,
         bounded=alpha.side.dofs,
+        on_contact_alone=flux.carried is not None,
+        contact=flux.contact if flux.carried is None else flux.contact - flux.carried,
+        complementary=float(ball.contact + ball.far**2 / 4),
+        above=float(ball.contact),
     )
 
 
@@ -568,7 +595,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     counts = certain.missed is not None, bool(segments.missed.any())
     if not any(cells.total(*counts)):
         return 0.0, 0.0
-    missed, square, change = np.zeros(cells.number), 0.0, 0.0
+    square, change = 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
         missed = certain.missed
         for part in blocks(cells.number):
@@ -585,12 +612,19 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
     at, sizes = segments.beyond()
     on_edge = np.sqrt(np.sum(sizes**2 / pick(kappa.low, at)))
-    missed = missed + np.bincount(segments.facets.cells, segments.missed, minlength=cells.number)
     change += segments.change(v.vertices, v.bumps)
     square, on_edge, change = cells.total(square, on_edge**2, change)
     loose = np.sqrt(square) + np.sqrt(on_edge)
-    missed_in_all = unbalanced(level, cells, missed, kappa.least, size, known.reaction)
-    return loose + missed_in_all, float(change)
+    if known.flux.carried is None:
+        missed = _missed(cells, certain, segments)
+        loose += unbalanced(level, cells, missed, kappa.least, size, known.reaction)
+    return float(loose), float(change)
+
+
+def _missed(cells: Cells, certain: Certain, segments: Segments) -> FloatArray:
+    """Bound what quadrature may have missed of the integrals of f and g, cell by cell."""
+    on_edge = np.bincount(segments.facets.cells, segments.missed, minlength=cells.number)
+    return np.asarray(on_edge if certain.missed is None else certain.missed + on_edge)
 
 
 def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, float, float]:

@@ -21,6 +21,7 @@ from ..data.admissible import differs
 from ..data.loads import reacts
 from ..data.moments import OnFacets, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, sum_rows
+from ..fem.conditions import number
 from .cusps import Cusps
 from .descent import descend, nonzero
 from .flux import Flux
@@ -53,12 +54,16 @@ class Masses:
         reaction: c, shape (cells,) or ().
         side: Facets with a b.
         loss: b |F| there, shape (n,).
+        toward: t/b − u_h there, at the ends and the height of a bump, shape (d + 1, n).
+        strong: Where b takes up what g has beyond its mean, and t/b is nearer to u than u_h is.
     """
 
     some: bool
     reaction: FloatArray
     side: BoundaryFacets
     loss: FloatArray
+    toward: FloatArray
+    strong: BoolArray
 
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
         """Return what c pulls heights of bumps by, in units of 8/3, shape (3, n)."""
@@ -71,8 +76,8 @@ class Masses:
 
     def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
         """Return the same of b, on its facets."""
-        ends = excess[others[self.side.local].T, self.side.cells]
-        return -0.25 * self.loss * ends.sum(axis=0)
+        ends = excess[others[self.side.local].T, self.side.cells] - self.toward[:2]
+        return self.loss * (0.4 * self.toward[2] - 0.25 * ends.sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +168,8 @@ class Floors:
         middle: At their midpoints, shape (n,).
         at_vertices: The values of s, and for each the largest bound at each vertex, −∞ for none:
             where parts with obstacles of their own meet, the higher one counts.
+        strong: Where v is drawn to t/b, as near to u as α is: there s v is not below α at the
+            middle, either, and no more is asked for, shape (n,).
         facets: Number of facets.
     """
 
@@ -171,17 +178,22 @@ class Floors:
     ends: FloatArray
     middle: FloatArray
     at_vertices: tuple[tuple[int, FloatArray], ...]
+    strong: BoolArray
     facets: int
 
     @classmethod
-    def of(cls, cells: Cells, bounds: OnParts) -> Floors:
+    def of(cls, cells: Cells, bounds: OnParts, masses: Masses) -> Floors:
         """Collect them; collective."""
         side, signs, ends = bounds.side, bounds.signs, bounds.ends
         limits = []
         for sign in sorted({each.sign for each in bounds.parts}, reverse=True):
             here = signs == sign
             limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
-        return cls(side, signs, ends, bounds.middle, tuple(limits), len(cells.exterior))
+        strong = np.zeros(len(cells.exterior), dtype=bool)
+        strong[masses.side.dofs] = masses.strong
+        return cls(
+            side, signs, ends, bounds.middle, tuple(limits), strong[side.dofs], len(cells.exterior)
+        )
 
     def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The least and the largest heights of bumps that they allow for, by facet dof.
@@ -189,7 +201,12 @@ class Floors:
         Args:
             v: v at the vertices, within the bounds.
         """
-        least = _lowest(self.signs * v[self.side.ends], self.ends, self.middle)
+        above = self.signs * v[self.side.ends]
+        least = np.where(
+            self.strong,
+            self.middle - above.mean(axis=0),
+            _lowest(above, self.ends, self.middle),
+        )
         low, high = np.full(self.facets, -np.inf), np.full(self.facets, np.inf)
         up = self.signs > 0.0
         low[self.side.dofs[up]] = least[up]
@@ -210,7 +227,13 @@ def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArr
 
 
 def companion(
-    functional: Functional, flux: Flux, u_D: OnParts, alpha: OnParts, sweeps: int, goal: float
+    functional: Functional,
+    flux: Flux,
+    u_D: OnParts,
+    alpha: OnParts,
+    sweeps: int,
+    goal: float,
+    highest: float,
 ) -> Companion:
     """Make v; collective.
 
@@ -221,11 +244,12 @@ def companion(
         alpha: Obstacle on Γ1, seen from the cells.
         sweeps: How often the bumps are improved.
         goal: What ‖∇ℓ‖ need not be known better than.
+        highest: The largest κ.
     """
-    cells, floors = functional.cells, Floors.of(functional.cells, alpha)
-    draft = _started(functional, u_D, floors, flux.touching)
+    cells, floors = functional.cells, Floors.of(functional.cells, alpha, functional.masses)
+    draft = _started(functional, u_D, floors, flux)
     largest = max(1e-300, float(np.abs(draft.vertices).max(initial=0.0)))
-    boundary = Boundary(u_D, alpha, max(cells.comm.allgather(largest)), goal)
+    boundary = Boundary(u_D, alpha, max(cells.comm.allgather(largest)), goal, highest)
     wrong = boundary.contradictions(cells, draft.vertices)
     excess, cusps = functional.excess(draft.vertices), None
     if cells.tdim == 2 and sweeps > 0:
@@ -258,17 +282,17 @@ class Draft:
     free: BoolArray
 
 
-def _started(functional: Functional, u_D: OnParts, floors: Floors, touching: BoolArray) -> Draft:
+def _started(functional: Functional, u_D: OnParts, floors: Floors, flux: Flux) -> Draft:
     """Make a v that is admissible, with bumps where data ask for them; collective.
 
     Args:
         functional: What v is to make small.
         u_D: Values on Γ0, seen from the cells.
         floors: What the bounds ask of v.
-        touching: Which facets of Γ1 are in contact.
+        flux: y, which knows where there is contact.
     """
     cells, fixed, contact = functional.cells, u_D.side, floors.side
-    v = _at_vertices(functional, u_D, floors, touching)
+    v, touching = _at_vertices(functional, u_D, floors, flux)
     held = np.zeros(len(v))
     held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
     bumps, taken = np.zeros((2, floors.facets))
@@ -321,12 +345,14 @@ class Boundary:
         alpha: Obstacle on Γ1, seen from the cells.
         scale: Size of the values.
         goal: What ‖∇ℓ‖ need not be known better than.
+        highest: The largest κ.
     """
 
     u_D: OnParts
     alpha: OnParts
     scale: float
     goal: float
+    highest: float
 
     def contradictions(self, cells: Cells, v: FloatArray) -> list[str | None]:
         """Tell which data no function can satisfy, from v at the vertices; this rank's facets."""
@@ -347,12 +373,7 @@ class Boundary:
         """
         fixed, contact = self.u_D.side, self.alpha.side
         lifts = [
-            joined(
-                [
-                    _lift(cells, part, v, bumps, thirds, self.scale, self.goal, obstacle)
-                    for part in data.parts
-                ]
-            )
+            joined([_lift(cells, part, v, bumps, thirds, self, obstacle) for part in data.parts])
             for data, obstacle in ((self.u_D, False), (self.alpha, True))
         ]
         # y·n is constant on a facet: the mean of v + ℓ − α
@@ -361,8 +382,9 @@ class Boundary:
         if cells.tdim == 2:
             above += signs * 2.0 / 3.0 * bumps[contact.dofs]
         above += lifts[1].beyond / measures(cells, contact)
+        force = flux.contact if flux.carried is None else flux.contact + flux.carried
         return (
-            np.where(flux.contact > 0, flux.contact * np.maximum(above, 0.0), 0.0),
+            np.where(force > 0, force * np.maximum(above, 0.0), 0.0),
             (
                 np.concatenate([fixed.cells, contact.cells]),
                 np.concatenate([lift.steep for lift in lifts]),
@@ -374,9 +396,13 @@ class Boundary:
 
 
 def _at_vertices(
-    functional: Functional, u_D: OnParts, floors: Floors, touching: BoolArray
-) -> FloatArray:
-    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D."""
+    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux
+) -> tuple[FloatArray, BoolArray]:
+    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D.
+
+    Returns:
+        They, and on which facets of Γ1 they are α or β at both ends, and the bump should be theirs.
+    """
     cells, w, kappa, masses = functional.cells, functional.w, functional.kappa, functional.masses
     index_map = cells.domain.mesh.topology.index_map(0)
     size = index_map.size_local + index_map.num_ghosts
@@ -387,22 +413,35 @@ def _at_vertices(
 
     if kappa.ndim or masses.some:
         weights = np.tile(kappa + masses.reaction * cells.volume, (len(w), 1))
-        for ends in cells.others[masses.side.local].T:
+        moved = np.zeros_like(weights)
+        for ends, toward in zip(cells.others[masses.side.local].T, masses.toward[:-1], strict=True):
             np.add.at(weights, (ends, masses.side.cells), masses.loss)
-        v = collect(flat, (weights * w).ravel())
+            np.add.at(moved, (ends, masses.side.cells), masses.loss * toward)
+        v = collect(flat, (weights * w + moved).ravel())
         v /= np.maximum(collect(flat, weights.ravel()), np.finfo(float).tiny)
     else:
         v = collect(flat, w.ravel())
         v /= np.maximum(collect(flat, None), 1.0)
+    at_bound, loss = flux.touching.copy(), np.zeros(floors.facets)
+    loss[masses.side.dofs] = masses.loss
     for sign, limit in floors.at_vertices:
-        there = floors.side.ends[:, touching & (floors.signs == sign)]
+        here = flux.touching & (floors.signs == sign)
+        there = floors.side.ends[:, here]
         held = collect(there.ravel(), None) > 0
+        if masses.some:
+            # what leaving t/b for α costs in ‖p − b‖², and what not doing so costs in 4C
+            of_b, of_force = (
+                collect(there.ravel(), np.tile(each[here], len(there)))
+                for each in (loss[floors.side.dofs], 2.0 * (cells.tdim + 1) * flux.contact)
+            )
+            held &= of_b * np.where(held, sign * v - limit, 0.0) <= of_force
+        at_bound[here] = held[there].all(axis=0)
         moved = np.where(held, limit, np.maximum(sign * v, limit))
         np.copyto(v, sign * moved, where=limit > -np.inf)
     ends = u_D.side.ends.ravel()
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ends.ravel()) / np.maximum(count, 1.0), where=count > 0)
-    return v
+    return v, at_bound
 
 
 def _solved(
@@ -543,8 +582,10 @@ class _OfHeights:
                 mass = self._mass(part)
                 energy += float(np.sum(mass * distance(excess[:, part], None)))
                 slope[:, part] += masses.pull(cells, excess[:, part], part)
-        ends = excess[cells.others[masses.side.local].T, masses.side.cells]
+        first, last, height = masses.toward
+        ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
         energy += float(np.sum(masses.loss * distance(ends, None)))
+        energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
         np.add.at(slope, self.at, masses.pull_on_facets(excess, cells.others))
         return energy, slope
 
@@ -678,18 +719,19 @@ def _lift(
     v: FloatArray,
     bumps: FloatArray,
     thirds: FloatArray,
-    scale: float,
-    goal: float,
+    boundary: Boundary,
     obstacle: bool,
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
     side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
     v, bumps, thirds = (data.sign * values for values in (v, bumps, thirds))
     if cells.tdim != 2:
-        return affine(cells, side, trace, v[side.ends], ends, scale)
+        return affine(cells, side, trace, v[side.ends], ends, boundary.scale)
     third = cells.ways_between(*side.ends) * thirds[side.dofs]
     companion = Cubic(v[side.ends], bumps[side.dofs], third)
-    base = None
-    if obstacle and len(data.condition.bounds) == 1:
+    base, lossy = None, data.condition.loss
+    loss = 0.0 if lossy is None else number(lossy) or 0.0
+    if obstacle and len(data.condition.bounds) == 1 and loss == 0.0:
         base = Cubic(ends, middle - ends.mean(axis=0), third)
-    return lift(cells, side, trace, base, companion, scale, goal, obstacle)
+    ratio = loss / boundary.highest
+    return lift(cells, side, trace, base, companion, boundary.scale, boundary.goal, obstacle, ratio)

@@ -17,7 +17,17 @@ from mpi4py import MPI
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import NOTHING, Known, VolumeMoments, reacts, to_cells
-from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..fem.cells import (
+    BoundaryFacets,
+    Cells,
+    Layers,
+    blocks,
+    dot_rows,
+    measures,
+    pick,
+    poincare,
+    sum_rows,
+)
 from ..vi.active import touching
 from .beyond import Beyond
 from .descent import descend, nonzero
@@ -40,6 +50,8 @@ class Flux:
         beyond: What y has beyond the Raviart-Thomas field; None where that is all.
         taken_up: Where c takes up what is left, shape (cells,); None for nowhere on any rank.
         shed: ∫_F (g − b u_h − y·n) for b to take up, in the order of `Known`; None for nothing.
+        carried: What contact forces may have to be changed by for the sake of what is left, in the
+            order of `contact`; None where that goes elsewhere.
     """
 
     excess: FloatArray
@@ -50,6 +62,7 @@ class Flux:
     beyond: Beyond | None = None
     taken_up: BoolArray | None = None
     shed: FloatArray | None = None
+    carried: FloatArray | None = None
 
     @property
     def loose(self) -> FloatArray:
@@ -320,8 +333,10 @@ def unbalanced(
         part = float(np.sum(coarser.diameters**2 * square / kappa_min))
         bound += poincare(cells.tdim) * np.sqrt(cells.comm.allreduce(part))
     if len(meshes) > 1:
-        cells = diffusion(meshes[0].data).cells  # kept: all finer meshes ask for the same walk
-    return min(taken_up, float(bound + _carried(cells.unstretched(), left, kappa_min, size)))
+        coarsest = diffusion(meshes[0].data)
+        cells, reaction = coarsest.cells, coarsest.reaction  # kept, with the walk on them
+    plain = cells.unstretched()
+    return min(taken_up, float(bound + _carried(plain, left, kappa_min, size, reaction)))
 
 
 def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
@@ -359,38 +374,53 @@ WORTH = 1e-3
 """Part of the bound from which on what is left of the equation is carried away by y itself."""
 
 
-def _carry(cells: Cells, left: FloatArray) -> tuple[FloatArray, bool]:
+def _carry(
+    cells: Cells, left: FloatArray, layers: Layers | None = None, takers: int = 0
+) -> tuple[FloatArray, bool]:
     """Fluxes of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
 
     q·n vanishes on the boundary but Γ0. Cell after cell, the farthest from Γ0 first, sends what it
     holds through the facets by which a walk from Γ0 first came to it, the same through each: so q
     does not depend on how cells and facets are numbered.
 
+    Args:
+        cells: The mesh.
+        left: Shape (cells,).
+        layers: The walk; None for that from Γ0.
+        takers: How many cells of this rank are in no layer: they keep what they get.
+
     Returns:
         Fluxes out of each cell, shape (d + 1, cells), and whether all cells have a way.
     """
     comm = cells.comm
+    layers = cells.layers if layers is None else layers
     fluxes = np.zeros((cells.tdim + 1, cells.number))
     arrived = np.zeros(len(cells.exterior))
-    for layer, ways in reversed(cells.layers):
+    kept = np.ones(cells.number, dtype=bool)
+    for layer, ways in reversed(layers):
         facets = cells.facets[:, layer]
         inflow = arrived[facets]
         outflow = np.broadcast_to(
             -(left[layer] + inflow.sum(axis=0)) / ways.sum(axis=0), ways.shape
         )
-        fluxes[:, layer] = np.where(ways, outflow, inflow)
+        fluxes[:, layer], kept[layer] = np.where(ways, outflow, inflow), False
         arrived[facets[ways]] = -outflow[ways]
         if comm.size > 1:
             arrived[cells.between] += cells.from_others(facets[ways], -outflow[ways])
-    reached = cells.total(sum(len(layer) for layer, _ in cells.layers), cells.number)
+    reached = cells.total(sum(len(layer) for layer, _ in layers) + takers, cells.number)
+    if takers:
+        fluxes[:, kept] = arrived[cells.facets[:, kept]]
     return fluxes, bool(reached[0] == reached[1])
 
 
-def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float) -> float:
+def _carried(
+    cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float, reaction: FloatArray
+) -> float:
     """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
 
     Where q leaves through facets with a b, that takes up ‖b^{-1/2} q·n‖ there. Where a walk's q is
-    not small against `size`, one that is nearly the smallest takes its place.
+    not small against `size`, one that is nearly the smallest takes its place. Where cells have no
+    way to Γ0 or a b, all is carried to cells with a c as well, and that takes up what they get.
     """
 
     def norm(fluxes: FloatArray) -> float:
@@ -403,13 +433,73 @@ def _carried(cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float)
 
     fluxes, all_reached = _carry(cells, left)
     if not all_reached:
-        return np.inf
+        if not reaction.ndim:
+            return np.inf
+        takers = reaction > 0.0
+        layers = cells.layered([cells.sides[part].dofs for part in cells.fixed], takers)
+        fluxes, all_reached = _carry(cells, left, layers, int(takers.sum()))
+        kept = (left + sum_rows(fluxes))[takers]
+        square = float(np.sum(kept**2 / (reaction * cells.volume)[takers]))
+        total = float(cells.total(square)[0])
+        return float(np.hypot(norm(fluxes), np.sqrt(total))) if all_reached else np.inf
     found = norm(fluxes)
     if found > WORTH * size:
         fluxes = _diffused(cells, left, kappa_min)
         rest, _ = _carry(cells, left + sum_rows(fluxes))
         found = min(found, norm(fluxes + rest))
     return found
+
+
+def carried_to_contact(
+    cells: Cells,
+    flux: Flux,
+    left: FloatArray,
+    kappa_min: FloatArray,
+    on_contact: BoundaryFacets,
+    reaction: FloatArray,
+    signed: bool,
+) -> tuple[float, FloatArray]:
+    """Carry to facets in contact, too, what has no other way; collective.
+
+    Args:
+        cells: The mesh.
+        flux: y.
+        left: Integrals over the cells, shape (cells,).
+        kappa_min: Lower bound of κ's eigenvalues on each cell, shape (cells,) or ().
+        on_contact: The facets of Γ1, once for each bound.
+        reaction: c, shape (cells,) or ().
+        signed: Whether these are the integrals; if not, they bound them.
+
+    Returns:
+        W as `unbalanced` has it for e less what e has on Γ1, ∞ where there is none; and by how much
+        that changes each contact force at most, shape (n,).
+    """
+    plain = cells.unstretched()
+    mean = cells.total(float(flux.contact.sum()), float(flux.touching.sum()))
+    firm = flux.contact >= 0.5 * mean[0] / max(mean[1], 1.0)
+    firm &= flux.touching
+    takers = np.broadcast_to(reaction > 0.0, cells.number)
+    exits = [*(cells.sides[part].dofs for part in cells.fixed), on_contact.dofs[firm]]
+    fluxes, all_reached = _carry(plain, left, plain.layered(exits, takers), int(takers.sum()))
+    change = np.where(firm, np.abs(fluxes[on_contact.local, on_contact.cells]), 0.0)
+    enough = not (change > flux.contact).any()
+    if not (all_reached and cells.comm.allreduce(enough, op=MPI.LAND)):
+        return np.inf, change
+    if signed:
+        squares = field_squares(plain, fluxes)
+    else:  # of a sum of one field for each facet, whatever the signs
+        units = np.eye(len(fluxes))[:, :, None] * np.ones(cells.number)
+        sizes = [np.sqrt(np.maximum(field_squares(plain, unit), 0.0)) for unit in units]
+        squares = dot_rows(np.abs(fluxes), np.stack(sizes)) ** 2
+    square = float(np.sum(squares / kappa_min))
+    for part, loss in plain.sinks.items():
+        side = plain.sides[part]
+        square += float(
+            np.sum(fluxes[side.local, side.cells] ** 2 / (loss * measures(plain, side)))
+        )
+    kept = (left + sum_rows(fluxes))[takers]
+    square += float(np.sum(kept**2 / (reaction * cells.volume)[takers])) if kept.size else 0.0
+    return float(np.sqrt(cells.total(square)[0])), change
 
 
 def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:

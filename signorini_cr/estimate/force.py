@@ -57,44 +57,7 @@ class Interval(NamedTuple):
     upper: float
 
 
-def force_bounds(solution: Certified) -> tuple[float, float]:
-    """Two numbers with the contact force of u itself between them; collective.
-
-    The force is ∫_Γ1 λ, λ = κ∂ₙu + b (u − u_ext) − g, which is κ∂ₙu unless the condition says more.
-
-    Args:
-        solution: One with a certified bound.
-
-    Raises:
-        InputError: There is no bound; the message says why.
-    """
-    return _interval(solution, diffusion(_certified(solution).level.data).forms.bounded)[1:]
-
-
-def flux(solution: Certified, *parts: str) -> Interval:
-    """Put what flows into Ω through parts of the boundary between two numbers; collective.
-
-    On a Dirichlet part that is ∫ κ∂ₙu, on a contact part the contact force, as in `force_bounds`.
-
-    Args:
-        solution: One with a certified bound.
-        *parts: Names of Dirichlet or contact parts that touch no others of these.
-
-    Raises:
-        InputError: There is no such part, or there is no bound; the message says why.
-    """
-    forms = diffusion(_certified(solution).level.data).forms
-    known = {c.part: c for c in (*forms.fixed, *forms.bounded)}
-    for part in parts:
-        if part not in known:
-            raise InputError(
-                f"{part!r} is no Dirichlet or contact part of the boundary; there are"
-                f" {', '.join(known)}"
-            )
-    return _interval(solution, [known[part] for part in parts])
-
-
-def _certified(solution: Certified) -> Made:
+def made_of(solution: Certified) -> Made:
     """Return what the certificate is made of; an error where there is none."""
     certificate = solution.certificate
     if certificate._made is None or certificate.bound_h1 is None:
@@ -102,41 +65,53 @@ def _certified(solution: Certified) -> Made:
     return certificate._made
 
 
-def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
+def interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     """Bound ∫ λ over parts; collective.
 
     With φ = 1 on them and φ = 0 on the rest of Γ0 and Γ1 it is a(u, φ) − χ(φ), and the certificate
     knows a ball that A u is in. φ is found by solving for nearly the least ‖Aφ‖, as accurately as
     the figures deserve; that costs about as much as the solve.
     """
-    made = _certified(solution)
+    made = made_of(solution)
     if made.varies or made.level.domain.mesh.topology.dim != 2:
         raise InputError(f"{NO_BOUNDS}: {VARIES if made.varies else SPATIAL}")
     cells = made.cells()
     phi = _weight(solution, conditions)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     work, slack = against(made, cells, at)
-    force = 0.0
-    for condition in conditions:
-        if condition.number in made.forces:
-            force += made.forces[condition.number]
-        else:
-            side = cells.sides[condition.number]
-            force += float(np.sum(made.through(cells)[side.local, side.cells]))
-    at_fixed = any(condition.fixed is not None for condition in conditions)
-    value, middle, energy, unsure = cells.total(
-        force,
-        force + 0.5 * work,
-        square(made, cells, at),
-        # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
-        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if at_fixed else 0.0,
+    force = sum(through(made, cells, condition) for condition in conditions)
+    value, middle, energy, more = cells.total(
+        force, force + 0.5 * work, square(made, cells, at), unsure(made, at, slack)
     )
-    reach = made.reach * np.sqrt(energy) + unsure
+    at_fixed = any(condition.fixed is not None for condition in conditions)
+    # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
+    exits = at_fixed or made.on_contact_alone
+    reach = made.reach * np.sqrt(energy) + (more if exits else 0.0)
     # a force off one bound only has its sign
     signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
     lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
     lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
     return Interval(float(value), lower, upper)
+
+
+def through(made: Made, cells: Cells, condition: Condition) -> float:
+    """Return ∫ λ_h on a contact part, ∫ y·n on a Dirichlet part; this rank's share."""
+    if condition.number in made.forces:
+        return made.forces[condition.number]
+    side = cells.sides[condition.number]
+    return float(np.sum(made.through(cells)[side.local, side.cells]))
+
+
+def unsure(made: Made, at: FloatArray, slack: FloatArray) -> float:
+    """Bound what is left of −div y = f times φ where φ does not vanish on Γ0; this rank's share.
+
+    Args:
+        made: What is left.
+        at: φ of P1 at the cells' vertices, shape (3, cells).
+        slack: From `against`.
+    """
+    largest = np.abs(at).max(initial=0.0)
+    return float(np.sum(slack) + made.missed * largest)
 
 
 def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray]:
@@ -242,7 +217,7 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
         return phi
     marks.x.array[:] = 0.0
     marks.x.array[chosen] = 1.0
-    return extended(marks, np.concatenate(parts), _certified(solution))
+    return extended(marks, np.concatenate(parts), made_of(solution))
 
 
 def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Function:

@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
 from ..data.jets import Enclosure, Jet, Unknown
-from ..data.moments import Trace
+from ..data.moments import OnParts, Trace
 from ..data.ranges import Pieces, refine
 from ..fem.cells import BoundaryFacets, Cells, corner_points
 
@@ -114,6 +114,7 @@ def lift(
     scale: float,
     goal: float,
     obstacle: bool,
+    ratio: float = 0.0,
 ) -> Lift:
     """Enclose data less a polynomial, and bound the lifting; collective.
 
@@ -126,6 +127,7 @@ def lift(
         scale: Size of the values, by which rounding is told.
         goal: What ‖∇ℓ‖ need not be known better than.
         obstacle: Whether δ is the positive part of the difference.
+        ratio: b over the largest κ, by which ‖ℓ‖²_F counts beside ‖∇ℓ‖²_T.
     """
     n, name = len(side.cells), "α" if obstacle else "u_D"
     if trace.constant is not None:
@@ -133,7 +135,7 @@ def lift(
     seen = _Triangles.of(cells, side)
     length, height = seen.length, seen.height
     try:
-        found = _enclosed(cells, side, trace, base, v, scale, goal, obstacle, seen)
+        found = _enclosed(cells, side, trace, base, v, scale, goal, obstacle, ratio, seen)
     except Unknown as error:
         return Lift.none(np.zeros(n), NO_RANGE.format(name, error))
     pieces = found.pieces
@@ -224,12 +226,13 @@ def _enclosed(
     scale: float,
     goal: float,
     obstacle: bool,
+    ratio: float,
     seen: _Triangles,
 ) -> _Enclosed:
     """Enclose δ piece by piece, as finely as `goal` asks for; collective.
 
     Args:
-        cells: As for `lift`, and so are the next seven.
+        cells: As for `lift`, and so are the next eight.
         side: The facets.
         trace: The data.
         base: α_I.
@@ -237,6 +240,7 @@ def _enclosed(
         scale: Size of the values.
         goal: What ‖∇ℓ‖ need not be known better than.
         obstacle: Whether δ is the positive part of the difference.
+        ratio: b over the largest κ.
         seen: The cells, as they are seen from the facets.
 
     Raises:
@@ -245,8 +249,15 @@ def _enclosed(
     n, polynomial, whole = len(side.cells), base or v, Pieces.of_facets(cells, side)
 
     def steepness(pieces: Pieces) -> FloatArray:
-        bound = _bounds(trace, pieces, polynomial, cells, seen.length, scale)
-        return np.stack([seen.parts(pieces, *bound[:2]).sum(axis=0), *bound])
+        size, steep, least = _bounds(trace, pieces, polynomial, cells, seen.length, scale)
+        if obstacle and base is None:
+            # δ is a positive part, and 0 where the difference is shown to be negative
+            signed = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0]
+            size = np.fmin(size, np.maximum(signed, 0.0))
+            steep = np.where(signed <= 0.0, 0.0, steep)
+        square = seen.parts(pieces, size, steep).sum(axis=0)
+        square = square + 2.0 * ratio / seen.height[pieces.parent] * size**2
+        return np.stack([square, size, steep, least])
 
     weights = np.zeros((4, n))
     weights[0] = 0.5 * seen.height * seen.length / goal**2
@@ -258,11 +269,52 @@ def _enclosed(
     jumps = _jump_at_ends(trace, whole, polynomial, cells, JUMP * scale, obstacle)
     clear = np.zeros(n, dtype=bool)
     if obstacle:
-        below = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0] <= 0
+        below = size <= 0.0
+        if base is not None:
+            below = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0] <= 0
         clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
-        if base is None:
-            size, steep = (np.where(below, 0.0, values) for values in (size, steep))
     return _Enclosed(pieces, size, steep, least, jumps, clear)
+
+
+def gaps(
+    cells: Cells, bounds: OnParts, v: FloatArray, bumps: FloatArray, thirds: FloatArray | None
+) -> FloatArray:
+    """Bound from below how far v is off its bounds on each facet, d = 2, shape (n,); collective.
+
+    Args:
+        cells: The mesh.
+        bounds: α and −β on Γ1, seen from the cells.
+        v: v at the vertices.
+        bumps: Heights of its bumps.
+        thirds: Those of its cubics; or None.
+    """
+    found: list[FloatArray] = [np.zeros(0)]
+    for data in bounds.parts:
+        side, trace = data.side(cells), data.trace
+        third: FloatArray = np.zeros(len(side.cells))
+        if thirds is not None:
+            third = cells.ways_between(*side.ends) * thirds[side.dofs]
+        own = Cubic(data.sign * v[side.ends], data.sign * bumps[side.dofs], data.sign * third)
+        pieces = Pieces.of_facets(cells, side)
+        for _ in range(QUARTERS):
+            pieces = pieces.halves()
+        above: FloatArray
+        if trace.constant is not None:
+            s = pieces.hats[:, 1]
+            ends = np.stack([own.at(pieces.parent, t) for t in s])
+            width = np.abs(s[1] - s[0])
+            bend = 4.0 * np.abs(own.height) + 3.0 * np.abs(own.third)
+            off = trace.constant - ends.min(axis=0) + bend[pieces.parent] * width**2 / 4.0
+            above = np.asarray(off)
+        else:
+            length = _Triangles.of(cells, side).length
+            try:
+                above = _bounds(trace, pieces, own, cells, length, 1.0, signed=True)[0]
+            except Unknown:
+                above = np.full(pieces.parent.shape, np.inf)
+        found.append(np.full(len(side.cells), np.inf))
+        np.minimum.at(found[-1], pieces.parent, -above)
+    return np.concatenate(found)
 
 
 def _bounds(

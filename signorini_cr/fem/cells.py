@@ -101,6 +101,9 @@ class BoundaryFacets:
         return np.column_stack([self.cells, self.local]).astype(np.int32)
 
 
+Layers = list[tuple[IndexArray, BoolArray]]
+
+
 class Cells:
     """What the certificate needs to know of a mesh.
 
@@ -241,11 +244,20 @@ class Cells:
         return mark.array > 0
 
     @cached_property
-    def layers(self) -> list[tuple[IndexArray, BoolArray]]:
-        """Cells by the number of facets between them and Γ0, nearest first.
+    def layers(self) -> Layers:
+        """Cells by the number of facets between them and Γ0 or a part with a b, nearest first."""
+        return self.layered([self.sides[part].dofs for part in self.fixed])
 
-        Each layer has its cells, shape (n,), and which of their local facets lead back towards Γ0,
-        shape (d + 1, n): one or more.
+    def layered(self, exits: Sequence[IndexArray], takers: BoolArray | None = None) -> Layers:
+        """Sort cells by the number of facets between them and others, nearest first; collective.
+
+        Args:
+            exits: Facet dofs that count as between a cell and the outside.
+            takers: Cells that have no way to go, shape (cells,); None for none.
+
+        Returns:
+            For each layer its cells, shape (n,), and which of their local facets lead back, shape
+            (d + 1, n): one or more. Takers are in none.
         """
         d = self.tdim
         owners = np.full((2, len(self.exterior)), -1)
@@ -253,10 +265,10 @@ class Cells:
         owners[0, flat] = cell
         other = owners[0, flat] != cell
         owners[1, flat[other]] = cell[other]
-        reached = np.zeros(self.number, dtype=bool)
+        reached = np.zeros(self.number, dtype=bool) if takers is None else takers.copy()
         front = np.zeros(len(self.exterior))
-        for part in self.fixed:
-            front[self.sides[part].dofs] = 1.0
+        for dofs in (*exits, self.facets[:, reached].ravel()):
+            front[dofs] = 1.0
         seen = self.share(front) > 0
         found, layers = np.flatnonzero(seen), []
         while self.comm.allreduce(len(found)) > 0:

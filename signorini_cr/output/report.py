@@ -26,7 +26,8 @@ from petsc4py import PETSc
 from .. import __version__
 from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
-from ..estimate.force import NO_BOUNDS, flux, force_bounds
+from ..estimate.force import NO_BOUNDS
+from ..force import flux, force_bounds
 from ..means import NO_MEAN, mean
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text

@@ -11,6 +11,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
+from signorini_cr.data import loads
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
 from signorini_cr.data.moments import OnParts
@@ -650,6 +651,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     v = SimpleNamespace(vertices=vertices, bumps=bumps, cusps=SimpleNamespace(at=at, means=means))
     sums = SimpleNamespace(steepness=steepness)
     known = SimpleNamespace(
+        flux=SimpleNamespace(carried=None),
         level=level,
         cells=cells,
         kappa=kappa,
@@ -714,9 +716,9 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     assert least < other and np.isclose(other, least + apart, rtol=1e-7)
     # A few steps, and what is left carried as a walk does, are between the two
     monkeypatch.setattr(flux, "STEPS", 10)
-    found = flux._carried(cells, left, kappa, 0.0)
+    found = flux._carried(cells, left, kappa, 0.0, np.array(0.0))
     assert np.sqrt(least) < found < np.sqrt(other)
-    assert np.isclose(flux._carried(cells, left, kappa, np.inf), np.sqrt(other))
+    assert np.isclose(flux._carried(cells, left, kappa, np.inf, np.array(0.0)), np.sqrt(other))
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3, 1e9])
@@ -836,7 +838,8 @@ def test_energy_of_a_function_of_degree_two():
     np.add.at(falls, cells.facets, slopes.facets)
     traces = kappa * cells.trace(slice(0, cells.number))
     curvature = 4 / 3 * cells.over_facets(np.tile(traces, (3, 1)))
-    none = companion.Masses(False, np.array(0.0), BoundaryFacets.joined([], 2), np.empty(0))
+    rim_without = BoundaryFacets.joined([], 2), np.empty(0), np.empty((3, 0)), np.empty(0, bool)
+    none = companion.Masses(False, np.array(0.0), *rim_without)
     functional = companion.Functional(cells, None, kappa, None, none)
     found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, whole)
@@ -998,15 +1001,16 @@ def test_contact_term_with_liftings(monkeypatch):
     bumps = rng.normal(size=len(cells.exterior))
     v = rng.normal(size=cells.vertices.max() + 1) + 1.0
     through = rng.uniform(size=3) * [1, 1, 0]
-    y = SimpleNamespace(contact=through)
-    boundary = companion.Boundary(u_D, alpha, 1.0, 1e-3)
+    more = np.array([0.5, 0.0, 0.0])
+    y = SimpleNamespace(contact=through, carried=more)
+    boundary = companion.Boundary(u_D, alpha, 1.0, 1e-3, 1.0)
     contact, (at, steep, area, edge), reasons = boundary.lifted(cells, y, v, bumps, 0 * bumps)
     side, found = sides[True], lifts[True]
     for i in range(3):
         a, b = v[side.ends[:, i]]
         above = (a + b) / 2 + 2 / 3 * bumps[side.dofs[i]] - found.least[i]
         above += found.beyond[i] / np.ptp(corner_points(cells, side)[1][:, i, 0])
-        assert np.isclose(contact[i], through[i] * max(above, 0.0))
+        assert np.isclose(contact[i], (through[i] + more[i]) * max(above, 0.0))
     assert np.array_equal(at, np.concatenate([sides[kind].cells for kind in (False, True)]))
     assert np.array_equal(steep, np.concatenate([lifts[kind].steep for kind in (False, True)]))
     assert np.array_equal(area, np.concatenate([lifts[kind].area for kind in (False, True)]))
@@ -1022,7 +1026,8 @@ def test_energy_with_masses():
     excess, bumps = rng.normal(size=(3, cells.number)), rng.normal(size=len(cells.exterior))
     side = cells.sides[2]
     loss = rng.uniform(1, 4, len(side.cells))
-    masses = companion.Masses(True, np.array(c), side, loss)
+    toward = rng.normal(size=(3, len(loss)))
+    masses = companion.Masses(True, np.array(c), side, loss, toward, loss > 2.0)
     points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
     hats = np.column_stack([1 - points.sum(axis=1), points])
     t, gauss = np.polynomial.legendre.leggauss(4)
@@ -1034,9 +1039,10 @@ def test_energy_with_masses():
         values = hats @ excess + products.T @ height
         total += c * np.sum(2 * weights @ values**2 * cells.volume)
         for i, b in enumerate(loss):
-            ends = excess[cells.others[side.local[i]], side.cells[i]]
+            ends = excess[cells.others[side.local[i]], side.cells[i]] - toward[:2, i]
+            height = bumps[side.dofs[i]] - toward[2, i]
             s = (t + 1) / 2
-            on_facet = ends[0] * (1 - s) + ends[1] * s + 4 * s * (1 - s) * bumps[side.dofs[i]]
+            on_facet = ends[0] * (1 - s) + ends[1] * s + 4 * s * (1 - s) * height
             total += b * (gauss @ on_facet**2) / 2
         return total
 
@@ -1126,7 +1132,8 @@ def test_bumps_that_touch_the_obstacle():
 def test_size_of_what_v_is_compared_with(monkeypatch):
     """The largest |v|, also where v is negative."""
     scales, lift_ = [], companion._lift
-    monkeypatch.setattr(companion, "_lift", lambda *all_: scales.append(all_[5]) or lift_(*all_))
+    noted = lambda *all_: scales.append(all_[5].scale) or lift_(*all_)  # noqa: E731
+    monkeypatch.setattr(companion, "_lift", noted)
     solution = solve(Problem(f=-1.0, dirichlet=-3.0, obstacle=-9.0), square(3))
     v = certificate.certify(solution).companion_at_vertices
     largest = WORLD.allreduce(np.abs(v).max(initial=0.0), op=MPI.MAX)
@@ -1155,7 +1162,7 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     alpha = np.full((2, len(contact.cells)), height), np.full(len(contact.cells), height)
     signs = np.ones(len(contact.cells))
     limits = ((1, cells.largest_at_vertices(contact.ends, alpha[0])),)
-    floors = companion.Floors(contact, signs, *alpha, limits, len(cells.exterior))
+    floors = companion.Floors(contact, signs, *alpha, limits, signs < 0.0, len(cells.exterior))
     start = companion.Draft(np.zeros(len(rim)), np.zeros(len(free)), loose, free)
     functional = companion.Functional(cells, w, kappa, np.array(True), None)
     v, bumps, found = companion._solved(functional, start, floors)
@@ -1237,6 +1244,40 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     for name, more in (("middle", sums.totals.near), ("across", sums.totals.far)):
         assert np.allclose(getattr(sums, name), (np.sqrt(before[name]) + norms) ** 2)
         assert np.isclose(more, np.sum(2 * np.sqrt(before[name]) * norms))
+
+
+@pytest.mark.serial
+def test_size_of_the_field_that_carries_a_quadratic_flux():
+    """Not below the norm of the gradient with these fluxes, by polynomials of degree 8, nor far."""
+    rng = np.random.default_rng(21)
+    points, weights = basix.make_quadrature(basix.CellType.triangle, 16)
+    t, gauss = np.polynomial.legendre.leggauss(9)
+    powers = [(i, j) for i in range(9) for j in range(9 - i)]
+    domain = square(2, comm=MPI.COMM_SELF)
+    domain.mesh.geometry.x[:, :2] += rng.uniform(-0.15, 0.15, (len(domain.mesh.geometry.x), 2))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    for side in cells.sides.values():
+        n = len(side.cells)
+        a, c = rng.normal(size=(2, n))
+        bounds = loads._of_quadratic(cells, side, a, c)
+        affine = loads._of_quadratic(cells, side, a, 0.0 * c)
+        apex, (first, last) = corner_points(cells, side)
+        for i in range(n):
+            edges = np.column_stack([last[i] - first[i], apex[i] - first[i]])
+            inverse, area = np.linalg.inv(edges), abs(np.linalg.det(edges))
+            x, y = points.T
+            slopes = np.array(
+                [(p * x ** max(p - 1, 0) * y**q, q * x**p * y ** max(q - 1, 0)) for p, q in powers]
+            )
+            slopes = np.einsum("bcq,cd->bdq", slopes, inverse)
+            matrix = area * np.einsum("adq,bdq,q->ab", slopes, slopes, weights)
+            s = (t + 1) / 2
+            length = np.linalg.norm(last[i] - first[i])
+            for parts, bound in (((a[i], c[i]), bounds[i]), ((a[i], 0.0), affine[i])):
+                flux = parts[0] * (1 - 2 * s) + parts[1] * (6 * s * (1 - s) - 1)
+                load = [length * (gauss / 2) @ (flux * s**p) * (q == 0) for p, q in powers]
+                least = np.sqrt(load @ np.linalg.lstsq(matrix, load, rcond=1e-11)[0])
+                assert least <= bound * (1 + 1e-9) and bound <= 1.5 * least
 
 
 @pytest.mark.serial

@@ -12,14 +12,16 @@ from dolfinx.la import InsertMode
 from dolfinx.mesh import compute_midpoints, create_box, exterior_facet_indices, meshtags
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, Polygon, Problem, solve, solve_levels
+from signorini_cr import Contact, Domain, InputError, Neumann, Polygon, Problem, solve, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate as module
 from signorini_cr.estimate import cusps
 from signorini_cr.estimate.certificate import certify
-from signorini_cr.estimate.force import _weight, force_bounds
+from signorini_cr.estimate.force import _weight
+from signorini_cr.force import force_bounds
+from signorini_cr.means import mean
 from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
@@ -73,6 +75,20 @@ class Pointwise:
         found = [(to_cells.links(facet)[0], facet) for facet in domain.tags.find(part)]
         own = [(cell, facet) for cell, facet in found if cell < self.number]
         return [(cell, to_facets.links(cell).tolist().index(facet)) for cell, facet in own]
+
+
+def smallest_curl(gradients, local, reference, weights):
+    """Root of the mean of |∇ψ|², ψ = λ_j λ_k (1 + β λ_i) with the best β, i the local vertex."""
+    hats = np.column_stack([1 - reference.sum(axis=1), reference])
+    i, (j, k) = local, [one for one in range(3) if one != local]
+    a, b, c = (hats[:, [one]] for one in (i, j, k))
+    by_a, by_b, by_c = gradients.T[[i, j, k]]
+    bump = c * by_b + b * by_c
+    bubble = a * bump + b * c * by_a
+    squares = [
+        weights @ (p * q).sum(axis=1) for p, q in ((bump,) * 2, (bump, bubble), (bubble,) * 2)
+    ]
+    return np.sqrt(squares[0] - squares[1] ** 2 / squares[2])
 
 
 def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=False, phi=None):
@@ -153,6 +169,10 @@ def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=F
                 c = poincare * at.h[cell]
                 c = np.sqrt(measure / at.volume[cell] * c * (c + 2 * at.h[cell] / d))
                 on_edge[cell] = c * np.sqrt(measure * facet_weights @ off**2)
+                if d == 2:  # g is affine: the curl of a cubic has its flux
+                    small = smallest_curl(at.gradients[cell], local, reference, weights)
+                    small *= np.sqrt(3.0 * at.volume[cell] * facet_weights @ off**2) * measure
+                    on_edge[cell] = min(on_edge[cell], small)
                 rise = potential(np.array([[cell]]), where)[0] / k[cell]
                 of_flux[cell] += measure * facet_weights @ (off * rise)
                 change = measure * facet_weights @ (off * (v_F - u_F)[:, 0])
@@ -532,3 +552,46 @@ def test_tetrahedra():
         level = Level((NestedMesh(Diffusion(Problem(**data, **curved), mesh), domain),))
         solution.level, solution.u = level, fem.Function(level.V)
         assert "affine on the facets" in certify(solution).reason
+
+
+def pressed(f=-1.0, rule=4):
+    """A rectangle with insulated sides that lies on an obstacle."""
+    sides = ("floor", "wall", "wall", "wall")
+    polygon = Polygon([[0, 0], [2, 0], [2, 1], [0, 1]], sides, names=("floor", "wall"))
+    conditions = {"floor": Contact(0.0), "wall": Neumann()}
+    return Problem(f=f, quadrature_degree=rule, conditions=conditions), polygon
+
+
+def test_contact_alone_holds_the_domain():
+    """u = y²/2 − y above 0 for f = −1: contact everywhere, the force is 2."""
+    problem, polygon = pressed()
+    exact = lambda x: x[1] ** 2 / 2 - x[1]  # noqa: E731
+    for solution in solve_levels(problem, polygon.mesh(0.3), 3):
+        certificate, x = solution.certificate, ufl.SpatialCoordinate(solution.domain.mesh)
+        off = ufl.grad(solution.u - exact(x))
+        square = WORLD.allreduce(fem.assemble_scalar(fem.form(ufl.inner(off, off) * ufl.dx)))
+        assert np.sqrt(square) <= certificate.bound_energy_norm <= 1.1 * np.sqrt(square)
+        low, high = certificate.energy  # ½∫|∇u|² − ∫ f u = −½ ∫ (y − 1)² over the rectangle
+        assert low <= -1 / 3 <= high
+        low, high = force_bounds(solution)
+        assert low <= 2.0 * (1 + 1e-12) and high >= 2.0 * (1 - 1e-12) and high - low < 1e-6
+        with pytest.raises(InputError, match="how high it is"):
+            mean(solution)
+
+
+def test_contact_alone_with_a_load_that_is_enclosed():
+    """What quadrature misses of f goes to where there is contact."""
+    problem, polygon = pressed(lambda x: -ufl.exp(x[1]) - ufl.sin(x[0]) ** 2, rule=2)
+    solution = solve(problem, polygon.mesh(0.2))
+    exact = 2 * (np.e - 1) + 1 - np.sin(4) / 4
+    low, high = force_bounds(solution)
+    assert low <= exact <= high and high - low < 0.1
+    assert solution.certificate.parts["solver"] < 0.1 * solution.certificate.bound_energy_norm
+
+
+def test_contact_that_does_not_press_holds_nothing():
+    """A solver that never began has no forces, and no bound."""
+    problem, polygon = pressed()
+    solution = solve(problem, polygon.mesh(0.3))
+    solution.u.x.array[:] = 1.0
+    assert "no contact whose force" in certify(solution).reason

@@ -1,0 +1,77 @@
+"""What flows through parts, corrected by a dual solution: orders, and intervals that hold."""
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, Robin, force, solve_levels
+
+SIDES = ("floor", "right", "top", "left")
+SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
+
+
+def widths(problem, *parts, levels=4, inside=None):
+    """Widths of the intervals on four meshes, each twice as fine as the one before."""
+    found = []
+    for solution in solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), levels):
+        value, lower, upper = force.flux(solution, *parts)
+        assert inside is None or lower <= inside <= upper
+        assert lower <= upper and abs(value - lower) < 1.0
+        found.append(upper - lower)
+    return np.array(found)
+
+
+def orders(found):
+    return np.log2(found[:-1] / found[1:])
+
+
+@pytest.mark.parametrize("part", ["floor", "top"])
+def test_fluxes_of_a_linear_problem(part):
+    """No part is in contact: h²."""
+    around = {"left": Neumann(), "right": Neumann()}
+    ends = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0)}
+    found = widths(Problem(f=5.0, reaction=4.0, conditions=ends | around), part)
+    assert (abs(orders(found) - 2.0) < 0.2).all() and found[-1] < 2e-2
+
+
+def test_fluxes_beside_a_loss_of_heat():
+    """Both solutions are like r² log r where parts meet: almost h²."""
+    around = {"left": Neumann(), "right": Robin(1.0, coefficient=3.0, external=0.5)}
+    ends = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0)}
+    found = widths(Problem(f=5.0, reaction=2.0, conditions=ends | around), "top")
+    assert (orders(found) > 1.5).all() and (np.diff(orders(found)) > 0.0).all()
+
+
+def test_a_linear_flux_is_known_to_rounding():
+    """u is affine."""
+    conditions = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0), "left": Neumann()}
+    found = widths(Problem(conditions=conditions | {"right": Neumann()}), "top", inside=1.0)
+    assert (found < 1e-6).all()
+
+
+@pytest.mark.parametrize("part", ["floor", "top"])
+def test_contact_that_never_comes_about(part):
+    """λ is at most what the gap leaves over the distance: h²."""
+    conditions = {"floor": Contact(-3.0), "top": Dirichlet(1.0), "left": Neumann()}
+    found = widths(Problem(f=1.0, reaction=9.0, conditions=conditions | {"right": Neumann()}), part)
+    assert (abs(orders(found) - 2.0) < 0.2).all()
+
+
+@pytest.mark.parametrize("loss", [0.0, 5.0])
+@pytest.mark.parametrize("part", ["floor", "top"])
+def test_contact_all_along(part, loss):
+    """u − α is at most what the gap leaves over λ: h². u = 5 y² − 6 y and λ = 6 with f = −10."""
+    floor = Contact(0.0, coefficient=loss)
+    conditions = {"floor": floor, "top": Dirichlet(-1.0), "left": Neumann(), "right": Neumann()}
+    exact = 6.0 if part == "floor" else 4.0
+    found = widths(Problem(f=-10.0, conditions=conditions), part, inside=exact)
+    assert (abs(orders(found) - 2.0) < 0.2).all()
+
+
+def test_contact_that_begins_somewhere():
+    """h: nothing is corrected."""
+    conditions = {"floor": Contact(0.0), "top": Dirichlet(0.0), "left": Neumann()}
+    load = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), -8.0, 8.0)  # noqa: E731
+    found = widths(Problem(f=load, conditions=conditions | {"right": Neumann()}), "floor", levels=3)
+    assert (orders(found) < 1.7).all()
