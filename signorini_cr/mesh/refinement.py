@@ -390,17 +390,15 @@ def _give_facets(
     links = np.diff(start)
     half_of = 2 * np.arange(_count(facet_map), dtype=np.int32)
     half_of[owned:] += inner
-    place, order = corners, None
+    place, order, mine = corners, None, vertices.index_map.size_local
     old = coarse.topology.connectivity(1, 0).array.reshape(-1, 2)
-    low, high = np.minimum(old[:, 0], old[:, 1]), np.maximum(old[:, 0], old[:, 1])
+    everyones, vertex_map = None, coarse.topology.index_map(0)
     if number is not None:  # as all ranks see it
         own = np.arange(*vertices.index_map.local_range)
         order = np.concatenate([own, vertices.index_map.ghosts])
-        vertex_map = coarse.topology.index_map(0)
-        everyones = np.arange(_count(vertex_map), dtype=np.int32)
-        everyones = vertex_map.local_to_global(everyones)
+        everyones = vertex_map.local_to_global(np.arange(_count(vertex_map), dtype=np.int32))
         place = everyones[corners]
-        low, high = _ascending(old[:, 0], old[:, 1], everyones)
+    low, high = _ascending(old[:, 0], old[:, 1], everyones, vertex_map.size_local)
 
     of_cells: Int32Array = np.empty((cells, 4, 3), dtype=np.int32)
     of_cells[:, 3] = 2 * owned + 3 * c[:, None] + np.arange(3, dtype=np.int32)
@@ -416,13 +414,13 @@ def _give_facets(
 
     ends: Int32Array = np.empty((2 * _count(facet_map) + inner, 2), dtype=np.int32)
     for i, at in enumerate((low, high)):
-        halves_ends = _ascending(vertices.corner[at], vertices.middle, order)
+        halves_ends = _ascending(vertices.corner[at], vertices.middle, order, mine)
         for n, column in enumerate(halves_ends):
             ends[i : 2 * owned : 2, n] = column[:owned]
             ends[count + i :: 2, n] = column[owned:]
     inside = ends[2 * owned : count].reshape(cells, 3, 2)
     for k in range(3):
-        pair = _ascending(m[:, (k + 1) % 3], m[:, (k + 2) % 3], order)
+        pair = _ascending(m[:, (k + 1) % 3], m[:, (k + 2) % 3], order, mine)
         inside[:, k, 0], inside[:, k, 1] = pair
 
     pairs = np.empty((cells, 3, 2), dtype=np.int32)
@@ -457,13 +455,22 @@ def _give_facets(
 
 
 def _ascending(
-    a: Int32Array, b: Int32Array, order: npt.NDArray | None
+    a: Int32Array, b: Int32Array, order: npt.NDArray | None, owned: int = 0
 ) -> tuple[Int32Array, Int32Array]:
-    """The first and the second of pairs of vertices, by global numbers; None: by their own."""
-    if order is None:
-        return np.minimum(a, b), np.maximum(a, b)
-    turned = order[a] > order[b]
-    return np.where(turned, b, a), np.where(turned, a, b)
+    """The first and the second of pairs of vertices, by global numbers.
+
+    Args:
+        a: One of each pair.
+        b: The other.
+        order: The global numbers; None where local ones are in the same order.
+        owned: How many vertices are this rank's, whose local numbers are in that order.
+    """
+    first, second = np.minimum(a, b), np.maximum(a, b)
+    if order is not None:
+        ghosts = np.flatnonzero(second >= owned)  # few
+        turned = ghosts[order[first[ghosts]] > order[second[ghosts]]]
+        first[turned], second[turned] = second[turned], first[turned]
+    return first, second
 
 
 def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: Int32Array) -> Mesh:
