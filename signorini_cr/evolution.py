@@ -31,10 +31,12 @@ from .errors import InputError
 from .fem.conditions import Data, is_by_cells
 from .fem.problem import Problem, as_expression
 from .levels import Start, solve_level
+from .limits import Limits
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.hierarchy import Hierarchy, NestedMesh
 from .multigrid.parents import Layout
+from .restart import Restart
 from .solution import Solution
 from .vi.level import Level
 
@@ -142,14 +144,14 @@ class Solver:
     def solve(
         self,
         source: fem.Function | None = None,
-        before: Solution | None = None,
+        before: Solution | fem.Function | None = None,
         rate: FloatArray | float = 1.0,
     ) -> Solution:
         """Solve with the data as they are now; collective.
 
         Args:
             source: Added to f, a function like those in `V`, ghosts up to date.
-            before: What to start from, with its active set; from this solver.
+            before: What to start from, with its active set; from this solver or one like it.
             rate: What the source is multiplied by, one number or one for each owned cell, see
                 `by_material`.
 
@@ -167,7 +169,7 @@ class Solver:
         data = diffusion(self._level.data).renewed(own, np.asarray(rate, dtype=np.float64))
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
         level = Level((*meshes[:-1], renewed), self._held, self._level.system)
-        start = Start() if before is None else Start(known=before.u)
+        start = Start(known=before.u if isinstance(before, Solution) else before)
         return solve_level(level, lambda _: nullcontext(self._cycle), start, None, {"mesh": 0.0})
 
     def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
@@ -207,6 +209,9 @@ def solve_in_time(
     capacity: float = 1.0,
     levels: int = 1,
     time: Clock | None = None,
+    max_time: float | None = None,
+    restart: Restart | None = None,
+    done: int = 0,
 ) -> Iterator[tuple[float, Solution]]:
     """Solve capacity ∂u/∂t − ∇·(κ∇u) + c u = f with contact, step by step; collective.
 
@@ -224,13 +229,18 @@ def solve_in_time(
         capacity: Above 0; materials may have their own.
         levels: How many nested meshes there are; solved is on the last of them.
         time: That Constant; it is set to the time of each step.
+        max_time: No step is begun that would end later than so many seconds from now.
+        restart: Where to go on, from `Restart.of_steps`: the first solution is the one it was taken
+            from, once more.
+        done: The number of that step.
 
     Yields:
         The time, and u_h then. The solution of a step stays as it is.
 
     Raises:
         InputError: An argument is not as it should be, or as for `solve_levels`.
-        NotConverged: A step was not solved.
+        NotConverged: A step was not solved, or would not fit into ``max_time``; or the mesh would
+            not fit into the memory there is.
     """
     if not (end > 0.0 and np.isfinite(end)):
         raise InputError(f"end is {end}; it must be a time after 0")
@@ -244,10 +254,13 @@ def solve_in_time(
     reactions = _reactions(problem, domain)
     factor, rates = 0.0, np.array(0.0)
     solver: Solver | None = None
-    last: Solution | None = None
-    before = then = np.empty(0)
+    last: Solution | fem.Function | None = None
+    then: FloatArray = np.empty(0)
+    before: FloatArray = then
+    limits, comm = Limits(max_time), domain.mesh.comm
+    limits.begin(domain, "CR", restart, levels)
     try:
-        for step in range(1, steps + 1):
+        for step in range(max(done, 1), steps + 1):
             second = scheme == "bdf2" and step > 1
             needed = (1.5 if second else 1.0) * steps / end
             if solver is None or needed != factor:
@@ -255,10 +268,12 @@ def solve_in_time(
                 added = {name: factor * each for name, each in {"": capacity, **own}.items()}
                 solver = Solver(_stepping(problem, reactions, added), domain, levels, former)
                 rates = factor * solver.by_material(capacity, own)
-                if former is None:
+                if former is not None:
+                    former.close()
+                elif restart is None:
                     then = solver.projected(initial).x.array
                 else:
-                    former.close()
+                    last, then, before = _gone_on(solver, restart, initial, step)
             source = fem.Function(solver.V)
             source.x.array[:] = (4.0 * then - before) / 3.0 if second else then
             t = end * step / steps
@@ -267,6 +282,8 @@ def solve_in_time(
             last = solver.solve(source, last, rates)
             before, then = then, last.u.x.array
             yield t, last
+            if step < steps:
+                limits.admit_step(comm)
     finally:
         if solver is not None:
             solver.close()
@@ -316,3 +333,14 @@ def _stepping(
     }
     materials = {**problem.materials, **own}
     return replace(problem, reaction=reactions[""] + rates[""], materials=materials)
+
+
+def _gone_on(
+    solver: Solver, restart: Restart, initial: Data, step: int
+) -> tuple[fem.Function, FloatArray, FloatArray]:
+    """Read u_h after a step, and what u was one and two steps before; collective."""
+    known = [restart.function(solver.V, k) for k in range(len(restart.u))]
+    former = [each.x.array for each in known[1:]]
+    if len(former) < 2:
+        former.append(solver.projected(initial).x.array if step <= 2 else np.empty(0))
+    return known[0], former[0], former[-1]

@@ -1,4 +1,4 @@
-"""Whether another level fits into the time and the memory there are, by what those before took."""
+"""Whether another level or step fits into the time and the memory there are, by those before."""
 
 from __future__ import annotations
 
@@ -41,19 +41,22 @@ class Limits:
         self._passed = 0.0
         self._before: _Taken | None = None
 
-    def begin(self, domain: Domain, element: str, restart: Restart | None) -> None:
+    def begin(self, domain: Domain, element: str, restart: Restart | None, levels: int = 1) -> None:
         """Look whether memory holds the first level to be solved; collective.
 
         Args:
             domain: The coarsest mesh.
             element: "CR" or "P1".
             restart: Where to go on, if it is not the coarsest mesh.
+            levels: The mesh that is solved on first, counted from 1; with CR.
 
         Raises:
             NotConverged: It does not.
         """
-        comm, topology, number = domain.mesh.comm, domain.mesh.topology, 0
+        comm, topology, number = domain.mesh.comm, domain.mesh.topology, levels - 1
         dofs = topology.index_map(0 if element == "P1" else topology.dim - 1).size_global
+        for k in range(levels - 1):  # the halves of all facets, and three in each triangle
+            dofs = 2 * dofs + 3 * 4**k * topology.index_map(topology.dim).size_global
         if restart is not None:
             number, dofs = len(restart.added), len(restart.u[0][0])
         _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
@@ -84,9 +87,27 @@ class Limits:
             growth = max(growth, (last.peak - before.peak) / grown)
         words = shortage(comm, growth * more)
         if self._max_time is not None and passed + seconds > self._max_time:
-            left = max(self._max_time - passed, 0.0)
-            words = f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"
+            words = self._words(seconds)
         _refuse(solution.level.number + 1, dofs, words)
+
+    def admit_step(self, comm: MPI.Comm) -> None:
+        """Look, when a step in time is done, whether there is time for another one; collective.
+
+        The first one tells nothing of the next, as it has set all up.
+
+        Raises:
+            NotConverged: There is not.
+        """
+        passed = comm.allreduce(time.perf_counter() - self._began, op=MPI.MAX)
+        seconds, self._passed = passed - (self._passed or passed), passed
+        if self._max_time is not None and passed + seconds > self._max_time:
+            raise NotConverged(f"it would take about {self._words(seconds)}")
+
+    def _words(self, seconds: float) -> str:
+        """What is asked for, and what there is."""
+        assert self._max_time is not None
+        left = max(self._max_time - self._passed, 0.0)
+        return f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"
 
 
 def _refuse(number: int, dofs: int, words: str | None) -> None:

@@ -1,4 +1,4 @@
-"""Where a sequence of meshes goes on: u_h on the last two, and how all were made.
+"""Where a run goes on: u_h on the last meshes or at the last times, and how meshes were made.
 
 Cells, facets and vertices are told by where they are. Places are the same to the last bit however a
 mesh is shared out: those of vertices are read, or are midpoints of two others, and so are those of
@@ -7,7 +7,7 @@ facets.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,12 +31,13 @@ Places = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class Restart:
-    """A sequence of meshes and u_h on the last two, for any number of ranks.
+    """A sequence of meshes, and u_h on the last two or at the last times, for any number of ranks.
 
     Attributes:
         added: For each mesh but the coarsest the places of the vertices that the one below does not
             have; None where every triangle was cut into four.
-        u: Places of the dofs of u_h and its values, on the last mesh and on the one below it.
+        u: Places of the dofs of u_h and its values, on the last mesh and on the one below it; or,
+            in time, all on the last mesh, after the last step and after those before it.
     """
 
     added: tuple[Places | None, ...]
@@ -67,6 +68,26 @@ class Restart:
             added = np.setdiff1d(fine, coarse)
         return cls((*below.added, added), (here, below.u[0]))
 
+    @classmethod
+    def of_steps(
+        cls, last: Sequence[fem.Function], levels: int, below: Restart | None = None
+    ) -> Restart:
+        """Take what there is after a step in time to rank 0; collective.
+
+        Args:
+            last: u_h after this step and after those before it that the next ones need.
+            levels: How many meshes there are; the functions are on the last.
+            below: The same for the step before, None at the first.
+
+        Returns:
+            Nothing but empty arrays on the other ranks.
+        """
+        V, comm = last[0].function_space, last[0].function_space.mesh.comm
+        size = V.dofmap.index_map.size_local
+        at = _gathered(_places(V)[:size], comm) if below is None else below.u[0][0]
+        u = tuple((at, _gathered(each.x.array[:size], comm)) for each in last)
+        return cls((None,) * (levels - 1), u)
+
     def meshes(self, domain: Domain) -> Iterator[Refined]:
         """Refine as it was done before; collective.
 
@@ -85,7 +106,7 @@ class Restart:
             domain = refined[0]
 
     def function(self, V: fem.FunctionSpace, number: int) -> fem.Function:
-        """u_h on the last mesh (0) or on the one below (1); collective.
+        """u_h on the last mesh (0) or on the one below (1), or so many steps back; collective.
 
         Raises:
             InputError: The mesh is another one.

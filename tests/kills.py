@@ -1,6 +1,6 @@
 """Runs that are ended from outside, each from a seed, and a look at what they leave.
 
-    container/run python3 tests/kills.py --count 60 --seed 0 --ranks 1 2 4
+    container/run python3 tests/kills.py --count 60 --seed 0 --ranks 1 2 3 4
 
 prints for each kind of end how many runs there were and with which status they ended, and the seeds
 of those that hung, lost a finished level, could not be resumed, or left anything but whole files of
@@ -42,6 +42,14 @@ obstacle = "0.1*x - 0.2"
 [refine]
 levels = 9
 """
+STEPS = 40
+CASES = {
+    "uniform": CASE,
+    "adaptive": CASE.replace("levels = 9", 'mode = "adaptive"\nlevels = 20'),
+    "time": CASE.replace("f = -3", 'f = "-3 - 20*sin(5*t)"').replace("levels = 9", "levels = 3")
+    + f'[time]\nend = 2\nsteps = {STEPS}\nscheme = "bdf2"\n',
+}
+"""On a sequence of meshes, on meshes that adapt, and in steps in time."""
 PATIENCE = 5.0
 """Seconds until all processes of a run are gone."""
 
@@ -50,9 +58,10 @@ class End(NamedTuple):
     """How a run ended.
 
     Attributes:
-        kind: Ranks, signal, and who got it.
+        kind: Ranks, signal, who got it, and of which case the run was.
         status: Of mpirun or of the one process.
-        levels: How many levels the report has; -1 where the results of the former run are left.
+        levels: How many levels, or steps, the report has; -1 where the results of the former run
+            are left.
         faults: What should not have been.
     """
 
@@ -111,15 +120,26 @@ def own_cache(folder: Path) -> Path:
 
 
 def levels_in(out: Path) -> int:
-    """How many levels the report has."""
+    """How many levels, or steps, the report has."""
     try:
-        return len(json.loads((out / "report.json").read_text())["levels"])
+        report = json.loads((out / "report.json").read_text())
+        return len(report.get("times", report["levels"]))
     except (OSError, ValueError, KeyError, TypeError):
         return 0
 
 
-def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
-    """Start a run on one of some numbers of ranks, end it at a random moment, look around."""
+def killed(
+    folder: Path, seed: int, counts: Sequence[int] = (1, 2), kinds: Sequence[str] = ("uniform",)
+) -> End:
+    """Start a run on one of some numbers of ranks, end it at a random moment, look around.
+
+    Args:
+        folder: Where.
+        seed: What all is drawn from.
+        counts: Numbers of ranks to choose from.
+        kinds: Keys of `CASES` to choose from.
+    """
+    kind = str(np.random.default_rng([seed, 1]).choice(kinds))
     random = np.random.default_rng(seed)
     ranks = int(random.choice(counts))
     number = signal.Signals(random.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
@@ -127,7 +147,9 @@ def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
     moment = float(random.uniform(0, 3)) if random.random() < 0.3 else None
     wanted, more = int(random.integers(1, 8)), float(random.uniform(0, 0.2))
     out, case = folder / f"out-{seed}", folder / "case.toml"
-    case.write_text(CASE)
+    case.write_text(CASES[kind])
+    if kind == "time":  # steps are shorter than levels
+        wanted *= 4
     out.mkdir()
     for name in FILES:
         (out / name).write_text("former")
@@ -177,12 +199,16 @@ def killed(folder: Path, seed: int, counts: Sequence[int] = (1, 2)) -> End:
         if run.returncode and "finished and kept in" not in said:
             faults.append(f"nothing is said of what is kept: {said[-600:]}")
     if levels > 0 and random.random() < 0.3:
-        again = [*solve, "--resume", "--levels", str(levels + 1), "-q"]
+        again = [*solve, "--resume", "-q"]
+        all_of_it = STEPS if kind == "time" else levels + 1
+        again += [] if kind == "time" else ["--levels", str(all_of_it)]
         # a minute longer where a killed one has left a form half compiled
         more_run = subprocess.run(again, capture_output=True, text=True, env=clean, timeout=180)
-        if more_run.returncode or levels_in(out) < levels + 1:
+        if more_run.returncode or levels_in(out) < all_of_it:
             faults.append(f"not resumed, status {more_run.returncode}: {more_run.stderr[-600:]}")
-    return End(f"{ranks} {number.name} {target}", run.returncode, levels, faults + more_faults)
+    return End(
+        f"{ranks} {number.name} {target} {kind}", run.returncode, levels, faults + more_faults
+    )
 
 
 def _left(out: Path) -> tuple[int, list[str]]:
@@ -194,7 +220,8 @@ def _left(out: Path) -> tuple[int, list[str]]:
         time.sleep(0.1)  # a process that is gone may have threads that are not, with its locks
         check_writable(out)
     there = {path.name for path in out.iterdir()}
-    if strange := sorted(there - set(FILES)):
+    fields = {path.name for path in out.glob("step_*.vtu")}
+    if strange := sorted(there - set(FILES) - fields):
         faults.append(f"left over: {strange}")
     if any(path.name.startswith(STAGE) for path in out.parent.iterdir()):
         faults.append("left over beside the folder")
@@ -206,16 +233,20 @@ def _left(out: Path) -> tuple[int, list[str]]:
     if "report.json" not in there:
         return 0, [*faults, "no report"]
     report = json.loads((out / "report.json").read_text())
-    with (out / "levels.csv").open() as file:
+    what, table = ("times", "times.csv") if "times" in report else ("levels", "levels.csv")
+    number = len(report[what])
+    with (out / table).open() as file:
         rows = list(csv.DictReader(file))
-    if not len(report["levels"]) <= len(rows) <= len(report["levels"]) + 1:
-        faults.append(f"{len(report['levels'])} levels in the report, {len(rows)} in the table")
+    if not number <= len(rows) <= number + 1:
+        faults.append(f"{number} {what} in the report, {len(rows)} in the table")
+    if what == "times" and len(fields) < number:
+        faults.append(f"{number} steps in the report, {len(fields)} fields")
     if (out / "solution.vtu").exists() and not report["complete"]:
         faults.append("a field beside a report that is not complete")
     found = read_checkpoint(out, MPI.COMM_SELF)
-    if found is None or len(found[1]["levels"]) < len(report["levels"]):
+    if found is None or len(found[1][what]) < number:
         faults.append("nothing to resume from")
-    return len(report["levels"]), faults
+    return number, faults
 
 
 def main() -> None:
@@ -224,19 +255,20 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2], help="numbers of ranks")
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     arguments = parser.parse_args()
     counts: Counter[tuple[str, int]] = Counter()
     wrong = kept = 0
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(arguments.seed, arguments.seed + arguments.count):
-            end = killed(Path(folder), seed, arguments.ranks)
+            end = killed(Path(folder), seed, arguments.ranks, arguments.cases)
             counts[end.kind, end.status] += 1
             kept += end.levels > 0
             if end.faults:
                 wrong += 1
                 print(f"seed {seed} ({end.kind}): {'; '.join(end.faults)}", flush=True)
     for (kind, status), count in sorted(counts.items()):
-        print(f"{kind:24} status {status:4} {count:5}")
+        print(f"{kind:32} status {status:4} {count:5}")
     print(f"{arguments.count} runs, {kept} with levels kept, {wrong} wrong")
 
 

@@ -13,8 +13,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -88,8 +89,9 @@ def _interruptible() -> Iterator[list[int]]:
     """Keep in mind the signals that asked for an end, and turn them into KeyboardInterrupt.
 
     That may reach us as another error, of PETSc, whose callback it was raised in. An import is left
-    to finish, as libraries that are being loaded may end the process; and whoever is told twice
-    within a second, by the user and by mpirun, say, is told once.
+    to finish, as libraries that are being loaded may end the process, and so is `_keep`, so that
+    what is told of files is true; and whoever is told twice within a second, by the user and by
+    mpirun, say, is told once.
     """
     asked: list[int] = []
     latest = -math.inf
@@ -97,7 +99,7 @@ def _interruptible() -> Iterator[list[int]]:
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal latest
         asked.append(number)
-        if _importing(frame):
+        if _must_not_be_disturbed(frame):
             again = threading.Timer(0.05, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
@@ -118,10 +120,11 @@ def _interruptible() -> Iterator[list[int]]:
             signal.signal(each, handler)
 
 
-def _importing(frame: FrameType | None) -> bool:
-    """Tell whether what runs has been called by an import."""
+def _must_not_be_disturbed(frame: FrameType | None) -> bool:
+    """Tell whether what runs has been called by an import or by `_keep`."""
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
+        code = frame.f_code
+        if code is _keep.__code__ or code.co_filename.startswith("<frozen importlib"):
             return True
         frame = frame.f_back
     return False
@@ -249,7 +252,7 @@ def _solve_levels(
     problem = statement(case, domain)
     screen.line(f"{folded(problem)}\n")
     if case.time is not None:
-        _solve_steps(args, screen, comm, folder, case, domain, problem)
+        _solve_steps(args, screen, comm, folder, case, domain, problem, records)
         return
     element = args.element.upper()
     said = _said(args, case, comm)
@@ -271,8 +274,8 @@ def _solve_levels(
             )
             with naming("--out"):
                 restart = Restart.of(solution, restart, case.mode == "adaptive")
-                output.write_levels(folder, report, solution, restart, said)
-            records.append(record)
+                write = partial(output.write_levels, folder, report, solution, restart, said)
+                _keep(write, records, [record])
             finest = solution
             if screen.verbose:
                 taken = solution.iterations.preconditioner
@@ -315,59 +318,98 @@ def _solve_steps(
     case: ProblemFile,
     domain: Domain,
     problem: dict[str, str],
+    kept: list[dict[str, Any]],
 ) -> None:
-    """Solve a problem in time; each step is safe in the folder before the next begins."""
+    """Solve a problem in time, and append to `kept` what is safe in the folder."""
     from ..errors import InputError, NotConverged, naming
     from ..output import report as output
     from ..output import series, strip
     from ..output.tables import certified, facts
+    from ..restart import Restart
 
-    for name, given in {"--resume": args.resume, "--max-time": args.max_time}.items():
-        if given:
-            raise InputError(f"{name}: problems in time have no such option")
     if args.element.upper() != "CR":
         raise InputError("--element: problems in time are solved with cr")
-    records: list[dict[str, Any]] = []
-    failure: NotConverged | None = None
-    solution: Solution | None = None
     assert case.time is not None
-    chosen, moments = strip.chosen(case.time.steps), []
-    screen.progress("step 1")
+    said = {**_said(args, case, comm), "refine.levels (or --levels)": case.levels}
+    restart = _resumed(folder, said, kept, comm) if args.resume else None
+    done, failure = len(kept), None
+    records: list[dict[str, Any]] = []
+    moments: list[strip.Moment] = []
+    if restart is not None:
+        with naming("--resume"):
+            moments = series.read_moments(folder, comm)
+
+    def tell(record: dict[str, Any]) -> None:
+        records.append(record)
+        if len(records) == 1:
+            screen.line(series.header())
+        screen.line(series.row(record))
+
+    def report(levels: list[dict[str, Any]], complete: bool = False) -> dict[str, Any]:
+        made = output.make_report(case.title, "CR", comm, levels, complete, case.units)
+        return {**made, "times": records}
+
+    for record in kept:
+        tell(record)
+    last: list[Solution] = []
+    screen.progress(f"step {done + 1}")
+    steps = case.steps(
+        domain, case.levels, max_time=_left(args), restart=restart, done=max(done, 1)
+    )
+    back = 2 if case.time.scheme == "bdf2" else 1
+
+    def keep() -> None:
+        nonlocal restart
+        with naming("--out"):
+            restart = Restart.of_steps([each.u for each in last], case.levels, restart)
+            series.write_steps(folder, report([]), last[0], restart, said, moments)
+
     try:
-        for time, solution in case.steps(domain, case.levels):
-            record = series.step_record(len(records) + 1, time, solution)
-            records.append(record)
-            if record["step"] in chosen:
+        for time, solution in steps:
+            last = [solution, *last[:back]]
+            if len(records) == done > 0 and len(last) == 1:  # the one that it goes on from
+                continue
+            tell(series.step_record(len(records) + 1, time, solution))
+            chosen = len(records) in strip.chosen(case.time.steps)
+            if chosen:
                 moments.append(strip.moment(time, solution))
-            with naming("--out"):
-                series.write_step(folder, records, solution)
-            if len(records) == 1:
-                screen.line(series.header())
-            screen.line(series.row(record))
+            if chosen or series.is_kept(len(records)):
+                _keep(keep, kept, records[len(kept) :])
+            else:
+                with naming("--out"):
+                    series.write_step(folder, len(records), solution)
     except NotConverged as error:
         failure = NotConverged(f"time step {len(records) + 1}: {error}")
-    if solution is not None:
+    if last:
+        if len(kept) < len(records):
+            _keep(keep, kept, records[len(kept) :])
         screen.progress("writing")
-        last = output.level_record(solution, None, case.quantities)
-        complete = failure is None
-        report = output.make_report(case.title, "CR", comm, [last], complete, case.units)
-        report["times"] = records
+        finest = output.level_record(last[0], None, case.quantities)
         with naming("--out"):
-            names = output.write_output(folder, report, solution, moments=moments)
+            whole = report([finest], failure is None)
+            names = output.write_output(folder, whole, last[0], resumable=True, moments=moments)
             if args.html:
-                names += _write_page(args, comm, folder, problem, report)
+                names += _write_page(args, comm, folder, problem, whole)
         screen.line("")
         screen.text(series.legend(case.units))
         screen.line("")
-        screen.text(f"at the end {facts(last, case.units)}")
+        screen.text(f"at the end {facts(finest, case.units)}")
         screen.text(series.certified(records))
-        screen.text(f"the last step's own problem, {certified(last, case.units)}")
+        screen.text(f"the last step's own problem, {certified(finest, case.units)}")
         screen.text(series.times(records))
         screen.text(
             f"written to {folder}: {', '.join(names)}, times.csv, series.pvd and its fields"
         )
     if failure is not None:
-        raise failure
+        raise NotConverged(f"{failure}\n{_kept(kept, folder)}")
+
+
+def _keep(
+    write: Callable[[], object], kept: list[dict[str, Any]], records: list[dict[str, Any]]
+) -> None:
+    """Write, and note what is safe then; signals wait for that, see `_must_not_be_disturbed`."""
+    write()
+    kept += records
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
@@ -432,7 +474,7 @@ def _said(args: argparse.Namespace, case: ProblemFile, comm: Any) -> dict[str, A
 def _resumed(
     folder: Path, said: dict[str, Any], records: list[dict[str, Any]], comm: Any
 ) -> Restart | None:
-    """Find where a run goes on, and fill in the records of the levels before; collective."""
+    """Find where a run goes on, and fill in the records of what is done; collective."""
     import json
 
     from ..errors import InputError, naming
@@ -450,10 +492,10 @@ def _resumed(
                     "not given" if each is None else json.dumps(each) for each in (was, now)
                 )
                 raise InputError(
-                    f"{folder} has levels of another run: {key} was {was} and is {now}; the same"
+                    f"{folder} has results of another run: {key} was {was} and is {now}; the same"
                     " is needed, or another --out"
                 )
-    records += facts["levels"]
+    records += facts["times" if "times" in facts else "levels"]
     return restart
 
 
@@ -478,16 +520,20 @@ def _solutions(
         screen.step(f"  level {level}  {facts}")
 
     screen.progress("level 0")
-    max_time = args.max_time
-    if max_time is not None:
-        max_time += args.began - time.perf_counter()
     return case.solutions(
         domain,
         element=args.element.upper(),
         monitor=monitor,
-        max_time=max_time,
+        max_time=_left(args),
         restart=restart,
     )
+
+
+def _left(args: argparse.Namespace) -> float | None:
+    """What is left of --max-time."""
+    if args.max_time is None:
+        return None
+    return float(args.max_time + args.began - time.perf_counter())
 
 
 def _write_page(
@@ -538,9 +584,11 @@ def _stopped(failure: NotConverged, records: list[dict[str, Any]], folder: Path)
 def _kept(records: list[dict[str, Any]], folder: Path) -> str:
     if not records:
         return "no level was finished, nothing was written"
-    if len(records) == 1:
-        return f"level 0 is finished and kept in {folder}"
-    return f"levels 0 to {len(records) - 1} are finished and kept in {folder}"
+    kind = "step" if "step" in records[0] else "level"
+    first, last = records[0][kind], records[-1][kind]
+    if first == last:
+        return f"{kind} {first} is finished and kept in {folder}"
+    return f"{kind}s {first} to {last} are finished and kept in {folder}"
 
 
 def _folder(args: argparse.Namespace) -> Path:

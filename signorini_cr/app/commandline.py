@@ -27,7 +27,7 @@ PETSC_NOTE = (
 EXIT_NOTE = (
     "Exit status: 0 solved, every level converged; 2 bad input, nothing written; 3 not converged,"
     " out of memory, or stopped by a limit; 130 interrupted; 143 terminated. Report and tables of a"
-    " level are kept as soon as it is finished, whatever ends the run then."
+    " level, or step, are kept as soon as it is finished, whatever ends the run then."
 )
 
 
@@ -169,16 +169,16 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         "--max-time",
         metavar="SECONDS",
         type=_positive,
-        help="begin no level that would end later, by what the levels before took; what is left to"
-        " do then is to bound the contact force, which takes about as long as the last solve did,"
-        " and to write fields and pictures",
+        help="begin no level, or step in time, that would end later, by what those before took;"
+        " what is left to do then is to bound the contact force, which takes about as long as the"
+        " last solve did, and to write fields and pictures",
     )
     solve.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the last level that a run into DIR has finished, on any number of ranks;"
-        " the problem must be the same, but --levels, tolerance and max_dofs may differ; where DIR"
-        " has none, begin",
+        help="go on from the last level, or step in time, that a run into DIR has finished, on any"
+        " number of ranks; the problem must be the same, but --levels, tolerance and max_dofs may"
+        " differ where there is no [time]; where DIR has none, begin",
     )
     solve.add_argument(
         "-v", "--verbose", action="store_true", help="print every step of the solver"

@@ -198,12 +198,15 @@ class ProblemFile:
             for name in domain.materials.others
         ]
 
-    def steps(self, domain: Domain, levels: int) -> Iterator[tuple[float, Solution]]:
+    def steps(
+        self, domain: Domain, levels: int, **arguments: Any
+    ) -> Iterator[tuple[float, Solution]]:
         """Solve step by step what has a [time]; collective.
 
         Args:
             domain: From :meth:`mesh`.
             levels: Number of meshes; solved is on the last.
+            **arguments: What `solve_in_time` takes beside what the file says.
         """
         time = self.time
         assert time is not None
@@ -217,6 +220,7 @@ class ProblemFile:
             capacity=time.capacity,
             levels=levels,
             time=time.clock,
+            **arguments,
         )
 
     def solutions(self, domain: Domain, **arguments: Any) -> Iterator[Solution]:

@@ -14,9 +14,10 @@ import ufl
 from dolfinx import cpp, la
 from dolfinx.mesh import CellType, Mesh, MeshTags, RefinementOption, meshtags
 from dolfinx.mesh import refine as split
+from mpi4py import MPI
 
 from .. import compat
-from ..arrays import Int32Array
+from ..arrays import Int32Array, Int64Array
 from ..errors import InputError
 from .domain import Domain, Refinement
 
@@ -57,12 +58,18 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
     children[:, 3] = m
     children = children.reshape(-1, 3)
 
+    ghosts = coarse.comm.allreduce(coarse.topology.index_map(2).num_ghosts)
+    given = compat.can_take_facets() and ghosts == 0
+    topology = number = None
+    if given and coarse.comm.size > 1:
+        topology, number = _between_ranks(coarse, facets, vertices, children)
+        given = topology is not None
     cell_map = cpp.common.IndexMap(coarse.comm, 4 * cells)
     topology = compat.create_topology(
-        coarse.comm, CellType.triangle, vertices.index_map, cell_map, children
+        coarse.comm, CellType.triangle, vertices.index_map, cell_map, children, topology
     )
-    if compat.can_take_facets(coarse.comm):
-        _give_facets(topology, coarse, corners, facets, vertices, m)
+    if given:
+        _give_facets(topology, coarse, corners, facets, vertices, m, number)
     else:
         topology.create_entities(1)
         topology.create_connectivity(1, 2)
@@ -291,6 +298,64 @@ def _ghosts_in(index_map: Any, entities: Int32Array) -> Int32Array:
     return np.flatnonzero(seen).astype(np.int32)
 
 
+def _shared(mesh: Mesh) -> Int32Array:
+    """The facets of this rank that another one sees, too; collective."""
+    facet_map = mesh.topology.index_map(1)
+    seen = la.vector(facet_map, dtype=np.int32)
+    seen.array[facet_map.size_local :] = 1
+    seen.scatter_reverse(la.InsertMode.add)
+    return np.flatnonzero(seen.array[: facet_map.size_local]).astype(np.int32)
+
+
+def _between_ranks(
+    coarse: Mesh, facets: Int32Array, vertices: _Vertices, children: Int32Array
+) -> tuple[Any, Int32Array | None]:
+    """A topology that knows what lies between ranks, and numbers to fit; collective.
+
+    DOLFINx notes that where it looks for facets, and nowhere else. Here it looks for those of the
+    few cells beside other ranks. What it will take to lie there are then the facets with the
+    numbers that it has found, so that these numbers are given to those that do. What is left of
+    the numbers is for facets inside coarse cells, of which it makes no difference.
+
+    Args:
+        coarse: The coarse mesh, without ghost cells.
+        facets: Coarse facets of the coarse cells, shape (cells, 3).
+        vertices: The fine vertices.
+        children: Fine vertices of the fine cells, shape (4 cells, 3).
+
+    Returns:
+        The topology, and new numbers of this rank's fine facets, in the order of `_give_facets`; or
+        nothing where a rank has too few cells.
+    """
+    facet_map, around = coarse.topology.index_map(1), coarse.topology.connectivity(1, 2)
+    owned, inner = facet_map.size_local, 3 * len(facets)
+    shared = _shared(coarse)
+    border = np.concatenate([shared, np.arange(owned, _count(facet_map), dtype=np.int32)])
+    cell = around.array[around.offsets[border]]
+    j = np.argmax(facets[cell] == border[:, None], axis=1)
+    beside = np.unique(np.concatenate([4 * cell + (j + 1) % 3, 4 * cell + (j + 2) % 3]))
+    cell_map = cpp.common.IndexMap(coarse.comm, len(beside))
+    topology = compat.create_topology(
+        coarse.comm, CellType.triangle, vertices.index_map, cell_map, children[beside]
+    )
+    topology.create_entities(1)
+
+    count = 2 * owned + inner
+    taken = np.asarray(topology.interprocess_facets())
+    taken = taken[taken < count]  # those of other ranks come last, here and there
+    between = np.concatenate([2 * shared, 2 * shared + 1])
+    spare = len(taken) - len(between)
+    if not coarse.comm.allreduce(0 <= spare <= inner, op=MPI.LAND):
+        return None, None
+    number = np.full(count, -1, dtype=np.int32)
+    number[between] = taken[: len(between)]
+    number[2 * owned : 2 * owned + spare] = taken[len(between) :]
+    free = np.ones(count, dtype=bool)
+    free[taken] = False
+    number[number < 0] = np.flatnonzero(free)
+    return topology, number
+
+
 def _give_facets(
     topology: Any,
     coarse: Mesh,
@@ -298,48 +363,71 @@ def _give_facets(
     facets: Int32Array,
     vertices: _Vertices,
     m: Int32Array,
+    number: Int32Array | None,
 ) -> None:
-    """Hand over the fine facets: the halves 2 f and 2 f + 1 of facet f, then three in each cell.
+    """Hand over the fine facets; collective.
 
-    Half 1 is the one at the end with the larger coarse index; the facet opposite vertex k of child
-    k is number 2 F + 3 c + k and also belongs to the child in the middle.
+    First come the halves 2 f and 2 f + 1 of facet f of this rank, then three in each cell, then the
+    halves of other ranks' facets; on several ranks this rank's are numbered anew after that. Half 1
+    is the one at the end with the larger coarse global number; the facet opposite vertex k of child
+    k is 2 F + 3 c + k and also belongs to the child in the middle.
 
     Args:
         topology: The fine topology.
-        coarse: The coarse mesh.
+        coarse: The coarse mesh, without ghost cells.
         corners: Coarse vertices of the coarse cells, shape (cells, 3).
         facets: Coarse facets of the coarse cells, shape (cells, 3).
         vertices: The fine vertices.
         m: Those in the middle of the coarse cells' facets, shape (cells, 3).
+        number: New numbers of this rank's facets, from `_between_ranks`; None on one rank.
     """
-    ends = _ends(coarse, vertices, m)
-    of_cells, around, offsets = _neighbours(coarse, corners, facets)
-    number = cpp.common.IndexMap(coarse.comm, len(ends))
-    compat.set_facets(topology, number, of_cells, ends, around, offsets)
+    together = number is not None
+    ends = _ends(coarse, vertices, m, together)
+    of_cells, around, size = _neighbours(coarse, corners, facets, together)
+    count = 2 * coarse.topology.index_map(1).size_local + m.size
+    global_map = cpp.common.IndexMap(coarse.comm, count)
+    if number is not None:
+        global_map = _numbered_anew(coarse, global_map, number)
+        number = np.concatenate([number, np.arange(count, len(size), dtype=np.int32)])
+        old = np.empty_like(number)
+        old[number] = np.arange(len(number), dtype=np.int32)
+        begin = _starts(size)[:-1][old]
+        of_cells, ends, size = number[of_cells], ends[old], size[old]
+        moved = np.repeat(begin - _starts(size)[:-1], size)
+        around = around[moved + np.arange(len(around), dtype=np.int32)]
+    compat.set_facets(topology, global_map, of_cells, ends, around, _starts(size))
 
 
-def _ends(coarse: Mesh, vertices: _Vertices, m: Int32Array) -> Int32Array:
-    """The vertices of the fine facets, the smaller number first, shape (fine facets, 2).
+def _ends(coarse: Mesh, vertices: _Vertices, m: Int32Array, together: bool) -> Int32Array:
+    """The vertices of the fine facets, the one first that comes first, shape (fine facets, 2).
 
     Args:
         coarse: The coarse mesh.
         vertices: The fine vertices.
         m: As for `_give_facets`.
+        together: Whether global numbers say which comes first, as all ranks see it.
     """
-    halves = 2 * coarse.topology.index_map(1).size_local
-    ends = np.empty((halves + m.size, 2), dtype=np.int32)
+    facet_map = coarse.topology.index_map(1)
+    owned, count = facet_map.size_local, 2 * facet_map.size_local + m.size
+    coarse_map, fine_map = coarse.topology.index_map(0), vertices.index_map
+    of_coarse, of_fine = (_everyones(each) if together else None for each in (coarse_map, fine_map))
+    mine = fine_map.size_local
+    ends: Int32Array = np.empty((2 * _count(facet_map) + m.size, 2), dtype=np.int32)
     old = coarse.topology.connectivity(1, 0).array.reshape(-1, 2)
-    for i, choose in enumerate((np.minimum, np.maximum)):
-        corner = vertices.corner[choose(old[:, 0], old[:, 1])]
-        _ascending(corner, vertices.middle, ends[i:halves:2])
-    inner = ends[halves:].reshape(-1, 3, 2)
+    for i, at in enumerate(_ascending(old[:, 0], old[:, 1], of_coarse, coarse_map.size_local)):
+        halves = _ascending(vertices.corner[at], vertices.middle, of_fine, mine)
+        for n, column in enumerate(halves):
+            ends[i : 2 * owned : 2, n] = column[:owned]
+            ends[count + i :: 2, n] = column[owned:]
+    inside = ends[2 * owned : count].reshape(-1, 3, 2)
     for k in range(3):
-        _ascending(m[:, (k + 1) % 3], m[:, (k + 2) % 3], inner[:, k])
+        pair = _ascending(m[:, (k + 1) % 3], m[:, (k + 2) % 3], of_fine, mine)
+        inside[:, k, 0], inside[:, k, 1] = pair
     return ends
 
 
 def _neighbours(
-    coarse: Mesh, corners: Int32Array, facets: Int32Array
+    coarse: Mesh, corners: Int32Array, facets: Int32Array, together: bool
 ) -> tuple[Int32Array, Int32Array, Int32Array]:
     """The fine facets of the children, shape (4 cells, 3), and the children at each fine facet.
 
@@ -347,42 +435,88 @@ def _neighbours(
         coarse: The coarse mesh.
         corners: As for `_give_facets`.
         facets: As for `_give_facets`.
+        together: As for `_ends`.
 
     Returns:
-        The former; the latter one facet after the other, and where each facet's begin.
+        The former; the latter one facet after the other, and how many there are at each.
     """
-    cells, count = len(corners), coarse.topology.index_map(1).size_local
+    cells, facet_map = len(corners), coarse.topology.index_map(1)
+    owned, inner = facet_map.size_local, 3 * cells
     c = np.arange(cells, dtype=np.int32)
     around = coarse.topology.connectivity(1, 2)
     start, first = around.offsets, around.array[around.offsets[:-1]]
-    number = np.diff(start)
+    links = np.diff(start)
+    half_of = 2 * np.arange(_count(facet_map), dtype=np.int32)
+    half_of[owned:] += inner
+    place = _everyones(coarse.topology.index_map(0))[corners] if together else corners
 
-    of_cells = np.empty((cells, 4, 3), dtype=np.int32)
-    of_cells[:, 3] = 2 * count + 3 * c[:, None] + np.arange(3, dtype=np.int32)
+    of_cells: Int32Array = np.empty((cells, 4, 3), dtype=np.int32)
+    of_cells[:, 3] = 2 * owned + 3 * c[:, None] + np.arange(3, dtype=np.int32)
     halves = np.empty(2 * len(around.array), dtype=np.int32)
     for j in range(3):
         f = facets[:, j]
-        links = 2 * start[f] + (first[f] != c)  # where the first half lists this cell's child
+        at = 2 * start[f] + (first[f] != c)  # where the first half lists this cell's child
         for k in (j + 1) % 3, (j + 2) % 3:
-            half = (corners[:, k] > corners[:, _third(j, k)]).astype(np.int32)
-            of_cells[:, k, j] = 2 * f + half
-            halves[links + half * number[f]] = 4 * c + k
+            half = (place[:, k] > place[:, _third(j, k)]).astype(np.int32)
+            of_cells[:, k, j] = half_of[f] + half
+            halves[at + half * links[f]] = 4 * c + k
         of_cells[:, j, j] = of_cells[:, 3, j]
 
     pairs = np.empty((cells, 3, 2), dtype=np.int32)
     pairs[:, :, 0] = 4 * c[:, None] + np.arange(3, dtype=np.int32)
     pairs[:, :, 1] = 4 * c[:, None] + 3
-    offsets = np.empty(2 * count + 3 * cells + 1, dtype=np.int32)
-    offsets[0 : 2 * count + 1 : 2] = 2 * start
-    offsets[1 : 2 * count : 2] = 2 * start[:-1] + number
-    offsets[2 * count :] = len(halves) + 2 * np.arange(3 * cells + 1, dtype=np.int32)
-    return of_cells.reshape(-1, 3), np.concatenate([halves, pairs.reshape(-1)]), offsets
+    last, twice = 2 * start[owned], np.repeat(links, 2)
+    of_facets = np.concatenate([halves[:last], pairs.ravel(), halves[last:]])
+    size = np.concatenate([twice[: 2 * owned], np.full(inner, 2, np.int32), twice[2 * owned :]])
+    return of_cells.reshape(-1, 3), of_facets, size
 
 
-def _ascending(a: Int32Array, b: Int32Array, pairs: Int32Array) -> None:
-    """Write pairs of numbers, the smaller one first."""
-    np.minimum(a, b, out=pairs[:, 0])
-    np.maximum(a, b, out=pairs[:, 1])
+def _numbered_anew(coarse: Mesh, index_map: Any, number: Int32Array) -> Any:
+    """The index map of the fine facets, halves of other ranks' facets as ghosts; collective.
+
+    Args:
+        coarse: The coarse mesh.
+        index_map: That of this rank's fine facets.
+        number: New numbers of these.
+    """
+    facet_map = coarse.topology.index_map(1)
+    owned = 2 * facet_map.size_local
+    everywhere = la.vector(facet_map, bs=2, dtype=np.int64)
+    everywhere.array[:owned] = index_map.local_range[0] + number[:owned]
+    everywhere.scatter_forward()
+    ghosts, owners = everywhere.array[owned:], np.repeat(facet_map.owners, 2)
+    return compat.index_map(coarse.comm, len(number), ghosts, owners)
+
+
+def _everyones(index_map: Any) -> Int64Array:
+    """The global numbers of local indices, ghosts included."""
+    return np.concatenate([np.arange(*index_map.local_range), index_map.ghosts])
+
+
+def _starts(size: Int32Array) -> Int32Array:
+    """Where each of so many groups of these sizes begins, and where the last ends."""
+    starts: Int32Array = np.zeros(len(size) + 1, dtype=np.int32)
+    np.cumsum(size, out=starts[1:])
+    return starts
+
+
+def _ascending(
+    a: Int32Array, b: Int32Array, order: npt.NDArray | None, owned: int = 0
+) -> tuple[Int32Array, Int32Array]:
+    """Sort pairs of vertices by global numbers.
+
+    Args:
+        a: One of each pair.
+        b: The other.
+        order: The global numbers; None where local ones are in the same order.
+        owned: How many vertices are this rank's, whose local numbers are in that order.
+    """
+    first, second = np.minimum(a, b), np.maximum(a, b)
+    if order is not None:
+        ghosts = np.flatnonzero(second >= owned)  # few
+        turned = ghosts[order[first[ghosts]] > order[second[ghosts]]]
+        first[turned], second[turned] = second[turned], first[turned]
+    return first, second
 
 
 def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: Int32Array) -> Mesh:

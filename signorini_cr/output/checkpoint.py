@@ -16,7 +16,7 @@ from ..errors import InputError, on_root
 from ..restart import Restart
 from .files import disk_errors
 
-NAME = "restart.npz"
+NAME, MOMENTS = "restart.npz", "moments.npz"
 
 
 def write_checkpoint(path: Path, restart: Restart, facts: dict[str, Any], comm: MPI.Comm) -> None:
@@ -36,12 +36,14 @@ def write_checkpoint(path: Path, restart: Restart, facts: dict[str, Any], comm: 
         arrays: dict[str, Any] = {
             f"added{k}": at for k, at in enumerate(restart.added) if at is not None
         }
+        first = restart.u[0][0]
         for k, (at, values) in enumerate(restart.u):
-            arrays |= {f"at{k}": at, f"u{k}": values}
-        text = json.dumps({"meshes": len(restart.added), "facts": facts})
-        arrays["facts"] = np.frombuffer(text.encode(), dtype=np.uint8)
-        with disk_errors(path):
-            np.savez(path, sum=_sum(arrays), **arrays)
+            arrays[f"u{k}"] = values
+            if k == 0 or at is not first:
+                arrays[f"at{k}"] = at
+        sizes = {"meshes": len(restart.added), "functions": len(restart.u)}
+        arrays["facts"] = _letters({**sizes, "facts": facts})
+        write_arrays(path, arrays)
 
     on_root(comm, write)
 
@@ -59,25 +61,48 @@ def read_checkpoint(
     """
 
     def read() -> tuple[Restart, dict[str, Any]] | None:
-        path = Path(folder) / NAME
-        if not path.exists():
+        arrays = read_arrays(Path(folder) / NAME)
+        if arrays is None:
             return None
-        try:
-            with np.load(path) as file:
-                arrays = dict(file)
-            if not np.array_equal(arrays.pop("sum"), _sum(arrays)):
-                raise ValueError("it is not as it was written")
-            text = json.loads(bytes(arrays["facts"]))
-            added = [arrays.get(f"added{k}") for k in range(text["meshes"])]
-            u = [(arrays[f"at{k}"], arrays[f"u{k}"]) for k in range(2 if added else 1)]
-            return Restart(tuple(added), tuple(u)), text["facts"]
-        except Exception as error:  # damaged archives raise whatever their readers come across
-            words = str(error) or type(error).__name__
-            raise InputError(
-                f"cannot read {path}: {words}; it is to be removed, and the run begun anew"
-            ) from error
+        text = json.loads(bytes(arrays["facts"]))
+        added = [arrays.get(f"added{k}") for k in range(text["meshes"])]
+        at = [arrays.get(f"at{k}", arrays["at0"]) for k in range(text["functions"])]
+        u = [(each, arrays[f"u{k}"]) for k, each in enumerate(at)]
+        return Restart(tuple(added), tuple(u)), text["facts"]
 
     return on_root(comm, read)
+
+
+def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an archive that `read_arrays` reads; called on one rank."""
+    with disk_errors(path):
+        np.savez(path, sum=_sum(arrays), **arrays)
+
+
+def read_arrays(path: Path) -> dict[str, Any] | None:
+    """What `write_arrays` has written, None if there is no such file; called on one rank.
+
+    Raises:
+        InputError: It can't be read, or is not as it was written.
+    """
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+        if not np.array_equal(arrays.pop("sum"), _sum(arrays)):
+            raise ValueError("it is not as it was written")
+    except Exception as error:  # damaged archives raise whatever their readers come across
+        words = str(error) or type(error).__name__
+        raise InputError(
+            f"cannot read {path}: {words}; it is to be removed, and the run begun anew"
+        ) from error
+    return arrays
+
+
+def _letters(value: Any) -> npt.NDArray[np.uint8]:
+    """What JSON knows, as an array."""
+    return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
 
 
 def _sum(arrays: dict[str, Any]) -> npt.NDArray[np.uint8]:

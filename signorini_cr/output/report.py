@@ -58,12 +58,14 @@ FILES = (
     "times.csv",
     "series.pvd",
     "strip.png",
+    checkpoint.MOMENTS,
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 
 MOST_CELLS = 4000
 """Of a mesh that is drawn, if there is a coarser one."""
 
+UNDER_WAY = {"lower": None, "upper": None, "reason": "the run is under way, or was ended"}
 PHASES = ("mesh", "assemble", "solve", "estimate")
 Record = dict[str, Any]
 
@@ -165,7 +167,8 @@ def make_report(
         title: The problem's.
         element: "CR" or "P1".
         comm: The ranks that solved it.
-        records: From `level_record`, coarsest level first.
+        records: From `level_record`, coarsest level first; none of a run in time that is under
+            way.
         complete: Whether these are all the levels that were asked for.
         units: What is told of u, lengths and the rest; also for tables and pictures.
     """
@@ -182,7 +185,7 @@ def make_report(
         "versions": versions,
         **units.record(),
         "complete": complete,
-        "force_bounds": records[-1]["contact"]["force_bounds"],
+        "force_bounds": records[-1]["contact"]["force_bounds"] if records else UNDER_WAY,
         "levels": list(records),
     }
 
@@ -284,7 +287,9 @@ def write_output(
             writers["strip.png"] = lambda path: plots.drawn(
                 comm, lambda: plot_strip(moments, path, title, units)
             )
-    kept = {checkpoint.NAME} if resumable else {"times.csv", "series.pvd"} if moments else set()
+    kept = {checkpoint.NAME} if resumable else set()
+    if moments:
+        kept |= {"times.csv", "series.pvd", checkpoint.MOMENTS}
     removed = set(FILES) - kept
     write_files(folder, writers, removed=removed, comm=comm)
     return list(writers)

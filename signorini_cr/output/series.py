@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mpi4py import MPI
+
 from ..errors import on_root
 from ..rounding import at_most, known
+from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
-from .report import FILES, plain
+from .report import FILES, plain, report_json
+from .strip import Moment, as_arrays, from_arrays
 from .tables import Column, explained, levels_csv, rows_of
 from .units import GLUE, Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
+    from ..restart import Restart
     from ..solution import Solution
 
 TABLE, SERIES, FIELDS = "times.csv", "series.pvd", "step_*.vtu"
@@ -96,40 +101,97 @@ def times(records: Sequence[Mapping[str, Any]]) -> str:
     return f"{whole}{GLUE}s for all {len(records)} steps, {each}{GLUE}s a step"
 
 
-def write_step(folder: Path, records: Sequence[Mapping[str, Any]], solution: Solution) -> None:
-    """Write a step's field, and the table and the series with all steps so far; collective.
+def is_kept(step: int) -> bool:
+    """Tell whether table, report and restart are written with a step: with all of the first 200.
 
-    With the first step what a former run has left goes.
+    Later on that would take longer than to solve: what they take grows with the steps before.
+    """
+    return step % (1 + step // 200) == 0
+
+
+def write_step(folder: Path, step: int, solution: Solution) -> None:
+    """Write a step's field; collective.
 
     Args:
         folder: Made if it is not there.
-        records: From `step_record`.
-        solution: The last step's.
+        step: Its number.
+        solution: What was found.
 
     Raises:
         InputError: The folder can't be written to.
     """
     comm = solution.domain.mesh.comm
+    write_files(folder, {_field(step): lambda path: write_solution(solution, path)}, comm=comm)
+
+
+def write_steps(
+    folder: Path,
+    report: Mapping[str, Any],
+    solution: Solution,
+    restart: Restart,
+    said: Mapping[str, Any],
+    moments: Sequence[Moment],
+) -> None:
+    """Write the last step's field, and all that tells of the steps so far; collective.
+
+    These are the report, the table, the series, and what a run that is resumed goes on from. With
+    the first step what a former run has left goes.
+
+    Args:
+        folder: Made if it is not there.
+        report: From `make_report`, with records from `step_record` as ``times``.
+        solution: The last step's.
+        restart: From there.
+        said: What the run was told to solve; nothing but what JSON knows.
+        moments: So far, for the strip.
+
+    Raises:
+        InputError: The folder can't be written to.
+    """
+    comm, records = solution.domain.mesh.comm, report["times"]
     removed: set[str] = set()
     if len(records) == 1:
         found = on_root(comm, lambda: [path.name for path in folder.glob(FIELDS)])
-        removed = {*FILES, *comm.bcast(found)}
+        removed = {*FILES, *found}
+    facts = {"said": said, "times": records}
+
+    def text(make: Callable[[], str]) -> Writer:
+        return lambda path: on_root(comm, write_text, path, make)
+
     writers: dict[str, Writer] = {
-        TABLE: lambda path: on_root(comm, write_text, path, lambda: levels_csv(records)),
-        SERIES: lambda path: on_root(comm, write_text, path, lambda: _series(records)),
-        _field(records[-1]): lambda path: write_solution(solution, path),
+        "report.json": text(lambda: report_json(report)),
+        TABLE: text(lambda: levels_csv(records)),
+        SERIES: text(lambda: _series(records)),
+        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
+        _field(len(records)): lambda path: write_solution(solution, path),
     }
+    if moments and moments[-1].time == records[-1]["time"]:
+        arrays = as_arrays(moments)
+        writers[checkpoint.MOMENTS] = lambda path: on_root(
+            comm, checkpoint.write_arrays, path, arrays
+        )
     write_files(folder, writers, removed=removed, comm=comm)
 
 
-def _field(record: Mapping[str, Any]) -> str:
-    return FIELDS.replace("*", f"{record['step']:05d}")
+def read_moments(folder: Path, comm: MPI.Comm) -> list[Moment]:
+    """The moments of a run that is resumed; collective.
+
+    Raises:
+        InputError: They can't be read.
+    """
+    arrays = on_root(comm, checkpoint.read_arrays, folder / checkpoint.MOMENTS)
+    return from_arrays(arrays or {})
+
+
+def _field(step: int) -> str:
+    return FIELDS.replace("*", f"{step:05d}")
 
 
 def _series(records: Sequence[Mapping[str, Any]]) -> str:
     """ParaView's list of files with their times."""
     sets = "".join(
-        f'<DataSet timestep="{record["time"]!r}" file="{_field(record)}"/>\n' for record in records
+        f'<DataSet timestep="{record["time"]!r}" file="{_field(record["step"])}"/>\n'
+        for record in records
     )
     return (
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'

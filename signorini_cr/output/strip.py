@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,6 +66,23 @@ class Moment:
     touching: FloatArray
     free: FloatArray
     words: str
+
+
+def as_arrays(moments: Sequence[Moment]) -> dict[str, Any]:
+    """What `from_arrays` makes moments of again."""
+    facts = [asdict(each) for each in moments]
+    return {f"{name}{k}": np.array(v) for k, each in enumerate(facts) for name, v in each.items()}
+
+
+def from_arrays(arrays: Mapping[str, Any]) -> list[Moment]:
+    """Moments, from what `as_arrays` has made of them."""
+    names = [each.name for each in fields(Moment)]
+    found: list[Moment] = []
+    while f"time{len(found)}" in arrays:
+        facts = {name: arrays[f"{name}{len(found)}"] for name in names}
+        low, high = map(float, facts.pop("limits"))
+        found.append(Moment(time=float(facts.pop("time")), limits=(low, high), **facts))
+    return found
 
 
 def chosen(steps: int) -> set[int]:

@@ -29,10 +29,22 @@ COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("seed", [0, 3, 9])
-def test_a_run_that_is_ended_leaves_whole_files_of_one_run(seed: int, tmp_path: Path) -> None:
-    """Seeds of one and two ranks; `python3 tests/kills.py` has as many as one likes."""
-    end = kills.killed(tmp_path, seed)
+@pytest.mark.parametrize(
+    "seed, ranks, case",
+    [
+        (0, None, "uniform"),
+        (3, None, "uniform"),
+        (9, None, "uniform"),
+        (1, 3, "adaptive"),
+        (2, 1, "time"),
+        (5, 3, "time"),
+    ],
+)
+def test_a_run_that_is_ended_leaves_whole_files_of_one_run(
+    seed: int, ranks: int | None, case: str, tmp_path: Path
+) -> None:
+    """A few seeds; `python3 tests/kills.py` has as many as one likes."""
+    end = kills.killed(tmp_path, seed, (1, 2) if ranks is None else (ranks,), (case,))
     assert end.faults == [], f"{end.kind}: {end.faults}"
     one = end.kind.startswith("1 ")
     assert end.status in ((130, 143, -2, -9, -15, 0) if one else (1, 130, 137, 143, -2, -9, -15, 0))
@@ -236,6 +248,33 @@ def test_an_interruption_inside_a_callback_is_one(
     assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("case, first", [("uniform", "levels 0 to"), ("time", "steps 1 to")])
+def test_told_while_files_are_put_in_place(
+    case: str, first: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """What is there then is what is told: the signal waits until both are done."""
+    text = kills.CASES[case].replace("levels = 9", "levels = 3")
+    (tmp_path / "case.toml").write_text(text)
+    replace, out = os.replace, tmp_path / "out"
+    calls: list[str] = []
+
+    def replaced(source: Path, target: Path) -> None:
+        replace(source, target)
+        calls.append(Path(target).name)
+        if calls.count("report.json") == 2 and calls[-1] == "report.json":
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+
+    monkeypatch.setattr(os, "replace", replaced)
+    assert cli.main(["solve", str(tmp_path / "case.toml"), "--out", str(out), "-q"]) == 143
+    words = " ".join(capsys.readouterr().err.split())
+    number = kills.levels_in(out)
+    last = number - 1 if case == "uniform" else number
+    assert number >= 2
+    assert words.endswith(f"terminated; {first} {last} are finished and kept in {out}")
 
 
 @pytest.mark.serial

@@ -146,7 +146,7 @@ def test_another_problem_is_refused(old, new, words, told, case, capfd) -> None:
     assert solved("--resume", *words) == cli.BAD_INPUT
     error = " ".join(capfd.readouterr().err.split())
     if COMM.rank == 0:
-        assert "case.toml: --resume: out has levels of another run:" in error
+        assert "case.toml: --resume: out has results of another run:" in error
         assert told in error
     assert Path("out", "report.json").read_bytes() == before
 

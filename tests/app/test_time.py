@@ -3,15 +3,20 @@
 import csv
 import json
 import xml.etree.ElementTree as ET
+from itertools import pairwise
 
+import helpers
 import numpy as np
 import pytest
 from helpers import is_picture
 from mpi4py import MPI
 
+from signorini_cr import evolution, limits, memory
 from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
+from signorini_cr.errors import NotConverged
 from signorini_cr.output.meanings import STEP
+from signorini_cr.output.series import is_kept
 
 COMM = MPI.COMM_WORLD
 CASE = """[domain]
@@ -151,12 +156,166 @@ def test_what_makes_no_sense_in_time(old, new, said, case, shared_tmp_path, capf
         assert not out.exists()
 
 
-@pytest.mark.parametrize("option", ["--resume", "--max-time=9", "--element=p1"])
+@pytest.mark.parametrize("option", ["--element=p1"])
 def test_options_that_do_not_go_with_time(option, case, shared_tmp_path, capfd):
     assert main(["solve", str(case()), "--out", str(shared_tmp_path / "out"), option]) == 2
     if COMM.rank == 0:
         error = capfd.readouterr().err
         assert option.split("=")[0] in error and "problems in time" in error
+
+
+def solved(path, out, *words):
+    COMM.Barrier()
+    status = main(["solve", str(path), "--out", str(out), "-q", *map(str, words)])
+    COMM.Barrier()
+    return status
+
+
+def report_in(out):
+    return json.loads((out / "report.json").read_text(encoding="utf-8"))
+
+
+def assert_same(one, other):
+    """All figures of all steps, and of the last one, but for iterations and seconds."""
+    one, other = map(report_in, (one, other))
+    pairs = zip(one["times"], other["times"], strict=True)
+    for a, b in [*pairs, (one["levels"][0], other["levels"][0])]:
+        for key in a.keys() & {"step", "time", "active", "cells", "dofs"}:
+            assert a[key] == b[key], key
+        for key in a.keys() & {"energy", "force", "length", "bound_h1"}:
+            assert a[key] == pytest.approx(b[key], rel=1e-6, abs=1e-9), key
+    for name, a in one["levels"][0]["quantities"].items():
+        b = other["levels"][0]["quantities"][name]
+        assert [a[k] for k in ("lower", "value", "upper")] == pytest.approx(
+            [b[k] for k in ("lower", "value", "upper")], rel=1e-6
+        )
+    assert (one["complete"], one["title"]) == (other["complete"], other["title"])
+
+
+@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+@pytest.mark.parametrize("after", [1, 2, 4])
+def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
+    scheme, after, case, shared_tmp_path, monkeypatch, capfd
+):
+    """Ended in the midst of a step; what was finished before is there, and nothing is lost."""
+    path = case(CASE.replace("steps = 6", f'steps = 6\nscheme = "{scheme}"'))
+    whole, out = shared_tmp_path / "whole", shared_tmp_path / "out"
+    assert solved(path, whole) == 0
+    with monkeypatch.context() as patch:
+        original = evolution.Solver.solve
+        calls = []
+
+        def solve(self, *arguments):
+            calls.append(1)
+            if len(calls) > after:
+                raise NotConverged("so it was told")
+            return original(self, *arguments)
+
+        patch.setattr(evolution.Solver, "solve", solve)
+        assert solved(path, out) == 3
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        kept = f"steps 1 to {after} are" if after > 1 else "step 1 is"
+        assert f"time step {after + 1}: so it was told {kept} finished and kept in" in error
+        assert len(report_in(out)["times"]) == after and not report_in(out)["complete"]
+    assert solved(path, out, "--resume") == 0
+    assert_same(out, whole)
+    assert {each.name for each in out.iterdir()} == {each.name for each in whole.iterdir()}
+    strips = [(each / "strip.png").read_bytes() for each in (out, whole)]
+    assert len(strips[0]) == pytest.approx(len(strips[1]), rel=0.01)
+    assert solved(path, out, "--resume") == 0  # nothing is left to do
+    assert_same(out, whole)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("first, then", [(1, 2), (2, 1)])
+def test_on_another_number_of_ranks(first, then, case, shared_tmp_path, monkeypatch):
+    """Three of six steps are done, with two steps behind each as bdf2 has them."""
+    text = CASE.replace("steps = 6", 'steps = 6\nscheme = "bdf2"')
+    whole, out = shared_tmp_path / "whole", shared_tmp_path / "out"
+    assert solved(case(text), whole) == 0
+    (shared_tmp_path / "run.py").write_text(
+        "import sys\n"
+        "from signorini_cr import evolution\n"
+        "from signorini_cr.app import cli\n"
+        "from signorini_cr.errors import NotConverged\n"
+        "def stop(self, *arguments, calls=[], solve=evolution.Solver.solve):\n"
+        "    calls.append(1)\n"
+        "    if len(calls) > 3:\n"
+        "        raise NotConverged('told')\n"
+        "    return solve(self, *arguments)\n"
+        "evolution.Solver.solve = stop\n"
+        "sys.exit(cli.main())\n"
+    )
+    words = ["solve", case(text), "--out", out, "-q"]
+    done = helpers.start(shared_tmp_path / "run.py", *words, ranks=first)
+    assert "time step 4: told" in " ".join(done.stderr.split())
+    done = helpers.command(*words, "--resume", ranks=then)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_same(out, whole)
+
+
+def test_what_another_run_in_time_has_left_is_refused(case, shared_tmp_path, capfd):
+    out = shared_tmp_path / "out"
+    assert solved(case(), out) == 0
+    for old, new, told in (
+        ("steps = 6", "steps = 7", "time.steps was 6 and is 7"),
+        ("end = 1.5", "end = 1", "time.end was 1.5 and is 1"),
+        ("[time]", "[refine]\nlevels = 2\n[time]", "--levels) was 1 and is 2"),
+    ):
+        assert solved(case(CASE.replace(old, new)), out, "--resume") == 2
+        if COMM.rank == 0:
+            assert told in " ".join(capfd.readouterr().err.split())
+
+
+def test_a_step_that_would_end_too_late_is_not_begun(case, shared_tmp_path, monkeypatch, capfd):
+    """Each step takes a second, of three and a half."""
+
+    class Clock:
+        now = 0.0
+
+        @classmethod
+        def perf_counter(cls):
+            return cls.now
+
+    admit = limits.Limits.admit_step
+
+    def after(self, comm):
+        Clock.now += 1.0
+        admit(self, comm)
+
+    monkeypatch.setattr(limits, "time", Clock)
+    monkeypatch.setattr(limits.Limits, "admit_step", after)
+    monkeypatch.setattr("signorini_cr.app.cli._left", lambda args: args.max_time)
+    out = shared_tmp_path / "out"
+    assert solved(case(), out, "--max-time", 3.5) == 3
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        assert "time step 4: it would take about 1 s, and of --max-time there are 0.5 s" in error
+        assert "steps 1 to 3 are finished and kept in" in error
+    assert len(report_in(out)["times"]) == 3
+    assert solved(case(), out, "--resume") == 0
+    assert len(report_in(out)["times"]) == 6
+
+
+def test_a_mesh_that_memory_does_not_hold_is_refused_before_the_first_step(
+    case, shared_tmp_path, monkeypatch, capfd
+):
+    monkeypatch.setattr(memory, "_spare", lambda: 1.0)
+    out = shared_tmp_path / "out"
+    assert solved(case(), out, "--levels", 3) == 3
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        assert "time step 1: level 2: its" in error and "degrees of freedom would take" in error
+        assert not out.exists()
+
+
+def test_long_tables_are_not_written_with_each_step():
+    """With all of the first 200; then as rarely as is needed to take a fixed share of the time."""
+    kept = [step for step in range(1, 20_001) if is_kept(step)]
+    assert kept[:199] == list(range(1, 200))
+    assert all(b - a <= 2 + b // 100 for a, b in pairwise(kept))
+    assert len(kept) < 1500
 
 
 @pytest.mark.serial

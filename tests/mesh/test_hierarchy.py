@@ -206,14 +206,38 @@ def test_any_number_of_ranks_gives_the_same_mesh(shape: str):
         assert load_norms(ours.mesh) == pytest.approx(load_norms(alone.mesh), rel=1e-12)
 
 
-def test_one_rank_alone_refines_like_several(monkeypatch):
-    """The facets of our own numbering and those of DOLFINx's are the same ones."""
-    domain = SHAPES["hole"].mesh(0.2, MPI.COMM_SELF)
-    given, _ = refine(domain)
-    monkeypatch.setattr("signorini_cr.compat.can_take_facets", lambda comm: False)
-    found, _ = refine(domain)
-    assert load_norms(given.mesh) == pytest.approx(load_norms(found.mesh), rel=1e-12)
-    assert geometry(given) == pytest.approx(geometry(found), rel=1e-13)
+@pytest.mark.parametrize("comm", [MPI.COMM_SELF, COMM], ids=["alone", "together"])
+@pytest.mark.parametrize("shape", list(SHAPES))
+def test_facets_that_are_given_are_those_that_are_found(shape: str, comm, monkeypatch):
+    """Those of our own numbering and DOLFINx's, what lies between ranks with them; also on few
+    cells, of which a rank has one, or none."""
+    for size in (SHAPES[shape].diameter, 0.6):
+        given = found = SHAPES[shape].mesh(size, comm)
+        for _ in range(2):
+            given, _ = refine(given)
+            with monkeypatch.context() as patch:
+                patch.setattr("signorini_cr.compat.can_take_facets", lambda: False)
+                found, _ = refine(found)
+            assert load_norms(given.mesh) == pytest.approx(load_norms(found.mesh), rel=1e-12)
+            assert geometry(given) == pytest.approx(geometry(found), rel=1e-13)
+            for one, other in zip(outside(given), outside(found), strict=True):
+                assert np.allclose(one, other)
+
+
+def outside(domain: Domain) -> list[np.ndarray]:
+    """Midpoints of exterior facets, and of ghosts with those of the owners, in order."""
+    mesh = domain.mesh
+    mesh.topology.create_connectivity(1, 0)
+    exterior = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    index_map = mesh.topology.index_map(1)
+    number = index_map.size_local + index_map.num_ghosts
+    middle = dolfinx.mesh.compute_midpoints(mesh, 1, np.arange(number, dtype=np.int32))
+    seen = dolfinx.la.vector(index_map, bs=3)
+    seen.array[: 3 * index_map.size_local] = middle[: index_map.size_local].ravel()
+    seen.scatter_forward()
+    assert np.allclose(seen.array.reshape(-1, 3), middle)
+    rows = np.concatenate(mesh.comm.allgather(middle[exterior]))
+    return [rows[np.lexsort(np.round(rows, 9).T)]]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
