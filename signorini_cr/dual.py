@@ -34,6 +34,7 @@ def certified(dual: Problem, level: Level) -> Certificate:
     system.residual(u, residual)
     release(load, found)
     contact = contact_facts(level.data, system, u, residual, Iterations(0, 0, ""))
+    u.x.array[:] += system.offset
     z = Solution(level, u, residual, contact, 0.0, Iterations(0, 0, ""))
     certificate = certify(z, sweeps=0)
     level.tidy()

@@ -418,7 +418,8 @@ def test_a_piece_pressed_onto_the_obstacle(slope, element, nested):
         assert 0 < contact.number_active < of_piece
         assert contact.midpoints[contact.active, 0].max(initial=2.0) < 2.6
     if element == "CR":
-        assert "Γ0" in solution.certificate.reason
+        low, high = solution.certificate.energy
+        assert high - low < 0.5 and (slope != 0.0 or low <= energy <= high)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6, 1e10])
