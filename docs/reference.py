@@ -67,12 +67,13 @@ def _options() -> list[str]:
             }
             settings = ", ".join(f"`{name} {value}`" for name, value in values.items())
         lines.append(f"| `-{prefix}` | {what} | {settings} |")
-    first, second = SMOOTHERS
+    first, *others = SMOOTHERS
+    named = " or ".join(f"`{name}`" for name in others)
     lines += [
         "",
-        f"`-{P}smoother {second}` is the program's own: what smooths in the cycle. It takes twice "
-        f"the steps of `{first}`, the default, and",
-        "gives the same figures on any number of ranks.",
+        f"`-{P}smoother` is the program's own: what smooths in the cycle, `{first}`, the default, "
+        f"or {named}.",
+        "`jacobi` takes twice the steps, and gives the same figures on any number of ranks.",
     ]
     return lines
 

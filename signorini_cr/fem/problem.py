@@ -362,6 +362,8 @@ class Forms:
         for condition in self.conditions:
             if condition.uncertified:
                 return condition.uncertified
+            if condition.loss is not None and condition.flux is None:
+                return f"{condition.part}: its kind has a loss, and no flux beside it"
             if condition.loss is not None and not is_by_cells(condition.loss):
                 return f"{condition.part}: its coefficient varies within cells: it has no enclosure"
         return None

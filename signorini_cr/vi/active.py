@@ -1,6 +1,9 @@
-"""Which dofs the obstacle holds: decided here, for everyone who asks.
+"""Which dofs the obstacle holds, for everyone who asks.
 
-The solver goes by `ActiveSet.of`; who knows a solution only by its gaps and forces, by `touching`.
+While it solves SNES decides, and `ActiveSet.without` takes that over. `ActiveSet.of` is the same
+criterion for an iterate as it is, `ReducedSystem.indicator` for one as CG sees it coming: the three
+must agree. Who knows a solution only by its gaps and forces goes by `touching`. From dofs to
+facets leads `contact_facts`.
 """
 
 from __future__ import annotations
