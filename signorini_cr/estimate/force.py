@@ -16,7 +16,7 @@ from ..data.diffusion import diffusion
 from ..data.loads import reacts, trace_of
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
-from ..fem.conditions import Condition, facets_of
+from ..fem.conditions import Condition, Data, facets_of
 from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
 from ..jit import compiled
@@ -24,6 +24,7 @@ from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
 from .gap import apart
+from .weights import Beyond, Weight
 
 NO_BOUNDS = "the contact force has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
@@ -71,14 +72,17 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     return _interval(solution, diffusion(_certified(solution).level.data).forms.bounded)[1:]
 
 
-def flux(solution: Certified, *parts: str) -> Interval:
+def flux(solution: Certified, *parts: str, weight: Data | None = None) -> Interval:
     """Put what flows into Ω through parts of the boundary between two numbers; collective.
 
     On a Dirichlet part that is ∫ κ∂ₙu, on a contact part the contact force, as in `force_bounds`.
 
     Args:
         solution: One with a certified bound.
-        *parts: Names of Dirichlet or contact parts that touch no others of these.
+        *parts: Names of Dirichlet or contact parts; without a weight they must touch no others of
+            these.
+        weight: What is integrated with it, as ∫ λ ω, continuous on the parts and 0 where they touch
+            others; None for 1.
 
     Raises:
         InputError: There is no such part, or there is no bound; the message says why.
@@ -91,7 +95,7 @@ def flux(solution: Certified, *parts: str) -> Interval:
                 f"{part!r} is no Dirichlet or contact part of the boundary; there are"
                 f" {', '.join(known)}"
             )
-    return _interval(solution, [known[part] for part in parts])
+    return _interval(solution, [known[part] for part in parts], weight)
 
 
 def _certified(solution: Certified) -> Made:
@@ -102,20 +106,54 @@ def _certified(solution: Certified) -> Made:
     return certificate._made
 
 
-def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
-    """Bound ∫ λ over parts; collective.
+def _interval(
+    solution: Certified, conditions: Sequence[Condition], weight: Data | None = None
+) -> Interval:
+    """Bound ∫ λ over parts, or ∫ λ ω with a weight ω; collective.
 
     With φ = 1 on them and φ = 0 on the rest of Γ0 and Γ1 it is a(u, φ) − χ(φ), and the certificate
     knows a ball that A u is in. φ is found by solving for nearly the least ‖Aφ‖, as accurately as
-    the figures deserve; that costs about as much as the solve.
+    the figures deserve; that costs about as much as the solve. With a weight ω it is φ + ℓ that is
+    ω on the parts, see `Weight`.
     """
     made = _certified(solution)
     if made.varies or made.level.domain.mesh.topology.dim != 2:
         raise InputError(f"{NO_BOUNDS}: {VARIES if made.varies else SPATIAL}")
     cells = made.cells()
-    phi = _weight(solution, conditions)
+    given = None if weight is None else Weight.of(made, cells, conditions, weight)
+    if given is None:
+        phi = _weight(solution, conditions)
+    else:
+        phi = extended(given.values, given.known, made)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     work, slack = against(made, cells, at)
+    (energy,) = cells.total(square(made, cells, at))
+    if given is None:
+        beyond = Beyond(force=_through(made, cells, conditions))
+    else:
+        beyond = given.beyond(made, cells, float(np.sqrt(energy)))
+    at_fixed = any(condition.fixed is not None for condition in conditions)
+    largest = np.abs(at).max(initial=0.0) + beyond.mean
+    value, middle, lifted, unsure = cells.total(
+        beyond.force,
+        beyond.force + 0.5 * work,
+        beyond.square,
+        # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
+        beyond.unsure + (np.sum(slack) + beyond.left + made.missed * largest if at_fixed else 0.0),
+    )
+    # ℓ meets all of A(u − v), of which one half is known to be at most the radius
+    reach = made.reach * (np.sqrt(energy) + 2.0 * np.sqrt(lifted)) + unsure
+    # a force off one bound only has its sign
+    signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
+    if min(cells.comm.allgather(beyond.least)) < 0.0:
+        signs = set()
+    lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
+    lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
+    return Interval(float(value), lower, upper)
+
+
+def _through(made: Made, cells: Cells, conditions: Sequence[Condition]) -> float:
+    """What y brings into Ω through parts of Γ0, and presses on parts of Γ1; this rank's share."""
     force = 0.0
     for condition in conditions:
         if condition.number in made.forces:
@@ -123,20 +161,7 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
         else:
             side = cells.sides[condition.number]
             force += float(np.sum(made.through(cells)[side.local, side.cells]))
-    at_fixed = any(condition.fixed is not None for condition in conditions)
-    value, middle, energy, unsure = cells.total(
-        force,
-        force + 0.5 * work,
-        square(made, cells, at),
-        # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
-        np.sum(slack) + made.missed * np.abs(at).max(initial=0.0) if at_fixed else 0.0,
-    )
-    reach = made.reach * np.sqrt(energy) + unsure
-    # a force off one bound only has its sign
-    signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
-    lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
-    lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
-    return Interval(float(value), lower, upper)
+    return force
 
 
 def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray]:

@@ -505,6 +505,84 @@ def test_means_where_data_are_curved(pressure):
     assert max(off) < 0.02  # what is added to the companion's means is right
 
 
+def bar(x):
+    """u of the bar that is held at 1 below and at 0 above."""
+    k = np.sqrt(1.5)
+    return np.sinh(k * (1.0 - x)) / np.sinh(k)
+
+
+def test_weighted_integrals_are_bracketed_in_one_dimension():
+    """Weights of either sign, on all of the domain, in a material and on sides, by Gauss's rule."""
+    half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
+    sides = [Contact(1.0, coefficient=5.0, external=-4.0), Neumann(), Dirichlet(0.0), Neumann()]
+    conditions = dict(zip(STRIP_EDGES, sides, strict=True))
+    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
+    problem = Problem(coefficient=2.0, reaction=3.0, conditions=conditions)
+    t, w = np.polynomial.legendre.leggauss(30)
+    y, w = (t + 1) / 2, w / 2
+    x, ends = 2 * y, {"left": (0.0 * y, y, w), "floor": (2 * y, 0.0 * y, 2 * w)}
+    grid = {None: (2, x[:, None], y), "half": (1, y[:, None], y)}
+
+    def psi(x, sin, exp):
+        return sin(3 * x[0] + 1) * exp(x[1]) - 0.2
+
+    exact_values = {
+        where: size * (w @ (psi((a, b), np.sin, np.exp) * bar(b)) @ w)
+        for where, (size, a, b) in grid.items()
+    } | {where: c @ (psi((a, b), np.sin, np.exp) * bar(b)) for where, (a, b, c) in ends.items()}
+    weights = {
+        where: size * (w @ psi((a, b), np.sin, np.exp) @ w) for where, (size, a, b) in grid.items()
+    } | {where: c @ psi((a, b), np.sin, np.exp) for where, (a, b, c) in ends.items()}
+    widths = []
+    for solution in solve_levels(problem, domain, 3):
+        widths.append([])
+        for where, exact_value in exact_values.items():
+            value, lower, upper = solution.integral(where, lambda x: psi(x, ufl.sin, ufl.exp))
+            assert lower <= exact_value <= upper
+            assert value == pytest.approx(exact_value, abs=0.02)
+            widths[-1].append(upper - lower)
+        _, lower, upper = solution.mean("left", lambda x: psi(x, ufl.sin, ufl.exp))
+        assert lower <= exact_values["left"] / weights["left"] <= upper
+    assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
+    whole, mean_of_all = solution.integral(), solution.mean()
+    assert whole[1:] == pytest.approx(tuple(2 * end for end in mean_of_all[1:]), rel=1e-12)
+    with pytest.raises(InputError, match="the weight's integral may be 0"):
+        solution.mean(None, lambda x: x[0] - 1)
+    with pytest.raises(InputError, match="the weight is not bounded"):
+        solution.integral(None, lambda x: 1 / x[0])
+    with pytest.raises(InputError, match=r"the weight has the shape \(2,\)"):
+        solution.integral(None, lambda x: x)
+
+
+def test_a_weight_is_what_is_needed_where_contact_meets_dirichlet():
+    """u = (1 − x²)(1 − y) lies on the floor, where λ = 1 − x²; the other sides are Dirichlet's."""
+    floor = Contact(lambda x: 1.0 - x[0] ** 2)
+    sides = dict.fromkeys(STRIP_EDGES, Dirichlet(0.0)) | {"floor": floor}
+    problem = Problem(f=lambda x: 2.0 * (1.0 - x[1]), conditions=sides)
+    polygon = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], STRIP_EDGES, names=STRIP_EDGES)
+    asked = [
+        ("floor", lambda x: 1.0 - x[0] ** 2, 16 / 15),
+        ("floor", lambda x: 1.0 - abs(x[0]), 5 / 6),
+        ("floor", lambda x: ufl.sin(np.pi * x[0]), 0.0),
+        ("top", lambda x: x[0] ** 2 - 1.0, 16 / 15),
+        ("right", lambda x: x[1] * (1.0 - x[1]), -1 / 6),
+        ("right", lambda x: x[1] * (1.0 - x[1]) * ufl.exp(x[1]), -2 * (11 - 4 * np.e)),
+    ]
+    widths = []
+    for solution in solve_levels(problem, polygon.mesh(0.4), 4):
+        widths.append([])
+        for part, weight, exact_value in asked:
+            value, lower, upper = solution.flux(part, weight=weight)
+            assert lower <= exact_value <= upper
+            assert abs(value - exact_value) < 0.2 * 0.5**solution.level.number
+            widths[-1].append(upper - lower)
+    assert np.all(np.log2(np.array(widths[1:-1]) / widths[2:]) > 0.85)
+    with pytest.raises(InputError, match=r"the weight is 1 at \(-1, 0\), where the part touches"):
+        solution.flux("floor", weight=1.0)
+    with pytest.raises(InputError, match="the weight jumps on a boundary facet"):
+        solution.flux("floor", weight=lambda x: ufl.conditional(ufl.gt(x[0], 0.1), 0.0, 1.0 + x[0]))
+
+
 def test_held_by_contact_alone_there_is_a_force_and_no_interval():
     """Nothing but the obstacle takes what f and g bring."""
     (*_, solution) = strip([Contact(0.0), Neumann(0.5), Neumann(), Neumann()], f=-3.0)
