@@ -198,13 +198,15 @@ def picture(rows: list[Row], path: Path) -> None:
         f"CG steps stay between {min(steps)} and {max(steps)}\nhowever fine the mesh",
     )
     values: list[Callable[[Row], float]] = [lambda r: r.all_ratio, lambda r: r.cg]
-    for axes, title, value in zip(figure.subplots(1, 2), titles, values, strict=True):
+    sides = ("time over that of one linear solve", "CG steps on the finest mesh")
+    for axes, title, side, value in zip(figure.subplots(1, 2), titles, sides, values, strict=True):
         for name, color, curve in zip(names, colors, curves, strict=True):
             style = "--" if "mapped" in name else "-"
             axes.semilogx([r.dofs for r in curve], [value(r) for r in curve], style, color=color,
                           marker="o", markersize=4)  # fmt: skip
         axes.set_title(title, fontsize=14)
         axes.set_xlabel("degrees of freedom on the finest mesh", fontsize=13)
+        axes.set_ylabel(side, fontsize=13)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.25)
         canvas.label_ends(axes, [(r.dofs, value(r)) for r in last], names, colors)

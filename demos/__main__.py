@@ -43,8 +43,9 @@ of this page is made by `make studies`, which runs
 
 in {minutes:.1f} minutes of processor time of each rank; the finest meshes have
 {dofs:,} degrees of freedom. Every demo ends in assertions, so that the page is there only if they
-hold. The examples (S1, A, B, C, D, E, I, L) are those of `signorini_cr.exact`; h is the largest
-diameter of a triangle, and rates are those between a level and the one before it.
+hold. The examples (S1, A, B, C 7/2, C 11/2, D, E, I, L) are those of `signorini_cr.exact`, where C
+and C2 stand for C 7/2 and C 11/2; h is the largest diameter of a triangle, and rates are those
+between a level and the one before it.
 
 | statement | seen in |
 |---|---|
@@ -66,7 +67,7 @@ polar coordinates there.
 |---|---|---|
 | S1 | (1 − x²)(1 − y²) r^1.5 cos 1.5θ | the regularity that a point has where contact ends |
 | A | x³ for x > 0, −y&#124;x&#124;³ for x < 0 | a pressure that fades slowly, hard on active sets |
-| B, C, C2 | r^s cos sθ, s = 1.5, 3.5, 5.5 | harmonic; u is not 0 on Γ0 |
+| B, C 7/2, C 11/2 | r^s cos sθ, s = 3/2, 7/2, 11/2 | harmonic; u is not 0 on Γ0 |
 | D | √r sin(θ/2) | not in H²; Γ0 and Γ1 meet at the origin, no contact |
 | E | not known; f = 2π sin 2πx | the unit square |
 | I | contact begins and ends at x = 1, ½, ⅓, … | infinitely many critical points |

@@ -15,7 +15,7 @@
 
 # %%
 import numpy as np
-from study import Study, column, levels_wanted, loglog, orders, run
+from study import COLOURS, Study, called, column, levels_wanted, loglog, orders, run
 
 from signorini_cr import exact
 
@@ -41,14 +41,17 @@ for norm, text in (("h1", "the broken norm"), ("l2", "L2")):
     study.table(
         f"Rates of P1 in {text}",
         {"h": ("{:.5f}", h)}
-        | {name: ("{:.3f}", orders(results[name, "P1"], norm)) for name in names},
+        | {called(name): ("{:.3f}", orders(results[name, "P1"], norm)) for name in names},
     )
 for norm, text in (("h1", "Broken norm"), ("l2", "L2")):
     study.table(
         f"{text}: the error of CR over that of P1, on the same mesh",
         {"h": ("{:.5f}", h)}
         | {
-            name: ("{:.3f}", column(results[name, "CR"], norm) / column(results[name, "P1"], norm))
+            called(name): (
+                "{:.3f}",
+                column(results[name, "CR"], norm) / column(results[name, "P1"], norm),
+            )
             for name in names
         },
     )
@@ -63,7 +66,7 @@ power = {"h1": 0.5, "l2": 1.0}
 smooth = [name for name in names if name != "D"]
 study.table(
     "Per degree of freedom, finest level: √N ‖u − u_h‖_h and N ‖u − u_h‖",
-    {"": ("{}", smooth)}
+    {"": ("{}", [called(name) for name in smooth])}
     | {
         f"{element} {norm.upper()}": (
             "{:.3f}",
@@ -124,8 +127,18 @@ def draw(left, right):
             for element in ("CR", "P1")
         }
         slopes = {1.0: "$h$", 2.0: "$h^2$"} if x == "h" else {-0.5: "$N^{-1/2}$", -1.0: "$N^{-1}$"}
-        loglog(axes, curves, slopes, title=title, x=label,
-               dashed=[key for key in curves if "P1" in key])  # fmt: skip
+        same = x == "h"
+        loglog(axes, curves, slopes, title=title, x=label, y="error of S1",
+               dashed=[key for key in curves if "P1" in key],
+               colours=[COLOURS[0], COLOURS[0], COLOURS[1], COLOURS[1]],
+               named={key: key.removeprefix("CR: ") + same * ",\nCR and P1"
+                      for key in curves if "CR" in key})  # fmt: skip
+        for key, (abscissae, errors) in {} if same else curves.items():
+            # beside the curves, which run apart
+            colour, at = COLOURS["_h" not in key.split("u_h")[-1]], 3 if "CR" in key else -1
+            axes.annotate(key.split(":")[0], (abscissae[at], errors[at]), (8, 4 if at > 0 else -4),
+                          textcoords="offset points", fontsize=13, color=colour,
+                          va="bottom" if at > 0 else "top")  # fmt: skip
 
 
 study.picture(

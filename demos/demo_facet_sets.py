@@ -15,7 +15,7 @@
 
 # %%
 import numpy as np
-from study import COLOURS, MARKERS, Study, levels_wanted, name_curves, run
+from study import COLOURS, MARKERS, Study, called, levels_wanted, name_curves, run
 
 study = Study("demo_facet_sets", "The facet sets (2.2) against the discrete active set")
 levels = levels_wanted(8)
@@ -46,7 +46,7 @@ judged = {
 # %%
 for (name, family), rows in judged.items():
     study.table(
-        f"{name} on the {family} meshes: number of facets",
+        f"{called(name)} on the {family} meshes: number of facets",
         {
             "h": ("{:.5f}", [h for h, _ in rows]),
             "Γ1h⁰": ("{}", [j.bound for _, j in rows]),
@@ -69,15 +69,23 @@ for (name, family), rows in judged.items():
 def draw(left, right):
     """Shares of the facets misjudged, and of those in Γ1h⁻."""
     for axes, what, title in (
-        (left, lambda j: j.misjudged, "Few facets are misjudged"),
+        (left, lambda j: j.misjudged, "Few facets are misjudged, none of S1"),
         (right, lambda j: j.mixed, r"Few facets are in $\Gamma_{1h}^-$, fewer the finer the mesh"),
     ):
+        alike = {}  # one line, one label
+        for (name, family), rows in judged.items():
+            share = tuple(what(j) / (j.bound + j.mixed + j.free) for _, j in rows)
+            alike.setdefault(share, []).append((name, family))
         curves = {}
-        for k, ((name, family), rows) in enumerate(judged.items()):
-            share = [what(j) / (j.bound + j.mixed + j.free) for _, j in rows]
-            curves[f"{name}, {family}"] = x, y = [h for h, _ in rows], share
-            style = "--" if family == "mapped" else "-"
-            axes.plot(x, y, style, color=COLOURS[k], marker=MARKERS[k], linewidth=1.8)
+        for k, (share, keys) in enumerate(alike.items()):
+            h = [h for h, _ in judged[keys[0]]]
+            label = ";\n".join(
+                f"{', '.join(called(name) for name, each in keys if each == family)}, {family}"
+                for family in dict.fromkeys(family for _, family in keys)
+            )
+            curves[label] = h, share
+            style = "--" if {family for _, family in keys} == {"mapped"} else "-"
+            axes.plot(h, share, style, color=COLOURS[k], marker=MARKERS[k], linewidth=1.8)
         axes.set_xscale("log")
         axes.set_yscale("symlog", linthresh=1e-3, linscale=0.4)
         axes.set_ylim(-2e-4, 1)
@@ -90,7 +98,8 @@ def draw(left, right):
 
 study.picture(
     "facet-sets.png",
-    "Shares of the contact facets that are misjudged (above) and that hold critical points.",
+    "Shares of the contact facets that are misjudged (above) and that hold critical points; where "
+    "several examples have the same, one line stands for all of them.",
     draw,
     panels=2,
 )

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import ufl
 from dolfinx import fem
-from study import Study, canvas, comm, levels_wanted
+from study import ENDS, Study, canvas, comm, levels_wanted
 
 from signorini_cr import (
     Contact,
@@ -40,6 +40,7 @@ from signorini_cr import (
 )
 from signorini_cr.app.problemfile import load
 from signorini_cr.output.strip import chosen, moment, plot_strip
+from signorini_cr.rounding import interval
 
 study = Study("demo_frost", "A bridge deck kept free of frost")
 MESHES = Path(__file__).parent.parent / "meshes"
@@ -58,40 +59,40 @@ found = []
 for solution in solve_levels(case.problem, case.mesh(), levels_wanted(6)):
     found.append((solution.cells, *force.flux(solution, "surface")))
 cells, values, lower, upper = map(np.array, zip(*found, strict=True))
-lower, upper = np.floor(100 * lower) / 100, np.ceil(100 * upper) / 100  # as they are shown
-study.table(
+lower, upper = study.intervals(
     "The heat that the surface needs, in W a metre of the bridge.",
-    {
-        "cells": ("{}", cells),
-        "heat": ("{:.2f}", values),
-        "at least": ("{:.2f}", lower),
-        "at most": ("{:.2f}", upper),
-        "width": ("{:.2%}", (upper - lower) / values),
-    },
+    "heat",
+    (cells, values, lower, upper),
+    2,
 )
-table = solution.contact.table()
-panels = None
-if comm.rank == 0:
-    figure = canvas.new_figure(11.0, 7.0)
-    panels = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1.0))
-plots.plot_solution(solution, ax=None if panels is None else panels[0], units=case.units)
-if panels is not None:
-    panels[0].set_title(
-        f"Free of frost with {lower[-1]:.2f} to {upper[-1]:.2f} W a metre", fontsize=16
-    )
-    panels[0].set_xlabel("")
-    panels[0].set_ylabel("$y$ [m]", fontsize=13)
-    panels[0].set_aspect("auto")
+
+
+def draw(field, below, table):
+    """The heat along the surface."""
+    field.set_xlabel("")
     order = np.argsort(table["x"])
     x, heat = (np.asarray(table[name])[order] for name in ("x", "pressure"))
-    panels[1].fill_between(x, heat, color=canvas.RED, alpha=0.35, step="mid")
-    panels[1].step(x, heat, color=canvas.RED, where="mid")
-    panels[1].set_xlabel("$x$ [m]", fontsize=13)
-    panels[1].set_ylabel("heat needed [W/m²]", fontsize=13)
-    panels[1].set_ylim(0.0)
-    panels[1].grid(alpha=0.3)
-    canvas.save(figure, study.folder / "frost.png")
-study.show("frost.png", "Temperature, and the heat that the surface needs: none above the ducts.")
+    below.fill_between(x, heat, color=canvas.RED, alpha=0.35, step="mid")
+    below.step(x, heat, color=canvas.RED, where="mid")
+    below.set_xlabel("$x$ in m", fontsize=13)
+    below.set_ylabel("heat needed in W/m²", fontsize=13)
+    below.set_ylim(0.0)
+    below.grid(alpha=0.3)
+
+
+study.field(
+    "frost.png",
+    "Temperature, and the heat that the surface needs: none above the ducts.",
+    solution,
+    draw,
+    units=case.units,
+    title=f"Free of frost with {lower[-1]:.2f} to {upper[-1]:.2f} W a metre, none above the ducts",
+    size=(11.0, 7.0),
+    words={"contact": "heated", "no contact": "not heated", ENDS: "heating begins or ends"},
+    nrows=2,
+    sharex=True,
+    height_ratios=(1.2, 1.0),
+)
 
 # %% [markdown]
 # ## A night
@@ -148,7 +149,7 @@ def deck(outside):
 resistance = 1 / BELOW + sum(d / k for d, k in LAYERS)
 expected = 5.0 * (ABOVE + 1 / resistance)
 value, low, high = np.array(force.flux(solve(deck(-5.0), column), "surface")) / WIDTH
-study.tell(f"layers: {expected:.6f} W/m²; found {value:.6f}, in [{low:.6f}, {high:.6f}]")
+study.tell(f"layers: {expected:.6f} W/m²; found {value:.6f}, in {interval(low, high)}")
 assert abs(value - expected) < 1e-6 * expected
 assert low - 1e-6 * expected <= expected <= high + 1e-6 * expected
 # ducts can only take from it

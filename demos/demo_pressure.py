@@ -13,7 +13,7 @@
 
 # %%
 import numpy as np
-from study import Study, canvas, column, levels_wanted, loglog, orders, run
+from study import Study, called, canvas, column, levels_wanted, loglog, orders, run
 
 from signorini_cr import exact, solve
 
@@ -35,6 +35,12 @@ cases = [
 # %%
 results = {case: run(*case, levels=levels) for case in cases}
 
+
+def whole(name, *rest):
+    """A case in words."""
+    return ", ".join([called(name), *rest])
+
+
 # %% [markdown]
 # ## Tables
 # For P1 the pressure of a facet is the mean of those of its two vertices.
@@ -43,12 +49,18 @@ results = {case: run(*case, levels=levels) for case in cases}
 study.table(
     "‖λ − λ_h‖ in L2(Γ1)",
     {"h, structured": ("{:.5f}", column(results[cases[0]], "h"))}
-    | {", ".join(case): ("{:.2e}", column(rows, "pressure")) for case, rows in results.items()},
+    | {
+        ", ".join([called(case[0]), *case[1:]]): ("{:.2e}", column(rows, "pressure"))
+        for case, rows in results.items()
+    },
 )
 study.table(
     "Rates of ‖λ − λ_h‖",
     {"h, structured": ("{:.5f}", column(results[cases[0]], "h"))}
-    | {", ".join(case): ("{:.3f}", orders(rows, "pressure")) for case, rows in results.items()},
+    | {
+        ", ".join([called(case[0]), *case[1:]]): ("{:.3f}", orders(rows, "pressure"))
+        for case, rows in results.items()
+    },
 )
 
 # %% [markdown]
@@ -62,13 +74,20 @@ solution = solve(exact.S1.problem, exact.S1.structured(n, shift=0.31))
 table = solution.contact.table()
 
 
+def short(name, element, family):
+    """A case, without what is so unless it is told."""
+    other = [word for word in (element, family) if word not in ("CR", "structured")]
+    return ", ".join([called(name), *other])
+
+
 def draw(left, right):
     """Errors, and λ with λ_h."""
     curves = {
-        ", ".join(case): (column(rows, "h"), column(rows, "pressure"))
+        short(*case): (column(rows, "h"), column(rows, "pressure"))
         for case, rows in results.items()
     }
-    loglog(left, curves, {1.0: "$h$"}, title="The error of the pressure falls like $h$",
+    loglog(left, curves, {1.0: "$h$"},
+           title="The error of the pressure falls like $h$\n(CR, structured, where not said)",
            y=r"$\|\lambda-\lambda_h\|_{L^2(\Gamma_1)}$",
            dashed=[label for label in curves if "P1" in label])  # fmt: skip
     x = np.linspace(-1, 1, 2001)
@@ -78,9 +97,16 @@ def draw(left, right):
     right.stairs(table["pressure"], edges, color=canvas.RED, linewidth=1.8, label=r"$\lambda_h$")
     right.set_xlim(-1, 0.25)
     right.set_xlabel("$x$", fontsize=14)
-    right.set_title(f"S1, mapped: one pressure on each of {2 * n} facets", fontsize=14)
+    right.set_ylabel("pressure", fontsize=13)
+    right.set_ylim(0.0)
+    right.set_title(f"S1, mapped: on each of {2 * n} facets $\\lambda_h$ is near $\\lambda$",
+                    fontsize=14)  # fmt: skip
     right.grid(alpha=0.3)
-    right.legend(fontsize=13, loc="upper right")
+    right.annotate(r"$\lambda$", (-0.1, 1.5 * (1 - 0.01) * np.sqrt(0.1)), (0.0, 0.6), fontsize=15,
+                   arrowprops={"arrowstyle": "-"})  # fmt: skip
+    steps = table["pressure"][np.searchsorted(edges, -0.62) - 1]
+    right.annotate(r"$\lambda_h$", (-0.62, steps), (-0.55, 0.55), fontsize=15, color=canvas.RED,
+                   arrowprops={"arrowstyle": "-", "color": canvas.RED})  # fmt: skip
 
 
 study.picture(

@@ -21,9 +21,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from study import Study, canvas, comm, levels_wanted
+from study import ENDS, Study, canvas, levels_wanted, name_curves
 
-from signorini_cr import Dirichlet, force, plots, solve_levels
+from signorini_cr import Dirichlet, force, solve_levels
 from signorini_cr.app.problemfile import load
 
 study = Study("demo_seepage", "Where a river bank seeps")
@@ -82,17 +82,12 @@ for solution in solve_levels(case.problem, case.mesh(), levels_wanted(6)):
     found.append((solution.cells, *inflow, outflow, solution.contact.transitions[0, 1]))
 cells, values, lower, upper, outflow, exits = map(np.array, zip(*found, strict=True))
 exact = discharge(exit_height(12.0))
-lower, upper = np.floor(1000 * lower) / 1000, np.ceil(1000 * upper) / 1000  # as they are shown
-study.table(
+lower, upper = study.intervals(
     "The discharge, in m² a day, and the exit point's height, in m.",
-    {
-        "cells": ("{}", cells),
-        "discharge": ("{:.4f}", values),
-        "at least": ("{:.3f}", lower),
-        "at most": ("{:.3f}", upper),
-        "width": ("{:.2%}", (upper - lower) / values),
-        "exit": ("{:.2f}", exits),
-    },
+    "discharge",
+    (cells, values, lower, upper),
+    3,
+    {"exit": ("{:.2f}", exits)},
 )
 study.tell(f"closed form: {exact:.6f} m² a day, exit at {exit_height(12.0):.4f} m")
 assert np.all(lower <= exact) and np.all(exact <= upper)
@@ -101,34 +96,40 @@ assert np.abs(outflow - values).max() < 1e-6 * exact
 assert abs(values[-1] - exact) < 1e-3 * solution.h * exact
 assert abs(exits[-1] - exit_height(12.0)) < solution.h
 
+
 # %%
-table = solution.contact.table()
-panels = None
-if comm.rank == 0:
-    figure = canvas.new_figure(13.0, 4.6)
-    panels = figure.subplots(1, 2, sharey=True, width_ratios=(3.4, 1.0))
-plots.plot_solution(solution, ax=None if panels is None else panels[0], units=case.units)
-if panels is not None:
-    panels[0].set_title(
-        f"{lower[-1]:.2f} to {upper[-1]:.2f} m³ a day leave each metre of the bank", fontsize=16
-    )
-    panels[0].set_xlabel("$x$ [m]", fontsize=13)
-    panels[0].set_ylabel("height above the river [m]", fontsize=13)
-    panels[0].set_aspect("auto")
+def draw_bank(field, beside, table):
+    """What leaves the bank at which height."""
+    field.set_ylabel("height above the river in m", fontsize=13)
     order = np.argsort(table["y"])
     y, flow = table["y"][order], -table["pressure"][order]
-    panels[1].fill_betweenx(y, flow, color=canvas.BLUE, alpha=0.35, step="mid")
-    panels[1].plot(flow, y, color=canvas.BLUE)
-    panels[1].axhline(exit_height(12.0), color=canvas.RED, linestyle="--")
-    panels[1].text(
+    beside.fill_betweenx(y, flow, color=canvas.BLUE, alpha=0.35, step="mid")
+    beside.plot(flow, y, color=canvas.BLUE)
+    beside.axhline(exit_height(12.0), color=canvas.RED, linestyle="--")
+    beside.text(
         flow.max(), exit_height(12.0) + 0.15, "exit point", color=canvas.RED, fontsize=13,
         horizontalalignment="right",
     )  # fmt: skip
-    panels[1].set_xlabel("leaves the bank [m/d]", fontsize=13)
-    panels[1].set_xlim(0.0)
-    panels[1].grid(alpha=0.3)
-    canvas.save(figure, study.folder / "seepage.png")
-study.show("seepage.png", "The head in the sand, and what leaves the bank below the exit point.")
+    beside.set_xlabel("leaves the bank, in m/d", fontsize=13)
+    beside.set_xlim(0.0)
+    beside.grid(alpha=0.3)
+
+
+# outward, as they are shown
+least, most = np.floor(100 * lower[-1]) / 100, np.ceil(100 * upper[-1]) / 100
+study.field(
+    "seepage.png",
+    "The head in the sand, and what leaves the bank below the exit point.",
+    solution,
+    draw_bank,
+    units=case.units,
+    title=f"{least:.2f} to {most:.2f} m³ a day leave each metre of the bank",
+    size=(13.0, 4.8),
+    words={"contact": "seeps", "no contact": "does not", ENDS: "exit point"},
+    ncols=2,
+    sharey=True,
+    width_ratios=(3.4, 1.0),
+)
 
 # %% [markdown]
 # ## Wet years and dry ones
@@ -169,16 +170,18 @@ assert np.abs(flows / discharge(expected) - 1.0).max() < 1e-3 * solution.h
 def draw(axes):
     """What leaves at which head."""
     fine = np.linspace(0.4, 9.4, 200)
-    axes.plot(head(fine), discharge(fine), color=canvas.GREY, label="closed form")
-    axes.plot(heads, flows, "o", color=canvas.BLUE, markersize=8, label="found")
-    axes.plot(heads, CONDUCTIVITY * (heads * THICKNESS - THICKNESS**2 / 2) / LENGTH, "--",
-              color=canvas.RED, label="Dupuit: all of the bank wet")  # fmt: skip
+    dupuit = CONDUCTIVITY * (heads * THICKNESS - THICKNESS**2 / 2) / LENGTH
+    axes.plot(head(fine), discharge(fine), color=canvas.BLUE)
+    axes.plot(heads, flows, "o", color=canvas.BLUE, markersize=8)
+    axes.plot(heads, dupuit, "--", color=canvas.RED)
     axes.set_xlim(heads[0] - 1.0, heads[-1] + 1.0)
     axes.set_ylim(0.0, 1.1 * flows[-1])
-    axes.set_xlabel("head in the hills [m]", fontsize=13)
-    axes.set_ylabel("discharge [m² a day]", fontsize=13)
-    axes.legend(fontsize=12)
+    axes.set_xlabel("head in the hills, in m", fontsize=13)
+    axes.set_ylabel("discharge in m² a day", fontsize=13)
+    axes.set_title("More leaves than if all of the bank were wet", fontsize=14)
     axes.grid(alpha=0.3)
+    wet = {"found (dots),\nclosed form (line)": (heads, flows), "Dupuit: all wet": (heads, dupuit)}
+    name_curves(axes, wet, [canvas.BLUE, canvas.RED])
 
 
 study.picture("seepage-heads.png", "What leaves the bank at which head.", draw, size=(8.0, 4.5))

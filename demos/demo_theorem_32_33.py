@@ -17,7 +17,7 @@
 
 # %%
 import numpy as np
-from study import Study, column, levels_wanted, loglog, orders, run
+from study import COLOURS, Study, column, levels_wanted, loglog, orders, run
 
 study = Study("demo_theorem_32_33", "Theorems 3.2 and 3.3: finitely many critical points")
 levels = levels_wanted(8)
@@ -67,22 +67,25 @@ study.table(
 # %%
 def draw(left, right):
     """Errors on the left, errors over h and over h|log h|^{1/4} on the right."""
+    colours = COLOURS[:3]
     curves = {
         f"{name}, {families[family]}": (column(rows, "h"), column(rows, "h1"))
         for (name, family), rows in results.items()
     }
     dashed = [label for label in curves if "inside" in label]
-    loglog(left, curves, {1.0: "$h$"}, title="Errors fall like $h$, wherever contact ends",
-           y=r"$\|u-u_h\|_h$", dashed=dashed)  # fmt: skip
-    curves = {}
+    loglog(left, curves, {1.0: "$h$"}, y=r"$\|u-u_h\|_h$", dashed=dashed, colours=colours,
+           named={label: label.split(",")[0] for label in dashed},
+           title="Errors fall like $h$, wherever contact ends\n"
+           "(solid: at a vertex, dashed: inside a facet)")  # fmt: skip
+    level, log = {}, {}
     for name in ("S1", "A", "B"):
         rows = results[name, "mapped"]
         h, error = column(rows, "h"), column(rows, "h1")
-        curves[f"{name}: $e/h$"] = (h, error / h)
-        curves[rf"{name}: $e/(h|\log h|^{{1/4}})$"] = (h, error / (h * abs(np.log(h)) ** 0.25))
-    dashed = [label for label in curves if "log" in label]
-    loglog(right, curves, {}, title="Critical point inside a facet: $e/h$ is level, no logarithm",
-           y="", dashed=dashed, scale="linear")  # fmt: skip
+        level[f"{name}: $e/h$"] = (h, error / h)
+        log[rf"{name}: $e/(h|\log h|^{{1/4}})$"] = (h, error / (h * abs(np.log(h)) ** 0.25))
+    loglog(right, level | log, {}, y="quotient of the error $e$", dashed=[*log], scale="linear",
+           colours=colours,
+           title="Inside a facet: $e/h$ is level, so there is no logarithm")  # fmt: skip
 
 
 study.picture(

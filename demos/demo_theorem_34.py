@@ -86,11 +86,12 @@ def draw(axes):
     """Errors of both solutions."""
     curves = {}
     for name, rows in results.items():
-        curves[rf"{name}: $\|u-u_h\|_h$"] = (h, column(rows, "h1"))
-        curves[rf"{name}: $\|u-u_h\|$"] = (h, column(rows, "l2"))
-    dashed = [label for label in curves if "octaves" in label]
+        where = {"I": "I, ends at $1/k$", "octaves": "ends in every octave"}[name]
+        curves[f"{where}:\n$\\|u-u_h\\|_h$"] = (h, column(rows, "h1"))
+        curves[f"{where}:\n$\\|u-u_h\\|$"] = (h, column(rows, "l2"))
+    dashed = [label for label in curves if "octave" in label]
     loglog(axes, curves, {1.0: "$h$", 2.0: "$h^2$"},
-           title="Infinitely many critical points, and full rates",
+           title="Contact ends infinitely often, and the rates are full",
            dashed=dashed)  # fmt: skip
 
 
@@ -106,21 +107,31 @@ table = solution.contact.table()
 judgement = theory.judge(solution, exact.I)
 
 
+TOP = 2.0
+
+
 def draw_contact(upper, lower):
     """Exact and discrete gap and pressure on 0 < x < 1, scaled by the power that fades them."""
     x = np.linspace(1e-3, 1.0, 20_001)
     fade = (1 - x**2) * np.sin(np.pi / x) ** 3
     near = table["x"] > 0
     middle = table["x"][near]
-    for axes, sign, name, colour, label in (
-        (upper, 1, "u", canvas.BLUE, "$u/x^6$"),
-        (lower, -1, "pressure", canvas.RED, r"$\lambda/x^6$"),
+    for axes, sign, name, what, colour, label in (
+        (upper, 1, "u", "gap", canvas.BLUE, "$u/x^6$"),
+        (lower, -1, "pressure", "pressure", canvas.RED, r"$\lambda/x^6$"),
     ):
         axes.plot(x, np.maximum(0, sign * fade), color="black", linewidth=0.8, label=label)
-        axes.plot(middle, table[name][near] / middle**6, "o", color=colour, markersize=4,
+        seen = middle > 0.06
+        values = table[name][near][seen] / middle[seen] ** 6
+        inside = values <= TOP
+        axes.plot(middle[seen][inside], values[inside], "o", color=colour, markersize=4,
                   label=label.replace("u/", "u_h/").replace("lambda/", "lambda_h/"))  # fmt: skip
+        if not inside.all():
+            axes.plot(middle[seen][~inside], np.full((~inside).sum(), TOP), "^", color=colour,
+                      markersize=6, label=f"above {TOP:g}")  # fmt: skip
         axes.set_xlim(0.06, 1)
-        axes.set_ylim(-0.15, 1.3)
+        axes.set_ylim(-0.15, TOP + 0.15)
+        axes.set_ylabel(f"{what} over $x^6$", fontsize=13)
         axes.set_xscale("log")
         ticks = [1 / k for k in (1, 2, 3, 4, 6, 8, 12)]
         axes.set_xticks(ticks, ["1", *(f"1/{round(1 / tick)}" for tick in ticks[1:])])
@@ -128,13 +139,14 @@ def draw_contact(upper, lower):
         axes.set_xlabel("$x$", fontsize=14)
         axes.legend(fontsize=12, loc="upper right")
         axes.grid(alpha=0.3)
-    upper.set_title(f"I: the gap on {2 * n} facets, $x^6$ taken out", fontsize=14)
-    lower.set_title("I: the pressure, $x^6$ taken out", fontsize=14)
+    upper.set_title("I: the gap is found wherever a facet fits into it", fontsize=14)
+    lower.set_title("and the pressure between the gaps", fontsize=14)
 
 
 study.picture(
     "theorem-34-contact.png",
-    "Example I: contact begins and ends at x = 1/k; both u and λ are divided by the factor x⁶.",
+    f"Example I on {2 * n} facets: contact begins and ends at x = 1/k; both u and λ are divided by "
+    "the factor x⁶.",
     draw_contact,
     panels=2,
     size=(8.5, 3.6),

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import ufl
 from dolfinx import fem
-from study import Study, canvas, comm, levels_wanted
+from study import Study, canvas, comm, levels_wanted, name_curves
 
 from signorini_cr import (
     Contact,
@@ -38,6 +38,7 @@ from signorini_cr import (
 )
 from signorini_cr.app.problemfile import load
 from signorini_cr.output.strip import chosen, moment, plot_strip
+from signorini_cr.rounding import interval
 
 study = Study("demo_wall", "A wall that lets the tide in, not out")
 levels, finer = levels_wanted(3), levels_wanted(5)
@@ -94,20 +95,20 @@ study.show("wall-strip.png", "The level in the ground; the wall is open where it
 def draw(levels_of, flows):
     """The tide and the level behind the wall, and what comes in."""
     fine = np.linspace(0.0, times[-1], 500)
-    levels_of.plot(fine, TIDE * np.sin(2 * np.pi * fine / PERIOD), "--", color=canvas.BLUE,
-                   label="the tide")  # fmt: skip
-    levels_of.plot(times, volume / (CAPACITY * AREA), color=canvas.RED, linewidth=2.5,
-                   label="behind the wall, mean")  # fmt: skip
-    levels_of.set_ylabel("level [m]", fontsize=13)
-    levels_of.legend(fontsize=12, loc="lower right", framealpha=1.0)
+    tide, mean = TIDE * np.sin(2 * np.pi * fine / PERIOD), volume / (CAPACITY * AREA)
+    levels_of.plot(fine, tide, "--", color=canvas.BLUE)
+    levels_of.plot(times, mean, color=canvas.RED, linewidth=2.5)
+    levels_of.set_ylabel("level in m", fontsize=13)
     levels_of.set_title("The tide comes in, and stays", fontsize=16)
     flows.fill_between(times, inflow, color=canvas.BLUE, alpha=0.35)
     flows.plot(times, inflow, color=canvas.BLUE)
-    flows.set_ylabel("comes in [m³/h]", fontsize=13)
-    flows.set_xlabel("hours", fontsize=13)
+    flows.set_ylabel("comes in, in m³/h", fontsize=13)
+    flows.set_xlabel("time in h", fontsize=13)
     for axes in (levels_of, flows):
         axes.grid(alpha=0.3)
         axes.set_xlim(0.0, times[-1])
+    named = {"the tide": (fine, tide), "behind the\nwall, mean": (times, mean)}
+    name_curves(levels_of, named, [canvas.BLUE, canvas.RED])
 
 
 study.picture("wall.png", "The tide, the level behind the wall, and what comes in.", draw,
@@ -137,7 +138,7 @@ assert np.all(inflow > -1e-9)
 case.time.clock.value = PERIOD / 4
 *_, solution = solve_levels(case.problem, case.mesh(), finer)
 steady, low, high = force.flux(solution, "quay")
-study.tell(f"high water for ever: {steady:.4f} m³/h, in [{low:.4f}, {high:.4f}]")
+study.tell(f"high water for ever: {steady:.4f} m³/h, in {interval(low, high)}")
 assert low <= steady <= high
 assert abs(steady - Totals(solution, leaked).of(solution)) < 1e-6 * steady
 

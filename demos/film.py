@@ -51,6 +51,7 @@ def draw_bounds(axes: Axes, adaptive: Curve, uniform: Curve, points: Curve) -> N
     axes.set_xlim(0.6 * min(dofs), 1.8 * max(dofs))
     axes.set_ylim(0.4 * min(bounds), 1.4 * max(bounds))
     axes.set_xlabel("degrees of freedom", fontsize=13)
+    axes.set_ylabel("certified bound of the error", fontsize=13)
     axes.set_title(f"the error is at most {at_most(adaptive[-1][1], 2)}", fontsize=14)
     axes.tick_params(labelsize=11)
     axes.grid(which="major", alpha=0.3)
@@ -71,7 +72,7 @@ def film(path: Path, max_dofs: int) -> None:
             figure = canvas.new_figure(11.0, 5.6)
             figure.set_layout_engine("none")  # that moves axes from frame to frame
             axes = figure.add_axes((0.07, 0.2, 0.4, 0.7))
-            bounds = figure.add_axes((0.56, 0.2, 0.41, 0.7))
+            bounds = figure.add_axes((0.58, 0.2, 0.4, 0.7))
         plots.plot_mesh(solution.domain, ax=axes)
         if bounds is not None:
             so_far = [each for each in uniform if each[0] <= adaptive[number - 1][0]]

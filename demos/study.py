@@ -8,13 +8,15 @@ and its tables, as Markdown. SIGNORINI_DEMO_LEVELS in the environment limits the
 from __future__ import annotations
 
 import gc
+import itertools
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI  # first: the DOLFINx of the wheels finds the MPI that is loaded
@@ -22,9 +24,10 @@ from mpi4py import MPI  # first: the DOLFINx of the wheels finds the MPI that is
 # isort: split
 from dolfinx.mesh import Mesh, entities_to_geometry
 
-from signorini_cr import exact, norms, solve, solve_levels, theory
+from signorini_cr import exact, norms, plots, solve, solve_levels, theory
 from signorini_cr.errors import on_root
 from signorini_cr.output import canvas
+from signorini_cr.output.units import Units
 from signorini_cr.solution import Solution
 from signorini_cr.verification.exact import Example
 
@@ -44,6 +47,18 @@ COLOURS = (
     "black",
 )
 MARKERS = "osD^vP*X"
+
+ENDS = "contact begins or ends"
+"""What pictures of a solution call such points."""
+
+CALLED = {"C": "C 7/2", "C2": "C 11/2"}
+"""What examples are called where their names in `exact.ALL` say too little."""
+
+
+def called(name: str) -> str:
+    """What an example is called in tables and pictures."""
+    return CALLED.get(name, name)
+
 
 FAMILIES = {
     "structured": "squares cut in two",
@@ -271,6 +286,83 @@ class Study:
         on_root(comm, lambda: path.write_text(page, encoding="utf-8"))
         self.tell(f"\nwritten: {path} and the pictures it shows")
 
+    def intervals(
+        self,
+        caption: str,
+        name: str,
+        found: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        digits: int,
+        more: Mapping[str, tuple[str, Sequence]] = MappingProxyType({}),
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Keep a table of a figure that is certain to lie in an interval, mesh by mesh.
+
+        Args:
+            caption: What it shows.
+            name: What the figure is called.
+            found: Numbers of cells, values, and their lower and upper bounds.
+            digits: Of the bounds, behind the point.
+            more: Further columns, as in `table`.
+
+        Returns:
+            The bounds as they are shown, rounded outward.
+        """
+        cells, values, lower, upper = found
+        unit = 10.0**digits
+        lower, upper = np.floor(unit * lower) / unit, np.ceil(unit * upper) / unit
+        columns = {
+            "cells": ("{}", cells),
+            name: (f"{{:.{max(digits, 2)}f}}", values),
+            "at least": (f"{{:.{digits}f}}", lower),
+            "at most": (f"{{:.{digits}f}}", upper),
+            "width": ("{:.2%}", (upper - lower) / values),
+        }
+        self.table(caption, columns | dict(more))
+        return lower, upper
+
+    def field(
+        self,
+        file: str,
+        caption: str,
+        solution: Solution,
+        draw: Callable[..., None],
+        *,
+        units: Units,
+        title: str,
+        size: tuple[float, float],
+        words: Mapping[str, str] = MappingProxyType({}),
+        **grid: Any,
+    ) -> None:
+        """Draw u_h and, on axes beside it, what happens along Γ1; collective.
+
+        Args:
+            file: Name of the PNG.
+            caption: What it shows.
+            solution: On a plane domain.
+            draw: Called on rank 0 with both axes and the table of Γ1.
+            units: What u and the axes are called and measured in.
+            title: The heading.
+            size: Inches of the whole.
+            words: What stands in the legend for contact, no contact, and where it ends.
+            grid: Of the two axes, as `subplots` takes it.
+        """
+        figure, panels = None, (None, None)
+        if comm.rank == 0:
+            figure = canvas.new_figure(*size)
+            panels = figure.subplots(**grid)
+        plots.plot_solution(solution, ax=panels[0], units=units)
+        table = solution.contact.table()
+        if figure is not None:
+            upper = panels[0]
+            handles, labels = upper.get_legend_handles_labels()
+            upper.get_legend().remove()
+            canvas.legend(figure, handles, [words.get(each, each) for each in labels], ncols=3)
+            upper.set_title("")
+            upper.set_aspect("auto")
+            figure.suptitle(title, fontsize=16)
+            draw(*panels, table)
+            canvas.save(figure, self.folder / file)
+        self.show(file, caption)
+
 
 def _plain(text: str) -> str:
     """Formulas as one can read them where nothing sets them."""
@@ -294,6 +386,8 @@ def loglog(
     below: float = 0.5,
     dashed: Sequence[str] = (),
     scale: str = "log",
+    colours: Sequence[str] = COLOURS,
+    named: Mapping[str, str] | None = None,
 ) -> None:
     """Draw curves in logarithmic scales, and dotted lines of given slopes below them.
 
@@ -307,6 +401,8 @@ def loglog(
         below: The dotted lines pass so far below the lowest end of a curve.
         dashed: Labels of curves to draw dashed.
         scale: Of the ordinate, "log" or "linear".
+        colours: One a curve, in a circle.
+        named: The labels that are written, by those of the curves; all of them if left out.
     """
     axes.set_xscale("log")
     axes.set_yscale(scale)
@@ -315,8 +411,8 @@ def loglog(
             abscissae,
             ordinates,
             "--" if label in dashed else "-",
-            color=COLOURS[k % len(COLOURS)],
-            marker=MARKERS[k % len(MARKERS)],
+            color=colours[k % len(colours)],
+            marker=MARKERS[k % len(colours) % len(MARKERS)],
             markersize=6,
             linewidth=1.8,
         )
@@ -331,7 +427,13 @@ def loglog(
         axes.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
         axes.set_xticks([], minor=True)
     axes.set_title(title, fontsize=14)
-    name_curves(axes, curves)
+    drawn = dict(zip(curves, itertools.cycle(colours)))
+    named = {label: label for label in curves} if named is None else named
+    name_curves(
+        axes,
+        {words: curves[label] for label, words in named.items()},
+        [drawn[label] for label in named],
+    )
 
 
 def name_curves(
@@ -347,6 +449,13 @@ def name_curves(
     canvas.label_ends(axes, ends, list(curves), used)
 
 
+def _ascending(curve: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of a curve's points, from the left to the right."""
+    x, y = (np.log(np.asarray(values, dtype=float)) for values in curve)
+    order = np.argsort(x)
+    return x[order], y[order]
+
+
 def guide(axes: Axes, curves: Sequence[tuple], slope: float, label: str, below: float) -> None:
     """A dotted line of one slope, below the curves whose own slope at the end is nearest to it."""
 
@@ -360,7 +469,14 @@ def guide(axes: Axes, curves: Sequence[tuple], slope: float, label: str, below: 
     x, y = (np.asarray(v, dtype=float) for v in lowest)
     line = below * y[-1] * (x / x[-1]) ** slope
     axes.plot(x, line, ":", color="black", linewidth=1.5)
-    middle = len(x) // 2
+    # Below the line, where the next curve is far away
+    room = []
+    for i in range(1, len(x) - 1):
+        others = [np.interp(np.log(x[i]), *_ascending(curve)) for curve in curves]
+        under = [np.log(line[i]) - other for other in others if other < np.log(line[i])]
+        room.append(min(under, default=np.inf))
+    wide = np.flatnonzero(np.minimum(room, 2.0) >= min(max(room, default=0.0), 2.0))
+    middle = 1 + int(wide[np.argmin(abs(wide + 1 - len(x) // 2))]) if len(wide) else len(x) // 2
     axes.annotate(
         label,
         (x[middle], line[middle]),

@@ -36,7 +36,14 @@ suppress_warnings = ["myst.header"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+python_use_unqualified_type_names = True
 autodoc_typehints_description_target = "documented"
+# Types by the names that the program gives them.
+autodoc_type_aliases = {
+    **{f"{kind}Array": f"{kind}Array" for kind in ("Bool", "Float", "Index", "Int32", "Int64")},
+    "Data": "Data",
+    "npt.ArrayLike": "ArrayLike",
+}
 autodoc_default_options = {"members": True}
 napoleon_use_ivar = True
 napoleon_preprocess_types = False
@@ -46,8 +53,9 @@ default_role = "code"
 
 
 def _as_text(app, what, name, obj, options, lines):
-    """Keep |F| the measure of F; reStructuredText takes it for a substitution."""
+    """Keep |F| the measure of F, and y. the name of y; reStructuredText sees other things there."""
     lines[:] = [line.replace("|", r"\|") for line in lines]
+    lines[:] = [re.sub(r"^( *(?::\w+ \w+: *)?)(\w\.)$", r"\1\\\2", line) for line in lines]
 
 
 def _for_download(app, name, content):

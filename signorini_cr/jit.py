@@ -1,26 +1,50 @@
-"""Compiling forms, also where a run that was ended has left one half compiled.
+"""Compiling forms, wherever there is room, and whatever runs that were ended have left behind.
 
 FFCx begins with an empty source file in a folder that all programs share, and ends with a mark
 beside it; where the mark is missing, it waits for whoever may be at work, ten seconds by default,
-and gives up. After a run that was killed in between, every run would give up, for ever.
+and gives up. After a run that was killed in between, every run would give up, for ever. It loads
+what it finds there: a library that was cut short by a full disk would take the program along.
 """
 
 from __future__ import annotations
 
+import atexit
+import hashlib
+import os
 import re
+import shutil
+import struct
+import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from functools import wraps
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import cffi
 from dolfinx import jit
+from ffcx.codegeneration import jit as ffcx_jit
 from mpi4py import MPI
+
+from .errors import InputError, on_root
 
 T = TypeVar("T")
 
 ABANDONED = 60.0
 """Seconds without a change from which on a source file without mark belongs to nobody."""
+ROOM = 2_000_000
+"""Bytes that compiling a form takes, at most."""
+OWN = "signorini-cr-forms-"
+"""What the names of temporary folders begin with; the number of their process follows."""
+
+tell: Callable[[str], Any] = warnings.warn
+"""Called on all ranks with what a user should know."""
+
+_elsewhere: str | None = None
+"""The folder that takes the place of the shared one, once that has turned out to be no good."""
 
 
 def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
@@ -33,16 +57,22 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
 
     Returns:
         What `build` returns.
+
+    Raises:
+        InputError: There is no folder to compile in.
     """
     began = time.time() - 0.1  # the clock that files are dated by may lag a little
     while True:
+        place = {} if _elsewhere is None else {"jit_options": {"cache_dir": _elsewhere}}
         try:
-            return build(*args)
-        except (TimeoutError, RuntimeError) as error:
+            return build(*args, **place)
+        except (OSError, RuntimeError, ImportError, cffi.VerificationError) as error:
             # With several ranks DOLFINx raises RuntimeError on all of them, rank 0's with the words
             if comm.size > 1 and not re.search("(JIT|just-in-time) compilation", str(error)):
                 raise
-            if not comm.bcast(comm.rank == 0 and _waited_in_vain(str(error)), root=0):
+            if comm.bcast(comm.rank == 0 and _waited_in_vain(str(error)), root=0):
+                continue
+            if not _moved(comm):
                 raise
         except (KeyboardInterrupt, SystemExit):
             if comm.rank == 0:
@@ -62,6 +92,54 @@ def _waited_in_vain(words: str) -> bool:
     return True
 
 
+def _moved(comm: MPI.Comm) -> bool:
+    """Go elsewhere if the folder for compiled forms can't be written to; collective."""
+    global _elsewhere
+    folder = _elsewhere or str(jit.get_options()["cache_dir"])
+
+    def move() -> tuple[str, str] | None:
+        fault = _fault(Path(folder))
+        if fault is None:
+            return None
+        words = f"compiled forms cannot be kept in {folder} ({fault})"
+        try:
+            if _elsewhere is None:
+                return _own_folder(), words
+        except OSError as error:
+            words += f", nor in a temporary folder ({error.strerror})"
+        raise InputError(f"{words}; XDG_CACHE_HOME may name another folder")
+
+    found = on_root(comm, move)
+    if found is None:
+        return False
+    _elsewhere, words = found
+    tell(f"{words}: they are compiled for this run only")
+    return True
+
+
+def _fault(folder: Path) -> str | None:
+    """What keeps us from writing into a folder, in words."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(ROOM))
+            file.flush()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def _own_folder() -> str:
+    """A temporary folder, gone when the process ends; those of processes that were killed go."""
+    for left in Path(tempfile.gettempdir()).glob(f"{OWN}*"):
+        number = left.name.removeprefix(OWN).split("-")[0]
+        if number.isdigit() and not Path(f"/proc/{number}").exists():
+            shutil.rmtree(left, ignore_errors=True)
+    folder = tempfile.mkdtemp(prefix=f"{OWN}{os.getpid()}-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
 def remove_unfinished(since: float = 0.0, until: float = float("inf")) -> None:
     """Remove source files without mark that were last changed in an interval of time."""
     folder = Path(jit.get_options()["cache_dir"])
@@ -70,3 +148,86 @@ def remove_unfinished(since: float = 0.0, until: float = float("inf")) -> None:
             marked = source.with_suffix(".c.cached").exists()
             if not marked and since <= source.stat().st_mtime <= until:
                 source.unlink()
+
+
+# What is loaded is looked at first: its end, and a sum of it that was noted when it was made
+
+
+def _note(library: Path) -> Path:
+    return library.with_name(library.name.split(".")[0] + ".sum")
+
+
+def _sum(library: Path) -> str:
+    return hashlib.blake2b(library.read_bytes(), digest_size=16).hexdigest()
+
+
+def _library(folder: Path, name: str) -> Path | None:
+    """A form's shared library, if it is there."""
+    places = (folder / (name + suffix) for suffix in EXTENSION_SUFFIXES)
+    return next((place for place in places if place.exists()), None)
+
+
+def _write_note(library: Path) -> None:
+    """Note what a library is like; where that can't be written, it is done without."""
+    with suppress(OSError):
+        note = _note(library)
+        part = note.with_suffix(f".{os.getpid()}")
+        part.write_text(_sum(library))
+        part.replace(note)
+
+
+def _ends_early(library: Path) -> bool:
+    """Whether a shared library is shorter than its head says, which ends in a bus error."""
+    with library.open("rb") as file:
+        head = file.read(64)
+    if head[:5] != b"\x7fELF\x02":  # another system's, of which nothing is known here
+        return len(head) < 64
+    (sections,), (size, number) = (
+        struct.unpack_from("<Q", head, 40),
+        struct.unpack_from("<HH", head, 58),
+    )
+    return library.stat().st_size < sections + size * number
+
+
+def _remove_damaged(folder: Path, name: str) -> None:
+    """Take a form away whose library is not as it was made, so that it is compiled anew."""
+    mark, library = folder / f"{name}.c.cached", _library(folder, name)
+    if not mark.exists():
+        return
+    if library is not None and not _ends_early(library):
+        try:
+            if _note(library).read_text() == _sum(library):
+                return
+        except FileNotFoundError:
+            _write_note(library)
+            return
+    try:
+        mine = mark.replace(mark.with_suffix(f".{os.getpid()}"))
+    except FileNotFoundError:  # another process is at it
+        return
+    source = folder / f"{name}.c"
+    for path in (source.with_suffix(".sum"), library, source, mine):
+        if path is not None:
+            path.unlink(missing_ok=True)
+
+
+def _watch() -> None:
+    """Have FFCx look before it loads, and note what it makes."""
+    find, load = ffcx_jit.get_cached_module, ffcx_jit._load_objects
+
+    @wraps(find)
+    def found(module_name: str, object_names: Any, cache_dir: Any, *others: Any) -> Any:
+        _remove_damaged(Path(cache_dir), module_name)
+        return find(module_name, object_names, cache_dir, *others)
+
+    @wraps(load)
+    def loaded(cache_dir: Any, module_name: str, *others: Any) -> Any:
+        library = _library(Path(cache_dir), module_name)
+        if library is not None:
+            _write_note(library)
+        return load(cache_dir, module_name, *others)
+
+    ffcx_jit.get_cached_module, ffcx_jit._load_objects = found, loaded
+
+
+_watch()

@@ -5,30 +5,52 @@ from __future__ import annotations
 import errno
 import math
 import resource
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI
-from petsc4py import PETSc
+if TYPE_CHECKING:  # it is asked before they are loaded, and where they can't be
+    from mpi4py import MPI
 
 CGROUPS = Path("/sys/fs/cgroup")
 
+LEAST = 4e8
+"""Bytes of address space; libraries that are loaded with less end the process in many ways."""
+
 _PETSC_ERR_MEM = 55
-# The last one stands in what the other ranks are told of a rank's error, see errors.fail_together
-_WORDS = ("std::bad_alloc", "Cannot allocate memory", "MemoryError")
+_WORDS = (
+    "std::bad_alloc",
+    "Cannot allocate memory",
+    "failed to map segment",  # of a library that is being loaded
+    "returned NULL without setting an exception",  # what Python says that has no room for an error
+    "MemoryError",  # what the other ranks are told of a rank's error, see errors.fail_together
+)
 
 
 def ran_out_of_memory(error: BaseException | None) -> bool:
     """Tell whether an error, or what it was raised from, says that no memory is left."""
+    petsc: Any = getattr(sys.modules.get("petsc4py.PETSc"), "Error", ())
     while error is not None:
         if (
             isinstance(error, MemoryError)
-            or (isinstance(error, PETSc.Error) and error.ierr == _PETSC_ERR_MEM)
+            or (isinstance(error, petsc) and error.ierr == _PETSC_ERR_MEM)
             or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
             or any(words in str(error) for words in _WORDS)
         ):
             return True
         error = error.__cause__
     return False
+
+
+def too_little() -> str | None:
+    """Say so where ``ulimit -v`` leaves no room for MPI, PETSc and DOLFINx."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY or limit >= LEAST:
+        return None
+    return (
+        f"out of memory: ulimit -v leaves {_shown(limit)}, and to load the program alone takes"
+        f" {_shown(LEAST)}"
+    )
 
 
 def most_memory() -> float:
@@ -51,6 +73,8 @@ def shortage(comm: MPI.Comm, growth: float) -> str | None:
     Returns:
         What the lowest rank with too little of it has, in words, on all ranks; None if it fits.
     """
+    from mpi4py import MPI
+
     own, words = _status(), None
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     spare = math.inf if limit == resource.RLIM_INFINITY else limit - own.get("VmPeak", 0.0)

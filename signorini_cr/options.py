@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,15 @@ ALONE_PREFIX = PREFIX + "alone_"
 
 ESTIMATE_PREFIX = PREFIX + "estimate_"
 """That of the linear systems of the certificate; what they leave costs sharpness, not validity."""
+
+OF_SOLVERS = re.compile("-(snes|ksp|pc)_[a-z]")
+"""What options of a solver begin with that are lost without the prefix."""
+
+OF_PETSC = (
+    "-log_view", "-log_view_memory", "-log_trace", "-options_left", "-options_view",
+    "-malloc_dump", "-malloc_view", "-memory_view",
+)  # fmt: skip
+"""Options of PETSc itself, which reads them when it starts, and whose names nothing else has."""
 
 HAS_MUMPS = PETSc.Sys.hasExternalPackage("mumps")
 
@@ -120,8 +130,46 @@ def take(words: Sequence[str]) -> None:
             database.setValue(word, value)
 
 
+def unheard(words: Sequence[str]) -> list[str]:
+    """Say which options of a script's command line PETSc has never seen, and what to write.
+
+    Whatever stands in its database is PETSc's business, which tells what nothing has used.
+
+    Args:
+        words: The command line; what looks like no option of PETSc's is the script's own.
+
+    Returns:
+        Up to two warnings.
+    """
+    database = PETSc.Options()
+    lost = [word for word in dict.fromkeys(words) if OF_SOLVERS.match(word) or word in OF_PETSC]
+    lost = [word for word in lost if not database.hasName(word)]
+    solver = [word for word in lost if OF_SOLVERS.match(word)]
+    own = [word for word in lost if word in OF_PETSC]
+    warnings = []
+    if solver:
+        known = ", ".join(f"-{PREFIX}{word[1:]}" for word in solver)
+        warnings.append(f"{', '.join(solver)} did not reach the solver; write {known}")
+    if own:
+        values = dict(pairwise([*words, "-none"]))
+        given = " ".join(w if values[w].startswith("-") else f"{w} {values[w]}" for w in own)
+        warnings.append(
+            f"{', '.join(own)} did not reach PETSc; set PETSC_OPTIONS='{given}' in the"
+            " environment, or call petsc4py.init(sys.argv) before signorini_cr is imported"
+        )
+    return warnings
+
+
+def _tell_unheard(words: Sequence[str]) -> None:
+    """Warn at the end, as PETSc does of options that nothing has used: it may still be told."""
+    if PETSc.Sys.isInitialized() and not PETSc.Sys.isFinalized():
+        for warning in unheard(words) if PETSc.COMM_WORLD.getRank() == 0 else ():
+            print(f"signorini_cr: warning: {warning}", file=sys.stderr)
+
+
 # A script's own, which it need not hand to petsc4py.init
 take(sys.argv[1:])
+atexit.register(_tell_unheard, sys.argv[1:])
 
 
 def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:

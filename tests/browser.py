@@ -54,7 +54,8 @@ addEventListener("load", () => {
 });
 </script>"""
 
-FRAME = """<!DOCTYPE html><iframe src="{name}" width="{width}" height="800" style="border:0"></iframe>
+FRAME = """<!DOCTYPE html>
+<iframe src="{name}" width="{width}" height="800" style="border:0"></iframe>
 <script>addEventListener("load", () => setTimeout(() =>
   document.body.append(frames[0].document.getElementById("measured")), 200))</script>
 """

@@ -11,6 +11,8 @@ from dolfinx import jit as dolfinx_jit
 from dolfinx.mesh import create_unit_square
 from mpi4py import MPI
 
+from signorini_cr import jit
+from signorini_cr.errors import InputError
 from signorini_cr.jit import ABANDONED, compiled, remove_unfinished
 
 COMM = MPI.COMM_WORLD
@@ -20,7 +22,7 @@ COMM = MPI.COMM_WORLD
 def cache(shared_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and a second instead of ten for those who wait."""
     options = dolfinx_jit.get_options() | {"cache_dir": shared_tmp_path, "timeout": 1}
-    monkeypatch.setattr(dolfinx_jit, "get_options", lambda *_: dict(options))
+    monkeypatch.setattr(dolfinx_jit, "get_options", lambda more=None: options | (more or {}))
     return shared_tmp_path
 
 
@@ -97,3 +99,78 @@ def test_an_interrupted_compilation_leaves_nothing(cache: Path) -> None:
         remove_unfinished(until=time.time() - ABANDONED)
     COMM.Barrier()
     assert sources(cache) == []
+
+
+def library(cache: Path) -> Path:
+    (found,) = (path for path in cache.iterdir() if path.suffix == ".so")
+    return found
+
+
+def flipped(data: bytes) -> bytes:
+    return data[:1000] + bytes([data[1000] ^ 1]) + data[1001:]
+
+
+DAMAGES = {
+    "emptied": lambda data: b"",
+    "cut short": lambda data: data[: len(data) // 2],
+    "a bit flipped": flipped,
+    "another file": lambda data: b"no library",
+}
+
+
+@pytest.mark.parametrize("noted", [True, False])
+@pytest.mark.parametrize("kind", [*DAMAGES, "away"])
+def test_a_damaged_library_is_made_anew(kind: str, noted: bool, cache: Path) -> None:
+    """Loading it would end the process with a bus error; without a note, its end tells."""
+    if kind == "a bit flipped" and not noted:
+        pytest.skip("that is what the note is for")
+    make(2.0)
+    COMM.Barrier()
+    if COMM.rank == 0:
+        path = library(cache)
+        data = path.read_bytes()
+        path.unlink()  # what is loaded stays as it is
+        if kind != "away":
+            path.write_bytes(DAMAGES[kind](data))
+        if not noted:
+            next(cache.glob("*.sum")).unlink()
+    COMM.Barrier()
+    integral = COMM.allreduce(fem.assemble_scalar(make(2.0)))
+    assert integral == pytest.approx(0.5, rel=1e-12)
+    COMM.Barrier()
+    assert library(cache).stat().st_size > 10_000
+    names = {path.suffix for path in cache.iterdir()}
+    assert names <= {".c", ".cached", ".so", ".o", ".sum"}
+
+
+@pytest.mark.parametrize("kind", ["file", "device", "nowhere"])
+def test_where_forms_cannot_be_kept_they_are_compiled_all_the_same(
+    kind: str, shared_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (shared_tmp_path / "file").touch()
+    places = {"file": str(shared_tmp_path / "file"), "device": "/dev/null", "nowhere": "/proc/x"}
+    options = dolfinx_jit.get_options() | {"cache_dir": places[kind] + "/fenics"}
+    monkeypatch.setattr(dolfinx_jit, "get_options", lambda more=None: options | (more or {}))
+    monkeypatch.setattr(jit, "_elsewhere", None)
+    words: list[str] = []
+    monkeypatch.setattr(jit, "tell", words.append)
+    for value in (3.0, 4.0):
+        integral = COMM.allreduce(fem.assemble_scalar(make(value)))
+        assert integral == pytest.approx(value / 4, rel=1e-12)
+    (told,) = words
+    assert told.startswith(f"compiled forms cannot be kept in {places[kind]}/fenics (")
+    assert "they are compiled for this run only" in told
+    own = jit._elsewhere
+    assert own is not None and Path(own).is_dir()
+    monkeypatch.setattr(jit, "_elsewhere", "/proc/x")
+    with pytest.raises(InputError, match=r"cannot be kept in /proc/x .*XDG_CACHE_HOME may name"):
+        make(5.0)
+
+
+@pytest.mark.serial
+def test_temporary_folders_of_runs_that_were_killed_go(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / f"{jit.OWN}999999999-abc").mkdir()
+    living = tmp_path / f"{jit.OWN}{os.getpid()}-abc"
+    living.mkdir()
+    assert {Path(jit._own_folder()), living} == set(tmp_path.iterdir())

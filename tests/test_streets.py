@@ -20,6 +20,7 @@ FLOORS = (
         "options",
         "garbage",
         "memory",
+        "reading",
         "shown",
         "rounding",
         "__init__",

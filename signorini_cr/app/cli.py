@@ -20,6 +20,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
+from ..memory import ran_out_of_memory, too_little
 from .commandline import (
     UsageError,
     launched,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from .problemfile import ProblemFile
 
 DONE, FAULT, BAD_INPUT, NOT_CONVERGED = 0, 1, 2, 3
+NO_MEMORY = "out of memory"
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 FRAMES = 10_000
 """Calls within one another: UFL differentiates by recursion, 40 calls at most for each of the 250
@@ -135,6 +137,9 @@ def _stopped_by(asked: Sequence[int]) -> int:
 
 def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
     """Start PETSc and do what the command says; whatever goes wrong becomes a message."""
+    if (complaint := too_little()) is not None:
+        screen.complain(f"{args.file}: {complaint}")
+        return NOT_CONVERGED
     try:
         start_petsc(args.petsc)
         from mpi4py import MPI
@@ -148,13 +153,19 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
     except (Exception, KeyboardInterrupt) as error:
         if asked or isinstance(error, KeyboardInterrupt):
             status = _stopped_by(asked)
-            if launched()[1] > 1:  # the others would wait for it, and it for them when MPI ends
-                os._exit(status)
-            return status
-        raise
+        elif ran_out_of_memory(error):
+            status = NOT_CONVERGED
+            screen.complain(f"{args.file}: {NO_MEMORY}")
+        else:
+            raise
+        if launched()[1] > 1:  # the others would wait for it, and it for them when MPI ends
+            os._exit(status)
+        return status
     try:
+        from .. import jit
         from ..errors import InputError, NotConverged
 
+        jit.tell = screen.warn
         try:
             status = {"solve": _solve, "check": _check}[args.command](args, screen, comm)
         except (InputError, NotConverged) as error:
@@ -176,6 +187,12 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
             if comm.size > 1:
                 comm.Abort(status)
             return status
+        if ran_out_of_memory(error):  # while it began, or while it wrote
+            screen.root = True
+            screen.complain(f"{args.file}: {NO_MEMORY}" + (kept and f"\n{kept}"))
+            if comm.size > 1:
+                comm.Abort(NOT_CONVERGED)
+            return NOT_CONVERGED
         import traceback
 
         where = f" on rank {comm.rank}" if comm.size > 1 else ""
@@ -189,7 +206,7 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
 
 def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..errors import NotConverged, naming
-    from ..memory import most_memory, ran_out_of_memory
+    from ..memory import most_memory
     from ..output import report as output
     from ..output.files import check_writable
 

@@ -9,6 +9,7 @@ import argparse
 import difflib
 import os
 import sys
+import tempfile
 import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
@@ -270,6 +271,9 @@ def start_petsc(options: list[str]) -> None:
     """Hand PETSc its options: at its start, or now where it has started already."""
     import petsc4py
 
+    if "HOME" not in os.environ:  # Open MPI ends the process without it
+        found = os.path.expanduser("~")  # what the system says
+        os.environ["HOME"] = tempfile.gettempdir() if found == "~" else found
     if "petsc4py.PETSc" not in sys.modules:
         # PETSc would take a closed pipe, or being told to stop, for a crash
         petsc4py.init([sys.argv[0] or "signorini-cr", "-no_signal_handler", *options])

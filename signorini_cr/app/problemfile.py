@@ -33,6 +33,7 @@ from .datacheck import bare, check_values, is_kappa
 from .expressions import Expression, check_name, parse
 from .formula import Clock, Node
 from .readers import (
+    HUGE,
     array,
     get,
     insist_known,
@@ -43,6 +44,7 @@ from .readers import (
     read_text,
     shown,
     string,
+    title,
     whole,
     word,
 )
@@ -63,11 +65,13 @@ KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
 """Keys that say where a run ends, and nothing else."""
-TELLING = ("quantities", "units", "names")
-"""Sections that levels do not depend on."""
+TELLING = ("units", "names")
+"""Sections that levels, and what is told of them, do not depend on."""
 ENOUGH = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
+MOST_STEPS = 100_000
+"""Of a run in time."""
 MOST_CELLS = 1e9
 """More than anyone means for the last mesh of a uniform sequence."""
 
@@ -213,7 +217,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     path = Path(path)
     table = parse_toml(on_root(comm, read_text, path))
     insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
-    title = get(table, "", "title", string, path.stem)
+    heading = get(table, "", "title", title, path.stem)
     parts, materials = _parts(table), _materials(table)
     sections = {name: _section(table, name) for name in SECTIONS}
     if "domain" not in table:
@@ -236,7 +240,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
                 ' mode = "adaptive" is needed beside it'
             )
     return ProblemFile(
-        title=title,
+        title=heading,
         domain=domain,
         size=size,
         parts=tuple(parts),
@@ -427,6 +431,8 @@ def _polygon(
             f" found {len(boundary)} labels"
         )
     arcs = _arcs(f"{section}.arcs", array(f"{section}.arcs", table.get("arcs", [])))
+    with naming(key):
+        points = coordinates(points, 2)
     with naming(f"{section}.arcs"):
         points, labels, edges = cut(points, boundary, arcs, size)
     with naming(key, SIMPLE):
@@ -444,7 +450,8 @@ def _arcs(key: str, arcs: list[Any]) -> dict[int, list[float]]:
             )
         insist_known(arc, where, ("edge", "through"))
         edge = arc["edge"]
-        if isinstance(edge, bool) or not isinstance(edge, int) or edge in found:
+        known = isinstance(edge, int) and not isinstance(edge, bool) and 0 <= edge < HUGE
+        if not known or edge in found:
             raise InputError(
                 f"{where}.edge: the number of an edge, from 0, that is no arc yet is needed, found"
                 f" {shown(edge)}"
@@ -566,12 +573,22 @@ def _time(
     initial = expressions.get("time.initial")
     return Time(
         end=get(table, "time", "end", positive, needed="a number above 0, the last time,"),
-        steps=get(table, "time", "steps", whole, needed="a whole number, of steps,"),
+        steps=_steps(get(table, "time", "steps", whole, needed="a whole number, of steps,")),
         scheme=get(table, "time", "scheme", one_of(SCHEMES), "euler"),
         initial=0.0 if initial is None else _data(initial),
         capacity=get(table, "time", "capacity", _capacity, 1.0),
         clock=clock,
     )
+
+
+def _steps(number: int) -> int:
+    """A number of steps that a folder has room for."""
+    if number > MOST_STEPS:
+        raise InputError(
+            f"time.steps: {shown(number)} is too many, as each step leaves a file behind; up to"
+            f" {MOST_STEPS} are allowed"
+        )
+    return number
 
 
 def _capacity(key: str, value: Any) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -12,15 +13,24 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
+from ..reading import read_regular
 
 MOST_CHARACTERS = 40
 """In a name or a unit."""
+MOST_IN_TITLE = 200
+"""Characters."""
+MOST_BYTES = 16_000_000
+"""In a problem file."""
+HUGE = 10**15
+"""From here on whole numbers are not shown, and no count is as large."""
 
 
 def read_text(path: Path) -> str:
     """The text of a file in UTF-8."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return read_regular(path, MOST_BYTES).decode("utf-8-sig")
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError("there is no such file") from None
     except IsADirectoryError:
@@ -53,6 +63,13 @@ def parse_toml(text: str) -> dict[str, Any]:
         if "{" in found and "}" not in found:
             what += " (all of { … } must stand on one line)"
         raise InputError(f"TOML syntax in {where}: {what}{picture}") from None
+    except ValueError:  # Python's own limit, of which TOML knows nothing
+        digits = sys.get_int_max_str_digits()
+        at = re.search(rf"\d(?:_?\d){{{digits}}}", text)
+        place = f" in line {text.count(chr(10), 0, at.start()) + 1}" if at else ""
+        raise InputError(
+            f"a whole number{place} has more than {digits} digits; up to that many are allowed"
+        ) from None
 
 
 def insist_known(
@@ -126,6 +143,16 @@ def word(key: str, value: Any) -> str:
     return value.strip()
 
 
+def title(key: str, value: Any) -> str:
+    """Insist on a line that can be printed, and stands over a picture."""
+    if len(string(key, value)) > MOST_IN_TITLE or not value.isprintable():
+        raise InputError(
+            f"{key}: up to {MOST_IN_TITLE} characters on one line are needed, none of which moves"
+            f" a cursor, found {shown(value)}"
+        )
+    return value
+
+
 def array(key: str, value: Any) -> list[Any]:
     """Insist on a list."""
     if not isinstance(value, list):
@@ -176,6 +203,8 @@ def whole(key: str, value: Any) -> int:
         raise InputError(f"{key}: a whole number is needed, found {shown(value)}")
     if value < 1:
         raise InputError(f"{key}: 1 or more is needed, found {shown(value)}")
+    if value >= HUGE:
+        raise InputError(f"{key}: less than {HUGE:.0e} is needed, found {shown(value)}")
     return value
 
 
@@ -203,5 +232,5 @@ def shown(value: Any) -> str:
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, int):
-        return f"{value}" if abs(value) < 10**15 else "a huge number"
+        return f"{value}" if abs(value) < HUGE else "a huge number"
     return f"{value}"

@@ -36,7 +36,7 @@ class Screen:
         """A line of results."""
         if self.root and not self.quiet:
             self.clear()
-            self._put(sys.stdout, text + "\n")
+            self._put(sys.stdout, printable(text) + "\n")
 
     def text(self, text: str) -> None:
         """Results as a paragraph."""
@@ -67,7 +67,7 @@ class Screen:
         if self.root:
             self.clear()
             self.flush()
-            self._put(sys.stderr, wrapped(message, "signorini-cr: ") + "\n")
+            self._put(sys.stderr, wrapped(printable(message), "signorini-cr: ") + "\n")
 
     def warn(self, message: str) -> None:
         """Say what is strange, but no reason to stop."""
@@ -91,6 +91,11 @@ class Screen:
                 self.quiet = True
                 if not isinstance(error, BrokenPipeError):  # the reader may leave
                     self.complain(f"cannot print to standard output: {error.strerror}")
+
+
+def printable(text: str) -> str:
+    """The same without what would move a terminal's cursor or change its colours."""
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 def wrapped(text: str, before: str = "") -> str:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray, Int64Array
 from ..errors import InputError
+from ..reading import read_regular
 from .polygon import FARTHEST
 
 Array = npt.NDArray[Any]
@@ -37,6 +38,8 @@ KINDS = {
 """Name, dimension and number of nodes of gmsh's element types."""
 
 DIMENSIONS = ("point", "curve", "surface", "volume")
+MOST_BYTES = 1_000_000_000
+"""In a file."""
 _MOST_TAGS = 10**6
 _MOST_QUOTED = 40
 """Most characters of the file that a message quotes."""
@@ -242,7 +245,7 @@ def load(path: Path) -> MshFile:
         InputError: It cannot be read, or is damaged; the message says where.
     """
     try:
-        data = path.read_bytes()
+        data = read_regular(path, MOST_BYTES)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}") from error
     try:

@@ -175,23 +175,31 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
     def edge(i: int) -> str:
         return f"edge {called[i]}{_where(ring[i])}"
 
-    for i in range(len(a)):  # the polygon's own vertices: few
-        same = np.flatnonzero(np.abs(a[i + 1 :] - a[i]).max(axis=1) <= near)
+    # a look at those alone whose boxes meet, which are few where there are many
+    left, below = np.ascontiguousarray(np.minimum(a, b).T) - near
+    right, above = np.ascontiguousarray(np.maximum(a, b).T) + near
+    x = a[:, 0].copy()
+    for i in range(len(a)):
+        same = i + 1 + np.flatnonzero(np.abs(x[i + 1 :] - x[i]) <= near)
+        same = same[np.abs(a[same, 1] - a[i, 1]) <= near]
         if len(same):
-            raise InputError(f"{vertex(i)} is the same point as {vertex(i + 1 + same[0])}")
+            raise InputError(f"{vertex(i)} is the same point as {vertex(same[0])}")
     direction = b - a
     length2 = (direction**2).sum(axis=1)
     for i in range(len(a)):
-        t = np.clip(((a[i] - a) * direction).sum(axis=1) / length2, 0, 1)
-        gap = np.linalg.norm(a + t[:, None] * direction - a[i], axis=1)
-        gap[(np.arange(len(a)) == i) | (after == i)] = np.inf
+        at = np.flatnonzero((left <= right[i]) & (right >= left[i]))
+        at = at[(below[at] <= above[i]) & (above[at] >= below[i])]
+        c, d, along = a[at], b[at], direction[at]
+        t = np.clip(((a[i] - c) * along).sum(axis=1) / length2[at], 0, 1)
+        gap = np.linalg.norm(c + t[:, None] * along - a[i], axis=1)
+        gap[(at == i) | (after[at] == i)] = np.inf
         if gap.min() <= near:
-            raise InputError(f"{vertex(i)} lies on {edge(int(gap.argmin()))}")
-        crossing = (_side(a[i], b[i], a) * _side(a[i], b[i], b) < 0) & (
-            _side(a, b, a[i]) * _side(a, b, b[i]) < 0
+            raise InputError(f"{vertex(i)} lies on {edge(int(at[gap.argmin()]))}")
+        crossing = (_side(a[i], b[i], c) * _side(a[i], b[i], d) < 0) & (
+            _side(c, d, a[i]) * _side(c, d, b[i]) < 0
         )
         if crossing.any():
-            raise InputError(f"{edge(i)} crosses {edge(int(crossing.argmax()))}")
+            raise InputError(f"{edge(i)} crosses {edge(int(at[crossing.argmax()]))}")
     for k in range(1, len(loops)):
         if not inside(loops[k][:1], loops[0]).any():
             raise InputError(f"hole {k - 1} lies outside the polygon")

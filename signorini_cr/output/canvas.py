@@ -23,7 +23,7 @@ from .units import PLAIN, Units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import YAxis
+    from matplotlib.axis import XAxis, YAxis
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure, SubFigure
 
@@ -130,6 +130,31 @@ def draw_cells(axes: Axes, corners: FloatArray, **style: Any) -> None:
     axes.add_collection(PolyCollection(list(corners), zorder=0, **style), autolim=False)
 
 
+def contour_heights(limits: tuple[float, float]) -> FloatArray:
+    """Round numbers between two, for contour lines."""
+    from matplotlib.ticker import MaxNLocator
+
+    heights = np.asarray(MaxNLocator(9).tick_values(*limits))
+    return heights[(heights > limits[0]) & (heights < limits[1])]
+
+
+def draw_contours(axes: Axes, image: FloatArray, box: FloatArray, heights: FloatArray) -> None:
+    """Draw contour lines.
+
+    Args:
+        axes: Where.
+        image: A continuous function, from `raster`.
+        box: Lowest and highest corner of its pixels.
+        heights: Of the lines.
+    """
+    if not len(heights):
+        return
+    rows, columns = ((np.arange(n) + 0.5) / n for n in image.shape)
+    size = box[1] - box[0]
+    axes.contour(box[0, 0] + columns * size[0], box[0, 1] + rows * size[1], image, levels=heights,
+                 colors="white", linewidths=0.8, alpha=0.7, linestyles="solid")  # fmt: skip
+
+
 def legend(
     figure: Figure | SubFigure, *entries: Any, ncols: int, above: str = "", ax: Axes | None = None
 ) -> None:
@@ -171,7 +196,10 @@ def label_ends(
     height = [0.21 * (1 + label.count("\n")) / high for label in labels]
     order = np.argsort(points[:, 1], kind="stable")
     places = apart(points[order, 1], [height[i] for i in order])
-    for i, y in zip(order, places, strict=True):
+    top = 0.0  # of those before; none stands below the axes
+    for i, wanted in zip(order, places, strict=True):
+        y = max(wanted, top + 0.5 * height[i])
+        top = y + 0.5 * height[i]
         axes.annotate(labels[i], ends[i], (1.02, y), textcoords="axes fraction", va="center",
                       fontsize=12, annotation_clip=False,
                       arrowprops={"arrowstyle": "-", "color": colors[i], "linewidth": 0.6,
@@ -202,7 +230,7 @@ def apart(wanted: Sequence[float] | FloatArray, heights: Sequence[float]) -> lis
     return places
 
 
-def log_ticks(axis: YAxis) -> None:
+def log_ticks(axis: XAxis | YAxis) -> None:
     """Decades with what is between; where there are few of them, 1, 2 and 5 of each."""
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
@@ -211,7 +239,9 @@ def log_ticks(axis: YAxis) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=12))
     axis.set_minor_locator(LogLocator(subs=range(2, 10), numticks=99))
     if few:
-        axis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.set_major_formatter(
+            lambda value, _: f"{value:g}" if value < 1000 else grouped(round(value))
+        )
     else:
         axis.set_major_formatter(LogFormatterSciNotation())
     axis.set_minor_formatter(lambda *_: "")
@@ -250,7 +280,7 @@ def chains(segments: FloatArray) -> list[FloatArray]:
     return lines
 
 
-def grouped(number: int) -> str:
+def grouped(number: float) -> str:
     """A number with its digits in groups of three."""
     return f"{number:,}".replace(",", "\u2009")
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError, on_root
@@ -38,8 +39,9 @@ def write_checkpoint(path: Path, restart: Restart, facts: dict[str, Any], comm: 
         for k, (at, values) in enumerate(restart.u):
             arrays |= {f"at{k}": at, f"u{k}": values}
         text = json.dumps({"meshes": len(restart.added), "facts": facts})
+        arrays["facts"] = np.frombuffer(text.encode(), dtype=np.uint8)
         with disk_errors(path):
-            np.savez(path, facts=np.frombuffer(text.encode(), dtype=np.uint8), **arrays)
+            np.savez(path, sum=_sum(arrays), **arrays)
 
     on_root(comm, write)
 
@@ -62,11 +64,26 @@ def read_checkpoint(
             return None
         try:
             with np.load(path) as file:
-                text = json.loads(bytes(file["facts"]))
-                added = [file.get(f"added{k}") for k in range(text["meshes"])]
-                u = [(file[f"at{k}"], file[f"u{k}"]) for k in range(2 if added else 1)]
-                return Restart(tuple(added), tuple(u)), text["facts"]
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"cannot read {path}: {error}") from error
+                arrays = dict(file)
+            if not np.array_equal(arrays.pop("sum"), _sum(arrays)):
+                raise ValueError("it is not as it was written")
+            text = json.loads(bytes(arrays["facts"]))
+            added = [arrays.get(f"added{k}") for k in range(text["meshes"])]
+            u = [(arrays[f"at{k}"], arrays[f"u{k}"]) for k in range(2 if added else 1)]
+            return Restart(tuple(added), tuple(u)), text["facts"]
+        except Exception as error:  # damaged archives raise whatever their readers come across
+            words = str(error) or type(error).__name__
+            raise InputError(
+                f"cannot read {path}: {words}; it is to be removed, and the run begun anew"
+            ) from error
 
     return on_root(comm, read)
+
+
+def _sum(arrays: dict[str, Any]) -> npt.NDArray[np.uint8]:
+    """What tells that an archive is whole and nobody has changed it, as good as sure."""
+    found = hashlib.blake2b(digest_size=16)
+    for name, array in sorted(arrays.items()):
+        found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        found.update(np.ascontiguousarray(array).data)
+    return np.frombuffer(found.digest(), dtype=np.uint8)

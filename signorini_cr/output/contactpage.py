@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray
 from ..errors import InputError
-from .canvas import BLUE, RED, draw_lines, legend, new_figure
+from .canvas import BLUE, RED, draw_lines, label_ends, legend, new_figure
 from .units import PLAIN, Units
 
 if TYPE_CHECKING:
@@ -45,9 +45,9 @@ def contact_page(
     panels = figure.subplots(
         2, len(parts), sharex="col", sharey="row", squeeze=False, width_ratios=shares
     )
-    lines = []
+    lines, names = [], _names(table)
     for column, rows, share in zip(panels.T, parts, shares / shares.sum(), strict=True):
-        course = _contact_part(column, rows, transitions)
+        course = _contact_part(column, rows, transitions, names)
         if len(parts) > 1:
             name = f"part {rows['part'][0]}"
             column[0].set_title(name, fontsize=12)
@@ -58,9 +58,10 @@ def contact_page(
     longest = f"its {MOST_PARTS} longest parts of {number}:\n" if number > MOST_PARTS else ""
     along = f"arc length along $\\Gamma_1${units.within('x')}, {longest}" + ",\n".join(lines)
     # Not the rounding errors of a function that is zero
-    _enlarge(panels[0, 0], np.concatenate([table["u"], *_bounds(table)]), size)
-    _enlarge(panels[1, 0], table["pressure"], size / lengths.sum())
-    mean = rf"$u_h$ and $\alpha${units.within('u')}, facet means"
+    _enlarge(panels[0], np.concatenate([table["u"], *(table[name] for name in names)]), size)
+    _enlarge(panels[1], table["pressure"], size / lengths.sum())
+    signs = " and ".join(["$u_h$", ", ".join(name.split()[-1] for name in names.values())])
+    mean = f"{signs}{units.within('u')}, facet means"
     panels[0, 0].set_ylabel("\n".join(filter(None, [units.name("u").strip(), mean])), fontsize=13)
     pressure = units.name("flux", "contact pressure") + rf"$\lambda_h${units.within('flux')}"
     panels[1, 0].set_ylabel(pressure, fontsize=13)
@@ -68,8 +69,34 @@ def contact_page(
     for axes in panels.ravel():
         handles, labels = axes.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
+    if len(parts) == 1 and ax is None:  # there is room beside the curves
+        _name_curves(panels[0, 0], entries)
+        del entries[r"$\lambda_h$"]  # its axis says so
     legend(figure, list(entries.values()), list(entries), ncols=5 if ax is None else 3, above=along)
     return figure
+
+
+def _names(table: Table) -> dict[str, str]:
+    """What the bounds are called that there are, by their columns."""
+    there = [
+        name for name in ("obstacle", "upper") if name in table and np.isfinite(table[name]).any()
+    ]
+    if there == ["obstacle"]:
+        return {"obstacle": r"obstacle $\alpha$"}
+    names = {"obstacle": r"lower bound $\alpha$", "upper": r"upper bound $\beta$"}
+    return {name: names[name] for name in there}
+
+
+def _name_curves(axes: Axes, entries: dict[str, Any]) -> None:
+    """Write what the curves are beside their right ends, and take that out of the legend."""
+    axes.set_ylim(axes.get_ylim())
+    curves = {label: line for label, line in entries.items() if line in axes.get_lines()}
+    right, ends = -1 if axes.get_xlim()[0] < axes.get_xlim()[1] else 0, []
+    for label, line in curves.items():
+        seen = np.flatnonzero(np.isfinite(line.get_ydata()))[right]
+        ends.append((float(line.get_xdata()[seen]), float(line.get_ydata()[seen])))
+        del entries[label]
+    label_ends(axes, ends, list(curves), [line.get_color() for line in curves.values()])
 
 
 def _page(width: float, height: float, ax: Axes | None) -> Figure | SubFigure:
@@ -90,21 +117,19 @@ def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
     longest = np.sort(np.argsort(-lengths, kind="stable")[:MOST_PARTS])
     rows = [{name: column[table["part"] == part] for name, column in table.items()}
             for part in longest]  # fmt: skip
-    return [_as_seen(part) for part in rows], lengths[longest]
+    return rows, lengths[longest]
 
 
-def _as_seen(rows: dict[str, npt.NDArray]) -> dict[str, npt.NDArray]:
-    """A part from the left to the right, or upwards, whichever way the boundary runs there."""
+def _backwards(rows: Table) -> bool:
+    """Whether the boundary, Ω to its left, runs leftwards or downwards in a part that is open."""
     dx, dy = rows["x"][-1] - rows["x"][0], rows["y"][-1] - rows["y"][0]
     closed = np.hypot(dx, dy) < 1.5 * rows["length"].max() and len(rows["x"]) > 2
-    if closed or (dx if abs(dx) >= abs(dy) else dy) >= 0:
-        return rows
-    back = {name: column[::-1] for name, column in rows.items()}
-    back["arc_length"] = back["arc_length"][0] + back["length"][0] / 2 - back["arc_length"]
-    return back
+    return not closed and bool((dx if abs(dx) >= abs(dy) else dy) < 0)
 
 
-def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) -> str:
+def _contact_part(
+    panels: Sequence[Axes], rows: Table, transitions: FloatArray, names: Mapping[str, str]
+) -> str:
     """Draw one connected piece of Γ1, u_h above, the pressure below; say where it runs."""
     from matplotlib.collections import PolyCollection
 
@@ -121,6 +146,7 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
     shift = offset[np.arange(len(near)), near]
     here = np.linalg.norm(shift, axis=1) <= 0.75 * length[near]
     points = (arc[near] + np.sum(shift * along[near], axis=1))[here]
+    begin, end = (_moved(each, points, length.max()) for each in (begin, end))
     # Corners of the shaded boxes and ends of the lines, heights as shares of the panel's
     runs = _upright(np.stack([begin, begin, end, end], axis=1), [0.0, 1.0, 1.0, 0.0])
     lines = _upright(np.stack([points, points], axis=1), [0.0, 1.0])
@@ -131,33 +157,45 @@ def _contact_part(panels: Sequence[Axes], rows: Table, transitions: FloatArray) 
         axes.add_collection(shaded, autolim=False)
         draw_lines(axes, lines, transform=across, color="black", linestyle=":", linewidth=1.5,
                    label="contact begins or ends" if len(points) else None)  # fmt: skip
-        axes.set_xlim(edges[0], edges[-1])
+        # From the left to the right as it is seen, in the arc length of contact.csv
+        axes.set_xlim(*edges[[-1, 0] if _backwards(rows) else [0, -1]])
         axes.tick_params(labelsize=11)
         axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
         axes.grid(alpha=0.25)
     marker: dict[str, Any] = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
     upper.plot(arc, rows["u"], color=BLUE, linewidth=2, label="$u_h$", **marker)
-    for bound, label in zip(_bounds(rows), ("$\\alpha$", "$\\beta$"), strict=False):
-        if np.isfinite(bound).any():
-            upper.plot(arc, bound, color="black", linestyle="--", label=f"obstacle {label}")
+    for name, label in names.items():
+        if np.isfinite(rows[name]).any():
+            upper.plot(arc, rows[name], color="black", linestyle="--", label=label)
     lower.stairs(rows["pressure"], edges, color=RED, linewidth=2, label=r"$\lambda_h$")
     ends = middle[[0, -1]] + along[[0, -1]] * (edges[[0, -1]] - arc[[0, -1]])[:, None]
     ends[np.abs(ends) < 1e-9 * np.abs(middle).max()] = 0.0
     start, stop = (f"({x:.3g}, {y:.3g})" for x, y in ends)
-    closed = np.linalg.norm(ends[1] - ends[0]) < 0.25 * length.min()
-    return f"round from {start}" if closed else f"from {start} to {stop}"
+    if np.linalg.norm(ends[1] - ends[0]) < 0.25 * length.min():
+        return f"round from {start}"
+    if _backwards(rows):
+        return f"from {stop} on the left to {start}, where it is 0"
+    return f"from {start}, where it is 0, to {stop}"
 
 
-def _bounds(table: Table) -> list[npt.NDArray]:
-    """α, and β where any facet has one."""
-    return [table[name] for name in ("obstacle", "upper") if name in table]
+def _moved(places: FloatArray, points: FloatArray, facet: float) -> FloatArray:
+    """Ends of active facets moved to where contact ends, inside the next one."""
+    if not len(points) or not len(places):
+        return places
+    nearest = points[np.argmin(np.abs(places[:, None] - points), axis=1)]
+    return np.where(np.abs(nearest - places) <= facet, nearest, places)
 
 
-def _enlarge(axes: Axes, values: npt.NDArray, size: float) -> None:
-    """See that the vertical axis shows more than differences of 1e-6 of `size`."""
+def _enlarge(panels: Sequence[Axes], values: npt.NDArray, size: float) -> None:
+    """Where there is nothing but differences below 1e-6 of `size`, say so, and the value."""
     values = values[np.isfinite(values)]
-    if np.ptp(values) < 1e-6 * size:
-        axes.set_ylim(values[0] - size, values[0] + size)
+    value = float(values[0])
+    if np.ptp(values) >= 1e-6 * size:
+        return
+    around = abs(value) if abs(value) > 1e-6 * size else size
+    for axes in panels:
+        axes.set_ylim(value - around, value + around)
+        axes.set_yticks([value], [f"{value:.3g}" if around != size else "0"])
 
 
 def _upright(x: FloatArray, heights: Sequence[float]) -> FloatArray:

@@ -11,7 +11,8 @@ from ..errors import InputError, on_root
 from ..fem.space import facet_measures
 from ..rounding import at_most
 from ..solution import Solution
-from .canvas import chains, draw_lines, grouped, headline, log_ticks, plane_axes, save
+from .canvas import RED, chains, draw_lines, headline, legend, log_ticks, plane_axes, save
+from .touching import contact_lines
 
 Where = str | os.PathLike[str]
 
@@ -45,6 +46,7 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
         facet_measures(mesh, solution.domain.facets(part))[0][..., :2]
         for part in solution.domain.parts.values()
     ]
+    touching, _ = contact_lines(solution.contact)
     pieces = mesh.comm.gather((corners, density, np.concatenate(ends)), root=0)
 
     def draw() -> None:
@@ -66,11 +68,14 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
         )
         axes.add_collection(cells, autolim=False)
         draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
+        if len(touching):
+            draw_lines(axes, chains(touching), color=RED, linewidth=4.5, zorder=3, label="contact")
+            legend(figure, ncols=1)
         beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
         bar = figure.colorbar(cells, cax=beside)
         log_ticks(bar.ax.yaxis)
-        bar.set_label("density of the error", fontsize=12)
-        known = f"bound {bound} on {grouped(len(values))} cells"
+        bar.set_label(r"$|\nabla(u-u_h)|$ by a cell's share of the bound", fontsize=12)
+        known = f"where the error sits, at most {bound} in all"
         axes.set_title(headline(title, known), fontsize=14)
         save(figure, path)
 

@@ -78,7 +78,7 @@ def run_page(
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<dl>{statement}</dl>",
-        *map(_paragraph, known),
+        *(_paragraph(text[0].upper() + text[1:]) for text in known),
         *(
             _picture(
                 folder / name, f"{what}{' at the end' if steps and name in AT_THE_END else ''}"

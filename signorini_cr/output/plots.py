@@ -30,7 +30,9 @@ from .canvas import (
     RED,
     YELLOW,
     chains,
+    contour_heights,
     draw_cells,
+    draw_contours,
     draw_lines,
     grouped,
     headline,
@@ -43,7 +45,8 @@ from .canvas import (
     save,
 )
 from .contactpage import contact_page
-from .raster import raster
+from .raster import averaged, raster
+from .touching import contact_lines, in_words
 from .units import PLAIN
 from .units import Units as Units
 
@@ -159,13 +162,12 @@ def plot_solution(
     domain, contact = solution.domain, solution.contact
     mesh = _plane(domain)
     image, box, limits = raster(solution.u)
+    smooth, words = raster(averaged(solution.u))[0], in_words(contact)
     boundary = np.concatenate([_segments(domain, part) for part in domain.parts.values()])
-    touching = _gather(mesh.comm, contact.vertices[contact.active][..., :2])
-    free = _gather(mesh.comm, contact.vertices[~contact.active][..., :2])
+    touching, free = contact_lines(contact)
 
     def draw() -> Figure | SubFigure:
         from matplotlib.patheffects import Normal, Stroke
-        from matplotlib.ticker import MaxNLocator
 
         figure, axes, width = plane_axes(box, room=1.5, ax=ax, units=units)
         shown = axes.imshow(
@@ -176,14 +178,8 @@ def plot_solution(
             vmin=limits[0],
             vmax=limits[1],
         )
-        heights = np.asarray(MaxNLocator(9).tick_values(*limits))
-        inner: FloatArray = heights[(heights > limits[0]) & (heights < limits[1])]
-        rows, columns = ((np.arange(n) + 0.5) / n for n in image.shape)
-        size = box[1] - box[0]
-        x, y = box[0, 0] + columns * size[0], box[0, 1] + rows * size[1]
-        if len(inner):
-            axes.contour(x, y, image, levels=inner, colors="white", linewidths=0.8, alpha=0.7,
-                         linestyles="solid")  # fmt: skip
+        inner = contour_heights(limits)
+        draw_contours(axes, smooth, box, inner)
         draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
         if len(free):
             outlined = [Stroke(linewidth=5.5, foreground="black"), Normal()]
@@ -207,7 +203,7 @@ def plot_solution(
         bar.ax.tick_params(labelsize=11)
         bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
         legend(figure, ncols=3, ax=ax)
-        axes.set_title(headline(title, f"$u_h$ on {grouped(solution.cells)} cells"), fontsize=14)
+        axes.set_title(headline(title, f"$u_h$, {words}"), fontsize=14)
         save(figure, path)
         return figure
 
@@ -238,12 +234,12 @@ def plot_contact(
     if contact.number == 0:
         raise InputError("a picture of the contact needs a contact boundary")
     size = comm.allreduce(float(np.abs(solution.u.x.array).max(initial=0.0)), op=MPI.MAX)
+    words = in_words(contact)
 
     def draw() -> Figure | SubFigure:
         assert table is not None
         figure = contact_page(table, contact.transitions, size, ax, units)
-        count = f"{grouped(contact.number_active)} of {grouped(contact.number)} facets in contact"
-        figure.suptitle(headline(title, count), fontsize=14)
+        figure.suptitle(headline(title, words), fontsize=14)
         save(figure, path)
         return figure
 
@@ -284,20 +280,24 @@ def plot_convergence(
     uniform = bool(np.all(sizes[1:] < 0.7 * sizes[:-1]))
     axes = ax or new_figure(9.5, 6.0).subplots()
     ends: list[tuple[float, float]] = []
+    falls: dict[str, str] = {}
+    measured = {"error_l2": " ".join(filter(None, (units.u, units.x)))}
     styles: list[dict[str, Any]] = []
     for key in keys:
         used = [record for record in records if record[key]]
         x = np.array([record["h" if uniform else "dofs"] for record in used])
         values = np.array([record[key] for record in used])
         style = dict(SERIES[key])
-        rate = used[-1].get(key.replace("error", "rate")) if uniform else None
-        style["label"] += (
-            f",\nlast rate {rate:.2f}" if rate is not None and key != "bound_h1" else ""
-        )
+        rate = used[-1][key.replace("error", "rate")] if uniform and "error" in key else None
+        if unit := measured.get(key, units.u):
+            style["label"] += " in " + unit.replace("$", r"\$")
+        if rate is not None:
+            style["label"] += f",\nlast rate {rate:.2f}"
         axes.loglog(x, values, markersize=7, linewidth=2, **style)
         styles.append(style)
         last = int(np.argmax(x))
         ends.append((x[last], values[last]))
+        falls[key] = _power(x, values, rate, uniform)
         if key == "bound_h1" and "error_h1" in keys:
             continue
         # A slope below the curve, touching it but for the factor
@@ -314,14 +314,32 @@ def plot_convergence(
         axes.set_xticks([], minor=True)
     size = f"$h${units.within('x')}"
     axes.set_xlabel(size if uniform else "number $N$ of degrees of freedom", fontsize=14)
-    axes.set_ylabel("error", fontsize=13)
+    if not uniform:
+        log_ticks(axes.xaxis)
+    axes.set_ylabel("error" if "bound_h1" not in keys else "error, bound", fontsize=13)
     axes.tick_params(labelsize=11)
     axes.grid(which="both", alpha=0.25)
     log_ticks(axes.yaxis)
     label_ends(axes, ends, *([style[key] for style in styles] for key in ("label", "color")))
-    axes.set_title(headline(title, "convergence"), fontsize=14)
+    axes.set_title(headline(title, _message(falls)), fontsize=14)
     save(axes.figure, path)
     return axes.figure
+
+
+def _power(x: FloatArray, values: FloatArray, rate: float | None, uniform: bool) -> str:
+    """The power of h or N with which the last two values fall."""
+    if rate is None:
+        rate = float(np.log(values[-1] / values[-2]) / np.log(x[-1] / x[-2]))
+    return f"${'h' if uniform else 'N'}^{{{rate:.2f}}}$"
+
+
+def _message(falls: Mapping[str, str]) -> str:
+    """What a picture of convergence shows."""
+    if "error_h1" in falls:
+        follows = falls.get("bound_h1") is not None
+        return f"the error falls like {falls['error_h1']}{', the bound with it' * follows}"
+    name, power = next(iter(falls.items()))
+    return f"the {'bound' if name == 'bound_h1' else 'error'} falls like {power}"
 
 
 def drawn(comm: MPI.Comm, draw: Callable[[], Figure | SubFigure]) -> Figure | SubFigure | None:

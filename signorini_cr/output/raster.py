@@ -10,7 +10,8 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, Int64Array
 from ..compat import cell_nodes
-from ..fem.space import vertex_values
+from ..fem.space import function_space, vertex_values
+from ..multigrid.parents import Layout
 
 AT_ONCE = 2**20
 """Pairs of a pixel and a cell near it that are looked at in one go."""
@@ -53,6 +54,26 @@ def raster(
     comm.Reduce(MPI.IN_PLACE if comm.rank == 0 else image, image, op=MPI.MAX, root=0)
     image[np.isneginf(image)] = np.nan
     return image, box, (float(lowest[2]), float(highest[2]))
+
+
+def averaged(u: fem.Function) -> fem.Function:
+    """The continuous P1 function of the means at the vertices; collective.
+
+    Contour lines of u itself would be torn at every edge.
+
+    Args:
+        u: CR or P1, ghosts up to date.
+    """
+    V = function_space(u.function_space.mesh, "P1")
+    layout, owned = Layout.of_space(V), V.mesh.topology.index_map(2).size_local
+    nodes = V.dofmap.list[:owned]
+    function = fem.Function(V)
+    sums = [np.zeros(len(function.x.array)) for _ in range(2)]
+    np.add.at(sums[0], nodes, vertex_values(u, slice(owned)))
+    np.add.at(sums[1], nodes, 1.0)
+    total, number = (layout.shared_sum(each) for each in sums)
+    function.x.array[:] = total / number
+    return function
 
 
 def _paint(image: FloatArray, x: FloatArray, y: FloatArray, values: FloatArray) -> None:

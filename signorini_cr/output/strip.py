@@ -15,6 +15,8 @@ from ..fem.space import facet_measures
 from .canvas import (
     RED,
     chains,
+    contour_heights,
+    draw_contours,
     draw_lines,
     headline,
     label_bar,
@@ -23,7 +25,8 @@ from .canvas import (
     plane_axes,
     save,
 )
-from .raster import raster
+from .raster import averaged, raster
+from .touching import contact_lines, in_words
 from .units import PLAIN, Units
 
 if TYPE_CHECKING:
@@ -45,20 +48,24 @@ class Moment:
     Attributes:
         time: Its end.
         image: u_h on rank 0, from `raster`.
+        smooth: Its means at the vertices, for contour lines.
         box: Lowest and highest corner of the domain, shape (2, 2).
         limits: The least and the greatest value of u_h.
         boundary: Ends of all boundary facets on rank 0, shape (n, 2, 2); none on the others.
-        touching: Of those in contact.
+        touching: Of the lines in contact, from `contact_lines`.
         free: Of those of Γ1 that are not.
+        words: How much of Γ1 is in contact.
     """
 
     time: float
     image: FloatArray
+    smooth: FloatArray
     box: FloatArray
     limits: tuple[float, float]
     boundary: FloatArray
     touching: FloatArray
     free: FloatArray
+    words: str
 
 
 def chosen(steps: int) -> set[int]:
@@ -70,17 +77,12 @@ def moment(time: float, solution: Solution) -> Moment:
     """Keep what a strip shows of a step on a plane domain; collective."""
     domain, contact = solution.domain, solution.contact
     ends = [facet_measures(domain.mesh, domain.facets(i))[0] for i in domain.parts.values()]
-    lines = (
-        np.concatenate(ends),
-        contact.vertices[contact.active],
-        contact.vertices[~contact.active],
-    )
-    pieces = domain.mesh.comm.gather([each[..., :2] for each in lines], root=0)
-    if pieces is None:
-        gathered = [np.zeros((0, 2, 2)) for _ in lines]
-    else:
-        gathered = [np.concatenate(each) for each in zip(*pieces, strict=True)]
-    return Moment(time, *raster(solution.u, PIXELS), *gathered)
+    pieces = domain.mesh.comm.gather(np.concatenate(ends)[..., :2], root=0)
+    boundary = np.zeros((0, 2, 2)) if pieces is None else np.concatenate(pieces)
+    image, box, limits = raster(solution.u, PIXELS)
+    smooth = raster(averaged(solution.u), PIXELS)[0]
+    lines = contact_lines(contact)
+    return Moment(time, image, smooth, box, limits, boundary, *lines, in_words(contact))
 
 
 def plot_strip(
@@ -132,13 +134,14 @@ def plot_strip(
             vmin=low,
             vmax=high,
         )
+        draw_contours(axes, each.smooth, box, contour_heights((low, high)))
         draw_lines(axes, chains(each.boundary), color="black", linewidth=1.0, joinstyle="round")
         for lines, color in ((each.free, "white"), (each.touching, RED)):
             outlined = [Stroke(linewidth=4.5, foreground="black"), Normal()]
             style: dict[str, Any] = {"color": color, "linewidth": 3.0, "path_effects": outlined}
             draw_lines(axes, chains(lines), zorder=3, **style)
             marks["contact" if color == RED else "no contact"] = Line2D([], [], **style)
-        axes.set_title(f"$t$ = {each.time:.4g}{time}", fontsize=12)
+        axes.set_title(f"$t$ = {each.time:.4g}{time}: {each.words}", fontsize=12)
     figure.supylabel(panels[0, 0].get_ylabel(), fontsize=12)  # on low panels they would overlap
     for axes in panels.flat:
         axes.set_ylabel("")

@@ -15,8 +15,9 @@ import helpers
 import pytest
 from mpi4py import MPI
 
-from signorini_cr.app import cli, commandline, problemfile
+from signorini_cr.app import cli, commandline, problemfile, readers
 from signorini_cr.errors import NotConverged
+from signorini_cr.mesh import mshfile
 
 pytestmark = pytest.mark.slow
 
@@ -232,6 +233,31 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["quantities.edge.mean", "allowed are contact, neumann, domain"],
     ),
     "title a number": (with_('"S1"', "1"), ["title: a string is needed, found 1"]),
+    "title with an escape": (
+        with_('"S1"', '"a\\u001b[31mred"'),
+        ["title: up to 200 characters on one line", r'found the string "a\x1b[31mred"'],
+    ),
+    "title too long": (with_('"S1"', f'"{"é" * 201}"'), ["title: up to 200 characters"]),
+    "an integer without end": (
+        with_("size = 0.5", f"size = {'9' * 4301}"),
+        ["case.toml: a whole number in line 5 has more than 4300 digits"],
+    ),
+    "a hexadecimal number without end": (
+        with_("levels = 2", f"levels = 0x{'f' * 5000}"),
+        ["refine.levels: less than 1e+15 is needed, found a huge number"],
+    ),
+    "a hexadecimal edge without end": (
+        with_("size", f"arcs = [{{ edge = 0x{'f' * 5000}, through = [0, 3] }}]\nsize"),
+        ["domain.arcs[0].edge:", "found a huge number"],
+    ),
+    "a vertex far away": (
+        with_("[1, 0]", "[1e300, 0]"),
+        ["domain.vertices: vertex 1 is (1e+300, 0): coordinates up to 1e+100 are allowed"],
+    ),
+    "steps without end": (
+        with_("[refine]", "[time]\nend = 1\nsteps = 100000000000\n[refine]"),
+        ["time.steps: 100000000000 is too many", "up to 100000 are allowed"],
+    ),
     "size zero": (with_("size = 0.5", "size = 0"), ["domain.size: a number above 0", "found 0"]),
     "size negative": (with_("size = 0.5", "size = -0.5"), ["domain.size:", "found -0.5"]),
     "size infinite": (with_("size = 0.5", "size = inf"), ["domain.size:", "found inf"]),
@@ -464,6 +490,30 @@ def write(shared_tmp_path: Path, monkeypatch) -> Callable[..., str]:
         return name
 
     return write
+
+
+@pytest.mark.parametrize("kind", ["file", "mesh"])
+def test_what_has_no_end_is_not_read(kind: str, write, monkeypatch) -> None:
+    """A device, a pipe, and a file that is larger than any that is meant."""
+    case = write('[domain]\nmesh = "there"\n[data]\nf = 1\n', "mesh.toml")
+    if COMM.rank == 0:
+        os.mkfifo("pipe")
+        Path("device").symlink_to("/dev/zero")
+        Path("large").write_text("#" * 2000)
+    monkeypatch.setattr(readers if kind == "file" else mshfile, "MOST_BYTES", 1000)
+    for name, told in {
+        "pipe": "this is a device or a pipe; a file is needed",
+        "device": "this is a device or a pipe; a file is needed",
+        "large": "the file has more than 0.001 MB; up to that are read",
+    }.items():
+        if COMM.rank == 0:
+            Path("there").unlink(missing_ok=True)
+            Path("there").symlink_to(name)
+        COMM.Barrier()
+        said = " ".join(refused("check", "there" if kind == "file" else case).split())
+        if COMM.rank == 0:
+            assert told in said
+            assert ("domain.mesh" in said) is (kind == "mesh")
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -81,6 +81,37 @@ def test_where_memory_ends_the_levels_before_are_kept(ranks, lone, tmp_path: Pat
     assert names == {"report.json", "levels.csv", "levels.md", "contact.csv", "restart.npz"}
 
 
+@pytest.mark.serial
+@pytest.mark.parametrize("most", [100_000_000, 300_000_000, 500_000_000])
+def test_where_memory_ends_at_the_beginning_one_message_tells(most: int, tmp_path: Path) -> None:
+    """`ulimit -v`, before a library is loaded and while some are."""
+    (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))
+    (tmp_path / "run.py").write_text(
+        f"import resource, sys\nresource.setrlimit(resource.RLIMIT_AS, ({most}, {most}))\n"
+        "from signorini_cr.app import cli\nsys.exit(cli.main())\n"
+    )
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q"]
+    done = helpers.start(tmp_path / "run.py", *argv)
+    if done.returncode == 0:
+        assert most > memory.LEAST
+        return
+    words = " ".join(done.stderr.split())
+    assert done.returncode == cli.NOT_CONVERGED, words
+    assert words.startswith(f"signorini-cr: {tmp_path / 'case.toml'}: ")
+    assert "out of memory" in words and "Traceback" not in words
+
+
+@pytest.mark.serial
+def test_a_run_without_a_home_folder(tmp_path: Path) -> None:
+    """Open MPI and DOLFINx ask for it; what is compiled goes where the system says it is."""
+    (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))
+    program = "import os, sys\nos.environ.pop('HOME', None)\nfrom signorini_cr.app import cli\n"
+    (tmp_path / "run.py").write_text(f"{program}sys.exit(cli.main())\n")
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q"]
+    done = helpers.start(tmp_path / "run.py", *argv)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_errors_that_mean_memory() -> None:
     for error in (MemoryError(), PETSc.Error(55), OSError(12, "Cannot allocate memory")):
         assert ran_out_of_memory(error)

@@ -53,6 +53,7 @@ def case(shared_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[...
 
 
 def solved(*words: object, out: str = "out") -> int:
+    COMM.Barrier()  # all have looked at what is there before one begins to write
     status = cli.main(["solve", "case.toml", "--out", out, "-q", *map(str, words)])
     COMM.Barrier()
     return status
@@ -129,6 +130,12 @@ def test_where_there_is_nothing_a_resumed_run_begins(case) -> None:
         ("uniform", "adaptive", [], 'refine.mode was "uniform" and is "adaptive"'),
         ("", "", ["--element", "p1"], '--element was "cr" and is "p1"'),
         ("[refine]", "g = 1\n[refine]", [], "data.g was not given and is 1"),
+        (
+            "[refine]",
+            '[quantities]\nall = { mean = "domain" }\n[refine]',
+            [],
+            'quantities.all was not given and is {"mean": "domain"}',
+        ),
     ],
 )
 def test_another_problem_is_refused(old, new, words, told, case, capfd) -> None:
@@ -154,6 +161,77 @@ def test_a_damaged_file_is_refused(damage: bytes, case, capfd) -> None:
     assert solved("--resume") == cli.BAD_INPUT
     if COMM.rank == 0:
         assert "--resume: cannot read out/restart.npz" in " ".join(capfd.readouterr().err.split())
+
+
+def rewritten(change: Callable[[dict, dict], None]) -> None:
+    """An archive that is in order, with other content."""
+    path = Path("out", checkpoint.NAME)
+    with np.load(path) as file:
+        arrays = dict(file)
+    text = json.loads(bytes(arrays["facts"]))
+    change(arrays, text)
+    if "facts" in arrays:
+        arrays["facts"] = np.frombuffer(json.dumps(text).encode(), dtype=np.uint8)
+    np.savez(path, **arrays)
+
+
+CHANGES = {
+    "no levels": lambda arrays, text: text["facts"].pop("levels"),
+    "no problem": lambda arrays, text: text["facts"].pop("said"),
+    "levels of nothing": lambda arrays, text: text["facts"].update(levels=[{}, {}]),
+    "many meshes": lambda arrays, text: text.update(meshes=99),
+    "fewer than none": lambda arrays, text: text.update(meshes=-1),
+    "other values": lambda arrays, text: arrays.update(u0=arrays["u0"] + 1.0),
+    "not a number": lambda arrays, text: arrays.update(u0=np.nan * arrays["u0"]),
+    "too short": lambda arrays, text: arrays.update(u0=arrays["u0"][:5]),
+    "words": lambda arrays, text: arrays.update(at0=np.full(len(arrays["at0"]), "a")),
+    "nothing known": lambda arrays, text: arrays.pop("facts"),
+    "no sum": lambda arrays, text: arrays.pop("sum"),
+    "objects": lambda arrays, text: arrays.update(at0=np.array([None, 1])),
+}
+
+
+@pytest.mark.serial
+def test_a_file_that_was_changed_is_refused(case, capfd) -> None:
+    """Also where all looks in order; nothing is solved for a look."""
+    case()
+    assert solved("--levels", 2) == 0
+    path = Path("out", checkpoint.NAME)
+    whole = path.read_bytes()
+    for name, change in CHANGES.items():
+        path.write_bytes(whole)
+        rewritten(change)
+        assert solved("--resume") == cli.BAD_INPUT, name
+        error = " ".join(capfd.readouterr().err.split())
+        assert "--resume: cannot read out/restart.npz: " in error, name
+        assert "it is to be removed, and the run begun anew" in error
+    path.write_bytes(whole)
+    assert solved("--resume") == 0
+
+
+@pytest.mark.serial
+def test_damaged_archives_are_read_or_refused(case) -> None:
+    """Headers and the table of contents are hit as often as the rest."""
+    case()
+    assert solved("--levels", 2) == 0
+    path = Path("out", checkpoint.NAME)
+    whole, ends = path.read_bytes(), []
+    random = np.random.default_rng(1)
+    for _ in range(400):
+        data = bytearray(whole)
+        if random.random() < 0.3:
+            del data[random.integers(len(data)) :]
+        else:
+            near = random.integers(400, size=4)
+            places = [random.integers(len(data)), near[0], near[1], len(data) - 1 - near[2]]
+            for at in random.choice(places, size=2):
+                data[at] ^= 1 << random.integers(8)
+        path.write_bytes(data)
+        try:
+            ends.append(checkpoint.read_checkpoint("out", MPI.COMM_SELF) is not None)
+        except InputError:
+            ends.append(False)
+    assert 0 < sum(ends) < 200  # a few bits mean nothing, those of dates
 
 
 def test_another_mesh_is_noticed() -> None:

@@ -79,15 +79,19 @@ def test_names_and_units_stand_beside_the_axes(solution):
         return
     (plane,) = figures[0].axes
     (bar,) = plane.child_axes
-    assert plane.get_xlabel() == "distance $x$ in km" and plane.get_ylabel() == "$y$ in km"
-    assert bar.get_ylabel() == r"price $u_h$ in \$"
+    assert (
+        plane.get_xlabel() == "distance $x$ in\u00a0km" and plane.get_ylabel() == "$y$ in\u00a0km"
+    )
+    assert bar.get_ylabel() == "price $u_h$ in\u00a0\\$"
     upper, lower = figures[1].axes
-    assert upper.get_ylabel().startswith("price\n$u_h$ and") and r"in \$," in upper.get_ylabel()
-    assert lower.get_ylabel() == r"heat $\lambda_h$ in W/m²"
-    assert "$\\Gamma_1$ in km, from" in figures[1].legends[0].get_title().get_text()
+    assert (
+        upper.get_ylabel().startswith("price\n$u_h$ and") and "in\u00a0\\$," in upper.get_ylabel()
+    )
+    assert lower.get_ylabel() == "heat $\\lambda_h$ in\u00a0W/m²"
+    assert "$\\Gamma_1$ in\u00a0km, from" in figures[1].legends[0].get_title().get_text()
     for figure in figures:
         assert figure._repr_png_()
-    assert plots.plot_convergence(records(), units=units).axes[0].get_xlabel() == "$h$ in km"
+    assert plots.plot_convergence(records(), units=units).axes[0].get_xlabel() == "$h$ in\u00a0km"
 
 
 def test_contact_takes_the_place_of_axes(solution):

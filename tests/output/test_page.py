@@ -90,7 +90,7 @@ def test_the_page_holds_everything_and_points_nowhere(page):
         "signorini-cr solve",
         "--levels 2",
         "dolfinx",
-        "certified: ",
+        "Certified: ",
         "−Δu = -1 - 0.001*x - 0.001*y - 0.001*x*y - 0.001*x*x",  # not folded
         " % wide",
     ):
@@ -106,8 +106,8 @@ def test_the_page_of_a_run_in_time(page):
         "signorini-cr solve",
         "dolfinx",
         "in 7 steps of euler",
-        "certified: in no step is ",
-        "the last step's own problem, certified: ",
+        "Certified: in no step is ",
+        "The last step's own problem, certified: ",
         "s for all 7 steps",
         "series.pvd opens the fields of all steps",
         "time: t at its end in h",

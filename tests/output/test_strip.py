@@ -60,5 +60,6 @@ def test_a_strip_of_any_number_of_moments(number, shared_tmp_path):
     figure = drawn(COMM, lambda: plot_strip(moments, shared_tmp_path / f"{number}.png"))
     if COMM.rank == 0:
         *panels, bar = figure.axes
-        assert [axes.get_title() for axes in panels] == [f"$t$ = {k}" for k in range(number)]
+        titles = [rf"$t$ = {k}: all of $\Gamma_1$ in contact" for k in range(number)]
+        assert [axes.get_title() for axes in panels] == titles
         assert "u_h" in bar.get_ylabel()

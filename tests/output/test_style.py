@@ -4,10 +4,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from mpi4py import MPI
 
-from signorini_cr import Polygon, Problem, plots, solve
+from signorini_cr import Contact, Dirichlet, Polygon, Problem, plots, solve
+from signorini_cr.fem.space import function_space
 from signorini_cr.output import canvas
+from signorini_cr.output.raster import averaged
+from signorini_cr.output.touching import contact_lines
 
 pytest.importorskip("matplotlib")
 WORLD = MPI.COMM_WORLD
@@ -46,15 +51,95 @@ def test_nothing_is_cut_off(vertices, size):
 
 @pytest.mark.parametrize("edge", [0, 2])
 def test_contact_runs_from_the_left_to_the_right_on_any_edge(edge):
-    """u falls with x, as the load grows: so it does on the picture, above and below."""
+    """In the arc length of contact.csv, which decreases on an upper edge, as Ω is to the left."""
     solution = solved(SQUARE, {edge}, 0.1)
     figure = plots.plot_contact(solution)
-    table = solution.contact.table()
-    if figure is not None:
-        (curve,) = (line for line in figure.axes[0].get_lines() if line.get_label() == "$u_h$")
-        order = np.argsort(table["x"])
-        assert curve.get_xdata() == pytest.approx(table["x"][order])
-        assert curve.get_ydata() == pytest.approx(table["u"][order])
+    table, transitions = solution.contact.table(), solution.contact.transitions
+    if figure is None:
+        return
+    axes, below = figure.axes
+    (curve,) = (line for line in axes.get_lines() if line.get_label() == "$u_h$")
+    assert curve.get_xdata() == pytest.approx(table["arc_length"])
+    assert curve.get_ydata() == pytest.approx(table["u"])
+    # pixels go with x on both edges
+    pixels = axes.transData.transform(np.c_[table["arc_length"], table["u"]])[:, 0]
+    assert np.all(np.diff(pixels[np.argsort(table["x"])]) > 0)
+    for panel in (axes, below):
+        assert panel.get_xlim() == pytest.approx((0, 1) if edge == 0 else (1, 0))
+    # contact is shaded up to where it ends, at the same place in terms of arc length
+    along = np.sort(transitions[:, 0] if edge == 0 else 1 - transitions[:, 0])
+    shaded = axes.collections[0].get_paths()[0].vertices[:, 0]
+    lines = np.array([line[0, 0] for line in axes.collections[1].get_segments()])
+    assert len(along) == 1 and lines == pytest.approx(along)
+    assert np.min(np.abs(shaded - along[0])) < 1e-12
+
+
+@pytest.mark.parametrize("edge", [0, 2])
+def test_the_screen_tells_places_in_the_order_of_arc_length(edge):
+    bump = Problem(f=lambda x: 300 * ufl.cos(6 * np.pi * x[0]))
+    sides = ["contact" if i == edge else "dirichlet" for i in range(4)]
+    solution = solve(bump, Polygon(SQUARE, sides).mesh(0.05))
+    table, points = solution.contact.table(), solution.contact.transitions[:, 0]
+    assert len(points) > 2
+    if table is not None:
+        arc = np.interp(points, *(column[np.argsort(table["x"])] for column in
+                                  (table["x"], table["arc_length"])))  # fmt: skip
+        assert np.all(np.diff(arc) > 0)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "names", "signs"),
+    [
+        ({"obstacle": -0.1}, [r"obstacle $\alpha$"], r"$u_h$ and $\alpha$"),
+        ({"upper": 0.1}, [r"upper bound $\beta$"], r"$u_h$ and $\beta$"),
+        (
+            {"obstacle": -0.1, "upper": 0.1},
+            [r"lower bound $\alpha$", r"upper bound $\beta$"],
+            r"$u_h$ and $\alpha$, $\beta$",
+        ),
+    ],
+)
+def test_bounds_have_their_names(bounds, names, signs):
+    conditions = {
+        "contact": Contact(**{key: lambda x, value=value: value + 0 * x[0]
+                              for key, value in bounds.items()}),
+        "dirichlet": Dirichlet(0.0),
+    }  # fmt: skip
+    problem = Problem(f=lambda x: 8 * ufl.sin(6 * x[0]), conditions=conditions)
+    sides = ["contact", "dirichlet", "dirichlet", "dirichlet"]
+    figure = plots.plot_contact(solve(problem, Polygon(SQUARE, sides).mesh(0.2)))
+    if figure is None:
+        return
+    axes = figure.axes[0]
+    assert axes.get_ylabel() == f"{signs}, facet means"
+    assert [text.get_text() for text in axes.texts] == ["$u_h$", *names]
+
+
+def test_the_mark_sits_where_the_bar_ends():
+    solution = solved(SQUARE, {2}, 0.1)
+    touching, free = contact_lines(solution.contact)
+    point = solution.contact.transitions[0, :2]
+    if WORLD.rank > 0:
+        return
+    facets = solution.contact.table()["x"] - 0.5 * solution.contact.table()["length"]
+    assert np.min(np.abs(facets - point[0])) > 1e-3  # inside one
+    (red,), (white,) = canvas.chains(touching), canvas.chains(free)
+    for line in (red, white):
+        assert np.min(np.linalg.norm(line - point, axis=1)) < 1e-12
+    lengths = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in (red, white)]
+    assert sum(lengths) == pytest.approx(1.0)
+
+
+def test_means_at_vertices_are_those_of_the_cells_around():
+    """Exact for a continuous function, and the mean of both sides for one that jumps."""
+    domain = Polygon(SQUARE, ["contact", "dirichlet", "dirichlet", "dirichlet"]).mesh(0.3)
+    u = fem.Function(function_space(domain.mesh, "CR"))
+    u.interpolate(lambda x: 2 * x[0] - 3 * x[1])
+    u.x.scatter_forward()
+    means = averaged(u)
+    exact = fem.Function(means.function_space)
+    exact.interpolate(lambda x: 2 * x[0] - 3 * x[1])
+    assert np.allclose(means.x.array, exact.x.array)
 
 
 @pytest.mark.serial
@@ -81,6 +166,31 @@ def test_the_error_axis_has_several_ticks(span):
     low, high = axes.get_ylim()
     axes.figure.canvas.draw()
     shown = [tick.get_text() for tick, at in zip(axes.get_yticklabels(), axes.get_yticks(),
+             strict=True) if low <= at <= high]  # fmt: skip
+    assert sum(bool(text) for text in shown) >= 2
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("keys", "sizes", "says"),
+    [
+        (("error_h1", "bound_h1"), [8, 4, 2], "the error falls like $h^{0.99}$, the bound with it"),
+        (("error_l2",), [8, 4, 2], "the error falls like $h^{1.98}$"),
+        (("bound_h1",), [8, 4, 2], "the bound falls like $h^{1.00}$"),
+        (("bound_h1",), [8, 7, 6], "the bound falls like $N^{-0.50}$"),
+    ],
+)
+def test_the_title_of_convergence_says_how_the_error_falls(keys, sizes, says):
+    rows = [{"h": h, "dofs": 100 * 4**k, "error_h1": None, "error_l2": None, "bound_h1": None,
+             "rate_h1": 0.99, "rate_l2": 1.98} | dict.fromkeys(keys, 0.5**k)
+            for k, h in enumerate(sizes)]  # fmt: skip
+    axes = plots.plot_convergence(rows, units=plots.Units(u="K", x="m")).axes[0]
+    assert axes.get_title() == says
+    labels = [text.get_text() for text in axes.texts if "u_h" in text.get_text()]
+    assert all(("in K m" if "nabla" not in label else "in K") in label for label in labels)
+    axes.figure.canvas.draw()
+    low, high = axes.get_xlim()
+    shown = [tick.get_text() for tick, at in zip(axes.get_xticklabels(), axes.get_xticks(),
              strict=True) if low <= at <= high]  # fmt: skip
     assert sum(bool(text) for text in shown) >= 2
 

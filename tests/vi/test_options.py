@@ -56,6 +56,36 @@ def test_options_of_a_script_reach_the_solver(tmp_path):
 
 
 @pytest.mark.serial
+def test_options_without_the_prefix_are_told(tmp_path):
+    """They do not reach the solver, nor PETSc; a script's own words are its own."""
+    own = ["-n", "3", "-v", "-f", "in.msh", "-info", "-mat_file", "a", "--ksp_view", "-pc"]
+    assert run(tmp_path, *own).stderr == ""
+    result = run(tmp_path, "-snes_monitor", "-ksp_rtol", "1e-3", "-log_view", ":x.txt")
+    assert result.returncode == 0 and "SNES Function norm" not in result.stdout
+    solver, petsc = result.stderr.splitlines()
+    write = "-signorini_snes_monitor, -signorini_ksp_rtol"
+    assert solver.endswith(f"-snes_monitor, -ksp_rtol did not reach the solver; write {write}")
+    assert "-log_view did not reach PETSc; set PETSC_OPTIONS='-log_view :x.txt'" in petsc
+    done = run(tmp_path, "-signorini_snes_monitor", "-signorini_ksp_rtol", "1e-3")
+    assert done.stderr == "" and "SNES Function norm" in done.stdout
+
+
+@pytest.mark.serial
+def test_options_that_petsc_has_are_no_alarm(tmp_path, monkeypatch):
+    """Given at its start, set by the script, or by the environment; some solver may use them."""
+    begin = "import sys, petsc4py\npetsc4py.init(sys.argv)\n"
+    words = ["-log_view", f":{tmp_path / 'x.txt'}", "-ksp_view"]
+    (tmp_path / "init.py").write_text(begin + SCRIPT)
+    done = start(tmp_path / "init.py", *words)
+    assert "signorini_cr: warning" not in done.stderr and (tmp_path / "x.txt").exists()
+    later = SCRIPT + "from petsc4py import PETSc\nPETSc.Options()['ksp_view'] = None\n"
+    (tmp_path / "later.py").write_text(later)
+    assert "signorini_cr: warning" not in start(tmp_path / "later.py", "-ksp_view").stderr
+    monkeypatch.setenv("PETSC_OPTIONS", f"-log_view :{tmp_path / 'y.txt'}")
+    assert run(tmp_path, "-log_view").stderr == "" and (tmp_path / "y.txt").exists()
+
+
+@pytest.mark.serial
 def test_a_misspelt_option_is_told(tmp_path):
     result = run(tmp_path, "-signorini_snes_monitr")
     assert result.returncode == 0
