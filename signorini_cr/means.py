@@ -25,7 +25,7 @@ from .multigrid.hierarchy import NestedMesh
 from .options import ESTIMATE_PREFIX, MEAN, solve_once
 from .vi.level import Level
 
-NO_MEAN = "the mean has no bounds"
+NO_MEAN = "u has no bounds there"
 NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral with u has bounds"
 ROUNDING = 1e-14
 """What rounding may do to an integral, in parts of that of |ψ u|."""
@@ -154,7 +154,7 @@ def _dual(forms: Forms, where: str | None, weight: Data) -> Problem:
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Dual:
     """z_h, as certificates want it.
 
@@ -220,8 +220,10 @@ def _paired(z: _Dual, made: Made, cells: Cells, where: str | None, width: float)
         return on_side(made, cells, segments).over_ranks(cells)
     certain = Certain.of(data.compiled.f, data.of_f, cells, low, size)
     _insist_on_weight(certain.reason)
-    there = np.ones(cells.number) if where is None else domain.materials.where(where)
-    return in_cells(made, cells, certain, there[: cells.number]).over_ranks(cells)
+    there = np.ones(cells.number)
+    if where is not None:
+        there[:] = domain.materials.where(where)[: cells.number]
+    return in_cells(made, cells, certain, there).over_ranks(cells)
 
 
 def _insist_on_weight(reason: str | None) -> None:

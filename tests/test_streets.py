@@ -31,7 +31,7 @@ FLOORS = (
     ("multigrid",),
     ("vi",),
     ("estimate",),
-    ("solution", "diffusion", "limits", "restart", "levels", "means", "adaptive", "evolution"),
+    ("solution", "diffusion", "limits", "restart", "levels", "means", "quantities", "adaptive", "evolution"),
     ("verification",),
     ("output",),
     ("app",),
