@@ -95,7 +95,7 @@ class Screen:
 
 def printable(text: str) -> str:
     """The same without what would move a terminal's cursor or change its colours."""
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    return "".join(c if c.isprintable() or c in "\n\u00a0" else ascii(c)[1:-1] for c in text)
 
 
 def wrapped(text: str, before: str = "") -> str:
