@@ -351,7 +351,7 @@ all = { mean = "domain" }
     wanted = {"heat": {**found["low"], "kind": "flux"}, "low": found["low"]}
     bounds = {"contact": {"force_bounds": {"reason": "x"}}, "quantities": wanted}
     told = certified(solution_record | bounds, measured)
-    assert re.search(r"heat is in \[[^]]*\] W, .*; low is in \[[^]]*\] K, ", told)
+    assert re.search(r"heat is in \[[^]]*\]\sW, .*; low is in \[[^]]*\]\sK, ", told)
     named = read(text.replace("[material.low]", "[material.domain]").replace('"low"', '"domain"'))
     renamed = {name: ("mean", "domain", None) for name in ("low", "all")}
     assert named.quantities == {**asked, **renamed}
@@ -387,7 +387,8 @@ all = { integral = "domain", weight = "x - y" }
         assert each["lower"] <= exact[name] <= each["upper"]
         assert each["upper"] - each["lower"] < 1e-8
     told = certified(record, Units(u="K", force="W"))
-    assert re.search(r"tilt is in \[[^]]*\] K", told) and "] W" not in told
+    assert re.search(r"tilt is in \[[^]]*\]\sK,", told)
+    assert re.search(r"push is in \[[^]]*\],", told) and re.search(r"all is in \[[^]]*\],", told)
     for old, new, said in [
         ('"x - y"', '"log(x - 5)"', "quantities.all.weight: the value at"),
         ('"1/(3 - y) + x"', '"log(0.4 - y)"', "quantities.low.weight: the value at"),

@@ -137,7 +137,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         )
         low, high = (float(text.replace("−", "-")) for text in told.groups())
         assert low <= ends[0] and ends[1] <= high
-        assert (low, high) == pytest.approx(ends, rel=0.02, abs=0.02)
+        assert (low, high) == pytest.approx(ends, rel=0.1, abs=0.1)
     (level,) = report["levels"]
     assert level["quantities"] == report["times"][-1]["quantities"]
     assert level["contact"]["force"] == report["times"][-1]["force"]
