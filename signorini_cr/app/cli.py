@@ -335,7 +335,7 @@ def _solve_steps(
     screen.progress("step 1")
     try:
         for time, solution in case.steps(domain, case.levels):
-            record = series.step_record(len(records) + 1, time, solution)
+            record = series.step_record(len(records) + 1, time, solution, case.quantities)
             records.append(record)
             if record["step"] in chosen:
                 moments.append(strip.moment(time, solution))
@@ -348,7 +348,7 @@ def _solve_steps(
         failure = NotConverged(f"time step {len(records) + 1}: {error}")
     if solution is not None:
         screen.progress("writing")
-        last = output.level_record(solution, None, case.quantities)
+        last = output.level_record(solution) | {"quantities": records[-1]["quantities"]}
         complete = failure is None
         report = output.make_report(case.title, "CR", comm, [last], complete, case.units)
         report["times"] = records
@@ -360,7 +360,8 @@ def _solve_steps(
         screen.text(series.legend(case.units))
         screen.line("")
         screen.text(f"at the end {facts(last, case.units)}")
-        screen.text(series.certified(records))
+        for sentence in (series.certified(records), *series.over_time(records, case.units)):
+            screen.text(sentence)
         screen.text(f"the last step's own problem, {certified(last, case.units)}")
         screen.text(series.times(records))
         screen.text(
