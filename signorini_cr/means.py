@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from dolfinx import fem
 
 from .data.diffusion import diffusion
 from .data.loads import Certain, Segments
-from .diffusion import Diffusion
+from .dual import Dual, solved
 from .errors import InputError
 from .estimate.certificate import Certificate, Made, certify
 from .estimate.force import Certified, Interval, against, extended, square
@@ -18,12 +18,8 @@ from .estimate.weights import scalar
 from .fem.cells import Cells
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Material, Problem
-from .fem.space import function_space, ghosted_vector, shared_sum
-from .garbage import release
+from .fem.space import function_space, shared_sum
 from .mesh.domain import Domain
-from .multigrid.hierarchy import NestedMesh
-from .options import ESTIMATE_PREFIX, MEAN, solve_once
-from .vi.level import Level
 
 NO_MEAN = "u has no bounds there"
 NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral with u has bounds"
@@ -84,7 +80,7 @@ def _bounded(
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
     cells = made.cells()
     _insist_on_extent(cells, where)
-    z = _solved(_dual(forms, where, 1.0 if weight is None else scalar(weight, forms)), level)
+    z = solved(_dual(forms, where, 1.0 if weight is None else scalar(weight, forms)), level)
     dual = certify(z, sweeps=0)
     if dual.energy is None or dual.bound_companion is None:
         z.level.tidy()
@@ -154,48 +150,7 @@ def _dual(forms: Forms, where: str | None, weight: Data) -> Problem:
     )
 
 
-@dataclass(eq=False)
-class _Dual:
-    """z_h, as certificates want it.
-
-    Attributes:
-        level: The mesh, with those below it.
-        u: z_h.
-    """
-
-    level: Level
-    u: fem.Function
-
-    @property
-    def domain(self) -> Domain:
-        """Mesh and boundary parts."""
-        return self.level.domain
-
-    @property
-    def element(self) -> str:
-        """The element's name."""
-        return self.level.physics.element
-
-
-def _solved(dual: Problem, level: Level) -> _Dual:
-    """Solve for z, on the same meshes; collective.
-
-    What is certain about z is so for whatever comes of it.
-    """
-    coarsest = level.meshes[0].domain
-    physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
-    meshes = (NestedMesh(physics, each.domain, each.parents) for each in level.meshes)
-    level = Level(tuple(meshes))
-    system = level.system
-    u = system.start()
-    load, found = (ghosted_vector(level.V, each.x.array) for each in (system.b, u))
-    solve_once(system.A, load, found, MEAN, ESTIMATE_PREFIX)
-    u.x.scatter_forward()
-    release(load, found)
-    return _Dual(level, u)
-
-
-def _paired(z: _Dual, made: Made, cells: Cells, where: str | None, width: float) -> Pairing:
+def _paired(z: Dual, made: Made, cells: Cells, where: str | None, width: float) -> Pairing:
     """Enclose ψ, and integrate it against v; collective.
 
     Args:

@@ -37,6 +37,7 @@ FLOORS = (
         "limits",
         "restart",
         "levels",
+        "dual",
         "means",
         "quantities",
         "adaptive",

@@ -1,0 +1,61 @@
+"""Linear problems that tell what functionals of u are worth, on the meshes of a solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dolfinx import fem
+
+from .diffusion import Diffusion
+from .fem.problem import Problem
+from .fem.space import ghosted_vector
+from .garbage import release
+from .mesh.domain import Domain
+from .multigrid.hierarchy import NestedMesh
+from .options import ESTIMATE_PREFIX, MEAN, solve_once
+from .vi.level import Level
+
+
+@dataclass(eq=False)
+class Dual:
+    """A solution, as certificates want it.
+
+    Attributes:
+        level: The mesh, with those below it.
+        u: The discrete solution.
+    """
+
+    level: Level
+    u: fem.Function
+
+    @property
+    def domain(self) -> Domain:
+        """Mesh and boundary parts."""
+        return self.level.domain
+
+    @property
+    def element(self) -> str:
+        """The element's name."""
+        return self.level.physics.element
+
+
+def solved(dual: Problem, level: Level) -> Dual:
+    """Solve a problem without contact; collective.
+
+    What is certain about its solution is so for whatever comes of it.
+
+    Args:
+        dual: The problem.
+        level: The meshes.
+    """
+    coarsest = level.meshes[0].domain
+    physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
+    meshes = (NestedMesh(physics, each.domain, each.parents) for each in level.meshes)
+    level = Level(tuple(meshes))
+    system = level.system
+    u = system.start()
+    load, found = (ghosted_vector(level.V, each.x.array) for each in (system.b, u))
+    solve_once(system.A, load, found, MEAN, ESTIMATE_PREFIX)
+    u.x.scatter_forward()
+    release(load, found)
+    return Dual(level, u)
