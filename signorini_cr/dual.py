@@ -19,11 +19,11 @@ from .vi.level import Level
 
 @dataclass(eq=False)
 class Dual:
-    """z_h, as certificates want it.
+    """A solution, as certificates want it.
 
     Attributes:
         level: The mesh, with those below it.
-        u: z_h.
+        u: The discrete solution.
     """
 
     level: Level
@@ -41,10 +41,14 @@ class Dual:
 
 
 def solved(dual: Problem, level: Level) -> Dual:
-    """Solve for z, on the same meshes; collective.
+    """Solve a problem without contact; collective.
 
-    What is certain about z is so for whatever comes of it. Whoever has no more use for its level
-    tidies it.
+    What is certain about its solution is so for whatever comes of it. Whoever has no
+    more use for its level tidies it.
+
+    Args:
+        dual: The problem.
+        level: The meshes.
     """
     coarsest = level.meshes[0].domain
     physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
@@ -60,7 +64,7 @@ def solved(dual: Problem, level: Level) -> Dual:
 
 
 def certified(dual: Problem, level: Level) -> Certificate:
-    """Return what is certain about z, with a companion in P1 where that will do; collective."""
+    """Solve it and say what is certain, with a companion in P1 where that will do; collective."""
     z = solved(dual, level)
     certificate = certify(z, sweeps=0)
     z.level.tidy()

@@ -743,8 +743,8 @@ def terms(seed: int, quick: bool) -> Group:
         "Reaction, loss of heat, several parts",
         "−∇·(κ∇u) + c u = f on the unit square, each edge a part of its own: Dirichlet, Neumann, "
         "Robin, or contact from below, from above or both, with a flux or a loss of heat of its "
-        "own. Passed: no bound below the error in either norm, J(u) and what flows through the "
-        f"parts inside their intervals, at most {MISSING:.0%} without bounds.",
+        "own. Passed: no bound below the error in either norm, J(u), what flows through the parts "
+        f"and integrals of u inside their intervals, at most {MISSING:.0%} without bounds.",
         [
             told(_drawn(seed, 4 if quick else 500, Case, DRAWN)),
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
