@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dolfinx import fem
 
 from .diffusion import Diffusion
@@ -9,33 +11,62 @@ from .estimate.certificate import Certificate, certify
 from .fem.problem import Problem
 from .fem.space import ghosted_vector
 from .garbage import release
+from .mesh.domain import Domain
 from .multigrid.hierarchy import NestedMesh
 from .options import ESTIMATE_PREFIX, MEAN, solve_once
-from .solution import Solution
-from .vi.contact import contact_facts
 from .vi.level import Level
-from .vi.solver import Iterations
 
 
-def certified(dual: Problem, level: Level) -> Certificate:
-    """Return what is certain about its solution, with a companion in P1 where that will do.
+@dataclass(eq=False)
+class Dual:
+    """A solution, as certificates want it.
 
-    It is true for whatever comes of a linear solve, in which Γ1 counts for nothing. Collective.
+    Attributes:
+        level: The mesh, with those below it.
+        u: The discrete solution.
+    """
+
+    level: Level
+    u: fem.Function
+
+    @property
+    def domain(self) -> Domain:
+        """Mesh and boundary parts."""
+        return self.level.domain
+
+    @property
+    def element(self) -> str:
+        """The element's name."""
+        return self.level.physics.element
+
+
+def solved(dual: Problem, level: Level) -> Dual:
+    """Solve a problem without contact; collective.
+
+    What is certain about its solution is so for whatever comes of it. Whoever has no
+    more use for its level tidies it.
+
+    Args:
+        dual: The problem.
+        level: The meshes.
     """
     coarsest = level.meshes[0].domain
     physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
     meshes = (NestedMesh(physics, each.domain, each.parents) for each in level.meshes)
     level = Level(tuple(meshes))
     system = level.system
-    u, residual = system.start(), fem.Function(level.V)
+    u = system.start()
     load, found = (ghosted_vector(level.V, each.x.array) for each in (system.b, u))
     solve_once(system.A, load, found, MEAN, ESTIMATE_PREFIX)
     u.x.scatter_forward()
-    system.residual(u, residual)
-    release(load, found)
-    contact = contact_facts(level.data, system, u, residual, Iterations(0, 0, ""))
     u.x.array[:] += system.offset
-    z = Solution(level, u, residual, contact, 0.0, Iterations(0, 0, ""))
+    release(load, found)
+    return Dual(level, u)
+
+
+def certified(dual: Problem, level: Level) -> Certificate:
+    """Solve it and say what is certain, with a companion in P1 where that will do; collective."""
+    z = solved(dual, level)
     certificate = certify(z, sweeps=0)
-    level.tidy()
+    z.level.tidy()
     return certificate

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,17 +13,25 @@ from .data.moments import OnParts
 from .dual import certified
 from .errors import InputError
 from .estimate.certificate import Made
-from .estimate.force import Interval, against, interval, made_of, square, through, unsure
+from .estimate.force import (
+    Certified,
+    Interval,
+    against,
+    interval,
+    made_of,
+    square,
+    through,
+    unsure,
+)
 from .estimate.lifting import gaps
 from .fem.cells import measures
-from .fem.conditions import Condition, Contact, Dirichlet, Robin
+from .fem.conditions import Condition, Data, Dirichlet, Robin
 from .fem.problem import Problem
-from .solution import Solution
 
 __all__ = ["Interval", "flux", "force_bounds"]
 
 
-def force_bounds(solution: Solution) -> tuple[float, float]:
+def force_bounds(solution: Certified) -> tuple[float, float]:
     """Two numbers with the contact force of u itself between them; collective.
 
     The force is ∫_Γ1 λ, λ = κ∂ₙu + b (u − u_ext) − g, which is κ∂ₙu unless the condition says more.
@@ -38,14 +45,17 @@ def force_bounds(solution: Solution) -> tuple[float, float]:
     return _interval(solution, diffusion(made_of(solution).level.data).forms.bounded)[1:]
 
 
-def flux(solution: Solution, *parts: str) -> Interval:
+def flux(solution: Certified, *parts: str, weight: Data | None = None) -> Interval:
     """Put what flows into Ω through parts of the boundary between two numbers; collective.
 
     On a Dirichlet part that is ∫ κ∂ₙu, on a contact part the contact force, as in `force_bounds`.
 
     Args:
         solution: One with a certified bound.
-        *parts: Names of Dirichlet or contact parts that touch no others of these.
+        *parts: Names of Dirichlet or contact parts; without a weight they must touch no others of
+            these.
+        weight: What is integrated with it, as ∫ λ ω, continuous on the parts and 0 where they touch
+            others; None for 1.
 
     Raises:
         InputError: There is no such part, or there is no bound; the message says why.
@@ -58,10 +68,13 @@ def flux(solution: Solution, *parts: str) -> Interval:
                 f"{part!r} is no Dirichlet or contact part of the boundary; there are"
                 f" {', '.join(known)}"
             )
-    return _interval(solution, [known[part] for part in parts])
+    conditions = [known[part] for part in parts]
+    if weight is not None:
+        return interval(solution, conditions, weight)
+    return _interval(solution, conditions)
 
 
-def _interval(solution: Solution, conditions: Sequence[Condition]) -> Interval:
+def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
     """Take the better ends of both intervals; collective."""
     found = interval(solution, conditions)
     other = _corrected(made_of(solution), solution, conditions)
@@ -72,7 +85,7 @@ def _interval(solution: Solution, conditions: Sequence[Condition]) -> Interval:
 
 
 def _corrected(
-    made: Made, solution: Solution, conditions: Sequence[Condition]
+    made: Made, solution: Certified, conditions: Sequence[Condition]
 ) -> tuple[float, float] | None:
     """Bound ∫ λ over parts by a(v, φ) − χ(φ), a-harmonic φ; None where contact begins or ends.
 
@@ -99,8 +112,6 @@ def _corrected(
     flows = np.zeros_like(at)
     if any(condition not in free for condition in conditions):
         problem = _harmonic(forms.problem, forms.conditions, conditions, free)
-        if problem is None:
-            return None
         dual = certified(problem, made.level)
         of_phi = dual._made
         if of_phi is None or dual.bound_companion is None:
@@ -142,7 +153,7 @@ def _corrected(
     most = max(cells.comm.allgather(most))
     reach += product + most * made.complementary
     reach += held_most * made.above if held else 0.0
-    return middle - reach, middle + reach
+    return float(middle - reach), float(middle + reach)
 
 
 def _harmonic(
@@ -150,11 +161,10 @@ def _harmonic(
     conditions: Sequence[Condition],
     chosen: Sequence[Condition],
     free: Sequence[Condition],
-) -> Problem | None:
-    """Return the problem whose solution is 1 on some parts and 0 on the rest of Γ0 and Γ1.
+) -> Problem:
+    """Return the linear problem whose solution is 1 on some parts and 0 on the rest of Γ0 and Γ1.
 
-    Elsewhere its flux is 0, and −1 an obstacle that changes nothing. None where there is no room
-    for both.
+    Elsewhere its flux is 0.
 
     Args:
         problem: What a comes from.
@@ -163,20 +173,11 @@ def _harmonic(
         free: Parts of Γ1 on which it is neither: there is no contact.
     """
     found: dict[str, Condition] = {}
-    natural: list[tuple[str, Any, bool]] = []
     for each in conditions:
         if (each.fixed is not None or each.bounds) and each not in free:
             found[each.part] = Dirichlet(float(each in chosen))
         else:
-            b = 0.0 if each.loss is None else each.loss
-            natural.append((each.part, b, bool(each.bounds)))
-    # what assembles has a part of either kind, if only an empty one
-    natural.sort(key=lambda each: each[2])
-    if len(natural) < 2:
-        return None
-    for part, b, bounded in natural:
-        bounded |= part == natural[-1][0]
-        found[part] = Contact(-1.0, coefficient=b) if bounded else Robin(0.0, coefficient=b)
+            found[each.part] = Robin(0.0, coefficient=0.0 if each.loss is None else each.loss)
     return Problem(
         f=0.0,
         coefficient=problem.coefficient,

@@ -1,4 +1,4 @@
-"""Guaranteed bounds of means of u: over a part of the boundary, a material, or all of Ω."""
+"""Guaranteed bounds of integrals of u: over a part of the boundary, a material, or all of Ω."""
 
 from __future__ import annotations
 
@@ -7,40 +7,72 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import fem
 
-from .arrays import FloatArray
 from .data.diffusion import diffusion
-from .dual import certified
+from .data.loads import Certain, Segments
+from .dual import Dual, solved
 from .errors import InputError
-from .estimate.certificate import Certificate, Made
-from .estimate.force import Interval, against, extended, square
-from .fem.cells import Cells, measures, sum_rows
-from .fem.conditions import Condition, Contact, Dirichlet, Robin, facets_of
+from .estimate.certificate import Certificate, Made, certify
+from .estimate.force import Certified, Interval, against, extended, square
+from .estimate.pairing import Pairing, in_cells, on_side
+from .estimate.weights import scalar
+from .fem.cells import Cells
+from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Material, Problem
 from .fem.space import function_space, shared_sum
 from .mesh.domain import Domain
-from .solution import Solution
 
-NO_MEAN = "the mean has no bounds"
+NO_MEAN = "u has no bounds there"
+NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral with u has bounds"
 AFLOAT = "nothing but contact holds a part of the domain, and no energy tells how high it is"
 ROUNDING = 1e-14
-"""What rounding may do to a mean, in parts of the mean of |u|."""
+"""What rounding may do to an integral, in parts of that of |ψ u|."""
 
 
-def mean(solution: Solution, where: str | None = None) -> Interval:
+def mean(solution: Certified, where: str | None = None, weight: Data | None = None) -> Interval:
     """Bound the mean of u; collective.
-
-    It is that of the companion, corrected by what a linear problem with the mean for its load says
-    of the difference, up to products of two errors and to what Γ1 leaves unknown. That takes
-    up to twice as long as mesh and solve have taken.
 
     Args:
         solution: One with a certified bound.
         where: Name of a part of the boundary on which u is not set, or else of a material; None for
             all of the domain.
+        weight: ψ, for the weighted mean ∫ ψ u / ∫ ψ; None for 1.
 
     Raises:
         InputError: There is no such place, or there is no bound; the message says why.
     """
+    known, found = _bounded(solution, where, weight)
+    if weight is None:
+        return Interval(*(each / known.total for each in found))
+    low, high = known.total - known.missed, known.total + known.missed
+    if low <= 0.0 <= high:
+        raise InputError(f"{NO_MEAN}: {NO_WEIGHT}")
+    ends = [each / total for each in found[1:] for total in (low, high)]
+    return Interval(found.value / known.total, min(ends), max(ends))
+
+
+def integral(solution: Certified, where: str | None = None, weight: Data | None = None) -> Interval:
+    """Bound ∫ ψ u; collective.
+
+    It is that of the companion, corrected by what a linear problem with ψ for its load says of the
+    difference, up to products of two errors and to what Γ1 leaves unknown. That takes up to twice
+    as long as mesh and solve have taken.
+
+    Args:
+        solution: One with a certified bound.
+        where: Name of a part of the boundary on which u is not set, or else of a material; None for
+            all of the domain.
+        weight: ψ, of either sign; None for 1.
+
+    Raises:
+        InputError: There is no such place, or there is no bound; the message says why.
+    """
+    return _bounded(solution, where, weight)[1]
+
+
+def _bounded(
+    solution: Certified, where: str | None, weight: Data | None
+) -> tuple[Pairing, Interval]:
+    """What is known of ψ, and ∫ ψ u between two numbers; collective."""
     certificate, level = solution.certificate, solution.level
     forms = diffusion(level.data).forms
     _insist_on_place(forms, level.domain, where)
@@ -50,21 +82,23 @@ def mean(solution: Solution, where: str | None = None) -> Interval:
     if made.on_contact_alone:
         raise InputError(f"{NO_MEAN}: {AFLOAT}")
     cells = made.cells()
-    size, *integrals = map(float, cells.total(*_integrals(made, cells, solution.u.x.array, where)))
-    if not size > 0.0:
-        raise InputError(f"{NO_MEAN}: {where!r} has no extent")
-    value, middle, lift, scale = (integral / size for integral in integrals)
-    dual = certified(_dual(forms, where), level)
-    if dual.energy is None:
-        raise InputError(f"{NO_MEAN}: {dual.reason}")
+    _insist_on_extent(cells, where)
+    z = solved(_dual(forms, where, 1.0 if weight is None else scalar(weight, forms)), level)
+    dual = certify(z, sweeps=0)
+    if dual.energy is None or dual.bound_companion is None:
+        z.level.tidy()
+        _insist_on_weight(dual.reason)
+    assert dual.energy is not None and dual.bound_companion is not None
+    known = _paired(z, made, cells, where, bound * dual.bound_companion)
+    z.level.tidy()
     # with the energy norm, that of the functional is the dual solution's, its square −2 J(z)
     norm = np.sqrt(max(-2.0 * dual.energy[0], 0.0))
-    known = [(0.0, float(norm * bound)), *_corrected(made, cells, bound, dual)]
-    loose = lift + ROUNDING * scale
-    return Interval(
-        value,
-        middle + max(shift - reach for shift, reach in known) / size - loose,
-        middle + min(shift + reach for shift, reach in known) / size + loose,
+    shifts = [(0.0, float(norm * bound)), *_corrected(made, cells, bound, dual)]
+    loose = known.unsure + ROUNDING * known.scale
+    return known, Interval(
+        known.of_u,
+        known.of_v + max(shift - reach for shift, reach in shifts) - loose,
+        known.of_v + min(shift + reach for shift, reach in shifts) + loose,
     )
 
 
@@ -80,33 +114,81 @@ def _insist_on_place(forms: Forms, domain: Domain, where: str | None) -> None:
         raise InputError(f"{where!r} is no part of the boundary and no material; there are {there}")
 
 
-def _dual(forms: Forms, where: str | None) -> Problem:
-    """The problem whose solution z has a(z, e) = ∫ e over the place, for all e that vanish on Γ0.
+def _insist_on_extent(cells: Cells, where: str | None) -> None:
+    """Refuse places that are empty; collective."""
+    domain = cells.domain
+    if where is None:
+        return
+    if where in domain.parts:
+        found: int = len(cells.sides[domain.parts[where]].cells)
+    else:
+        found = int(np.sum(domain.materials.where(where)[: cells.number]))
+    if not cells.comm.allreduce(found):
+        raise InputError(f"{NO_MEAN}: {where!r} has no extent")
 
-    On Γ1 e is free. As z ≥ 0 anyway, for f, g ≥ 0, an obstacle 0 there changes nothing, and what
-    assembles and certifies is made for one.
+
+def _dual(forms: Forms, where: str | None, weight: Data) -> Problem:
+    """The linear problem whose solution z has a(z, e) = ∫ ψ e for all e that vanish on Γ0.
+
+    On Γ1 e is free, and so is z.
     """
     problem = forms.problem
     conditions: dict[str, Condition] = {}
     for each in forms.conditions:
-        g, b = float(each.part == where), 0.0 if each.loss is None else each.loss
         if each.fixed is not None:
             conditions[each.part] = Dirichlet(0.0)
-        elif each.bounds:
-            conditions[each.part] = Contact(0.0, coefficient=b, g=g)
         else:
+            g, b = weight if each.part == where else 0.0, 0.0 if each.loss is None else each.loss
             conditions[each.part] = Robin(g, coefficient=b)
     materials = {name: replace(each, f=None) for name, each in problem.materials.items()}
     if where is not None and where not in conditions:
-        materials[where] = replace(materials.get(where, Material()), f=1.0)
+        materials[where] = replace(materials.get(where, Material()), f=weight)
     return Problem(
-        f=float(where is None),
+        f=weight if where is None else 0.0,
         coefficient=problem.coefficient,
         reaction=problem.reaction,
         conditions=conditions,
         materials=materials,
         quadrature_degree=problem.quadrature_degree,
     )
+
+
+def _paired(z: Dual, made: Made, cells: Cells, where: str | None, width: float) -> Pairing:
+    """Enclose ψ, and integrate it against v; collective.
+
+    Args:
+        z: Whose load is ψ.
+        made: v.
+        cells: The mesh.
+        where: The place.
+        width: Of the interval, to which what is missed should be small.
+    """
+    data, domain, low = diffusion(z.level.data), cells.domain, made.kappa
+    largest = max(cells.comm.allgather(float(np.abs(made.vertices).max(initial=1e-300))))
+    weakest = min(cells.comm.allgather(float(np.min(low, initial=np.inf))))
+    size = width / (largest * np.sqrt(weakest))
+    if where in domain.parts:
+        (edge,) = (
+            moments
+            for condition, moments in zip(data.forms.natural, data.edges, strict=True)
+            if condition.part == where
+        )
+        segments = Segments.of(edge, cells, low, size)
+        _insist_on_weight(segments.reason)
+        return on_side(made, cells, segments).over_ranks(cells)
+    certain = Certain.of(data.compiled.f, data.of_f, cells, low, size)
+    _insist_on_weight(certain.reason)
+    there = np.ones(cells.number)
+    if where is not None:
+        there[:] = domain.materials.where(where)[: cells.number]
+    return in_cells(made, cells, certain, there).over_ranks(cells)
+
+
+def _insist_on_weight(reason: str | None) -> None:
+    """Refuse a weight of which too little is known, or whatever else there is a reason for."""
+    if reason is not None:
+        load = reason.startswith(("f ", "g "))  # which ψ is of the dual problem
+        raise InputError(f"{NO_MEAN}: {f'the weight{reason[1:]}' if load else reason}")
 
 
 def _corrected(
@@ -142,41 +224,3 @@ def _corrected(
     )
     reach = made.loose * np.sqrt(size) + made.reach * np.sqrt(of_phi)
     return [(float(-work - 0.5 * other), float(reach + dual.bound_companion * bound))]
-
-
-def _integrals(made: Made, cells: Cells, u: FloatArray, where: str | None) -> tuple[float, ...]:
-    """This rank's shares of the extent, and of the integrals of u_h, v, a bound of |ℓ|, and |v|.
-
-    Bumps have the means ⅓ on cells and ⅔ on facets, cubics 0; cusps vanish on the boundary, and ℓ
-    on facets of other parts than Γ0 and Γ1.
-    """
-    d, domain, (lifted, _, areas, edges) = cells.tdim, cells.domain, made.lift
-    bumps = made.bumps if d == 2 else np.zeros(len(u))
-    part = None if where is None else domain.parts.get(where)
-    if part is not None:
-        side = cells.sides[part]
-        extent = measures(cells, side)
-        at_ends = made.vertices[side.ends]
-        v = at_ends.mean(axis=0) + 2 / 3 * bumps[side.dofs]
-        scale = np.abs(at_ends).max(axis=0, initial=0.0) + np.abs(bumps[side.dofs])
-        own = np.zeros(len(u))
-        np.add.at(own, made.bounded, edges)
-        lift = np.sqrt(extent) @ own[side.dofs]
-        of_u = u[side.dofs]
-    else:
-        there = np.ones(cells.number) if where is None else domain.materials.where(where)
-        extent = cells.volume * there[: cells.number]
-        at_ends, height = made.vertices[cells.vertices], bumps[cells.facets]
-        v = at_ends.mean(axis=0) + sum_rows(height) / 3
-        if made.cusps is not None:
-            v[made.cusps.at] += made.cusps.means
-        scale = np.abs(at_ends).max(axis=0) + np.abs(height).max(axis=0)
-        lift = np.sqrt(extent[lifted]) @ areas
-        of_u = u[cells.facets].mean(axis=0)
-    return (
-        float(extent.sum()),
-        float(extent @ of_u),
-        float(extent @ v),
-        float(lift),
-        float(extent @ scale),
-    )

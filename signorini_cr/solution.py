@@ -12,8 +12,11 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
+from . import force, means
 from .estimate.certificate import Certificate
+from .estimate.force import Interval
 from .fem import fields
+from .fem.conditions import Data
 from .fem.problem import Problem
 from .mesh.domain import Domain
 from .rounding import at_most
@@ -112,6 +115,48 @@ class Solution:
             with self._estimating():
                 certificate: Certificate = self.level.physics.certify(self)
                 return certificate
+        finally:
+            self.level.tidy()
+
+    def force_bounds(self) -> tuple[float, float]:
+        """Two numbers with the contact force of u itself between them; collective.
+
+        See :func:`signorini_cr.force.force_bounds`.
+        """
+        with self._quantity():
+            return force.force_bounds(self)
+
+    def flux(self, *parts: str, weight: Data | None = None) -> Interval:
+        """What flows into Ω through Dirichlet or contact parts, as an interval; collective.
+
+        See :func:`signorini_cr.force.flux`.
+        """
+        with self._quantity():
+            return force.flux(self, *parts, weight=weight)
+
+    def mean(self, where: str | None = None, weight: Data | None = None) -> Interval:
+        """The mean of u over a part, a material or all of Ω, as an interval; collective.
+
+        See :func:`signorini_cr.means.mean`.
+        """
+        with self._quantity():
+            return means.mean(self, where, weight)
+
+    def integral(self, where: str | None = None, weight: Data | None = None) -> Interval:
+        """∫ ψ u over a part, a material or all of Ω, as an interval; collective.
+
+        See :func:`signorini_cr.means.integral`.
+        """
+        with self._quantity():
+            return means.integral(self, where, weight)
+
+    @contextmanager
+    def _quantity(self) -> Iterator[None]:
+        """Have the certificate that a quantity needs, and make room after it."""
+        _ = self.certificate
+        try:
+            with self._estimating():
+                yield
         finally:
             self.level.tidy()
 

@@ -43,6 +43,21 @@ def test_fluxes_beside_a_loss_of_heat():
     assert (orders(found) > 1.5).all() and (np.diff(orders(found)) > 0.0).all()
 
 
+def test_u_is_set_all_round():
+    """No part has a natural condition; what flows in is what f brings out. h^4/3 at the corners."""
+    hole = Polygon([[1, 1], [2, 1], [2, 2], [1, 2]], ("in",) * 4, names=("in",))
+    around = [[0, 0], [3, 0], [3, 3], [0, 3]]
+    polygon = Polygon(around, ("out",) * 4, holes=(hole,), names=("out", "in"))
+    conditions = {"out": Dirichlet(0.0), "in": Dirichlet(1.0)}
+    found = []
+    problem = Problem(f=1.0, conditions=conditions)
+    for solution in solve_levels(problem, polygon.mesh(0.5, MPI.COMM_WORLD), 3):
+        inner, outer = (force.flux(solution, part) for part in ("in", "out"))
+        assert inner.lower + outer.lower <= -8.0 <= inner.upper + outer.upper
+        found.append(inner.upper - inner.lower)
+    assert (orders(np.array(found)) > 1.25).all()
+
+
 def test_a_linear_flux_is_known_to_rounding():
     """u is affine."""
     conditions = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0), "left": Neumann()}

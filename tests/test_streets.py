@@ -40,6 +40,7 @@ FLOORS = (
         "dual",
         "force",
         "means",
+        "quantities",
         "adaptive",
         "evolution",
     ),

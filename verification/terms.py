@@ -10,7 +10,7 @@ All integrals are of smooth functions on triangles and between those zeros, by G
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -34,7 +34,6 @@ from signorini_cr import (
     Solution,
     families,
     force,
-    means,
     solve_adaptive,
     solve_levels,
 )
@@ -225,8 +224,7 @@ class Case:
             if side.kind == "contact":
                 cuts = np.unique([*cuts, *zeros[(zeros > 0) & (zeros < 1)]])
             t, weights = _gauss(cuts)
-            ends = [np.zeros_like(t), np.ones_like(t)]
-            x, y = ((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]
+            x, y = edge(i, t)
             u, g = self.u(x, y), self.known(i, x, y)
             if side.kind == "contact":
                 g = g - side.pressure(amplitude * np.sin(frequency * t + phase))
@@ -496,16 +494,21 @@ def smooth(c: float, b: float, bounds: str | None = None) -> Case:
     return case
 
 
-def exact_flux(case: Case, i: int) -> float:
-    """∫ λ on a contact edge, ∫ κ∂ₙu on another, by so many points that kinks do not count."""
+def edge(i: int, t: Any) -> tuple[Any, Any]:
+    """Points of an edge, t from 0 to 1."""
+    ends = [np.zeros_like(t), np.ones_like(t)]
+    return ((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]
+
+
+def exact_flux(case: Case, i: int, weight: Callable[[Any], Any] = np.ones_like) -> float:
+    """∫ λ w on a contact edge, ∫ κ∂ₙu w on another, so finely that kinks do not count."""
     side = case.sides[i]
     amplitude, frequency, phase = side.wave
     t, weights = _gauss(np.linspace(0.0, 1.0, 4001))
+    weights = weights * weight(t)
     if side.kind == "contact":
         return float(weights @ side.pressure(amplitude * np.sin(frequency * t + phase)))
-    ends = [np.zeros_like(t), np.ones_like(t)]
-    x, y = ((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]
-    return float(weights @ case.through(i, x, y))
+    return float(weights @ case.through(i, *edge(i, t)))
 
 
 def apart(rng: np.random.Generator) -> Case:
@@ -543,6 +546,11 @@ TENSORS = "the same with κ a tensor, its eigenvalues up to 1 : 10⁴, in two fi
 
 ALONE = "contact alone holds u, on one to four edges"
 ONE_HOLDS = "a reaction in one half, up to 1e8, and no Γ0"
+FLUXES = "Forces and fluxes of parts, c and b up to 1e8, contact anywhere"
+SETTLED = "Forces and fluxes of parts, c and b up to 1e8, contact everywhere or nowhere"
+WEIGHTED = "The same with weights of either sign, also where contact and Dirichlet parts meet"
+MEANS = "Means of parts and of the domain"
+INTEGRALS = "Integrals and means with weights, of parts, materials and the domain"
 LAYERS = "the same with κ, up to 1 : 10⁴, and c, up to 1e8 or 0, of their own left and right"
 
 
@@ -561,70 +569,141 @@ def _drawn(seed: int, number: int, kind: type[Case], name: str) -> Row:
     return tally.row(name, REFERENCE)
 
 
-def _fluxes(seed: int, number: int, drawn: Callable[[np.random.Generator], Case], name: str) -> Row:
+Found = Iterator[tuple[str, force.Interval, float]]
+"""What was asked for, its interval and the exact number."""
+
+
+def _intervals(
+    name: str,
+    seed: int,
+    number: int,
+    row: int,
+    draw: Callable[[np.random.Generator], Case],
+    found: Callable[[Case, Solution, np.random.Generator], Found],
+) -> Row:
+    """Tell whether the exact numbers of some cases are in their intervals."""
     count, none, misses = 0, 0, []
     for k in range(number):
-        rng = np.random.default_rng((seed, k, 78))
-        case = drawn(rng)
+        rng = np.random.default_rng((seed, k, row))
+        case = draw(rng)
         try:
-            solution = solved(case, rng)
-            found = {i: force.flux(solution, SIDES[i]) for i in (0, 2)}
+            intervals = list(found(case, solved(case, rng), rng))
         except (InputError, NotConverged):  # the same on all ranks
             none += 1
             continue
-        for i, interval in found.items():
+        for what, interval, exact in intervals:
             count += 1
-            exact = exact_flux(case, i)
             slack = NEARLY * max(abs(exact), abs(interval.value))
             if not interval.lower - slack <= exact <= interval.upper + slack:
-                misses.append(f"case {k} of seed {seed}: {exact:g} is not in {interval}")
+                misses.append(f"case {k} of seed {seed}, {what}: {exact:g} is not in {interval}")
         if k % 10 == 9:
             gc.collect()
     if none > MISSING * number:
         misses.append(f"{none} cases have no intervals")
     measured = f"{len(misses)} intervals that miss; {none} of {number} cases without any"
-    return Row(
-        f"Forces and fluxes of parts, c and b up to 1e8, {name}",
-        count,
-        measured,
-        REFERENCE,
-        misses,
-    )
+    return Row(name, count, measured, REFERENCE, misses)
 
 
-def exact_mean(case: Case, i: int | None) -> float:
-    """The mean of u over an edge, or over the square."""
+def _fluxes(case: Case, solution: Solution, rng: np.random.Generator) -> Found:
+    for i in (0, 2):
+        yield SIDES[i], solution.flux(SIDES[i]), exact_flux(case, i)
+
+
+def mixed(rng: np.random.Generator) -> Case:
+    """A case of any kind, with κ constant on each cell."""
+    kind = (Case, Layered, Anisotropic)[rng.integers(3)]
+    case = kind(rng)
+    if isinstance(case, Anisotropic):
+        case.moved = np.zeros((2, 2))
+    return case
+
+
+@dataclass(frozen=True)
+class Weight:
+    """A wave of either sign, perhaps 0 where its first coordinate is 0 or 1.
+
+    Attributes:
+        wave: Its frequencies and phase.
+        base: What is added.
+        zeros: Whether it is 0 at 0, and at 1.
+    """
+
+    wave: tuple[float, ...]
+    base: float
+    zeros: tuple[bool, bool] = (False, False)
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, *zeros: bool) -> Weight:
+        """By chance."""
+        wave, base = tuple(map(float, rng.uniform(-4, 4, 3))), float(rng.uniform(-0.8, 0.8))
+        return cls(wave, base, zeros or (False, False))  # type: ignore[arg-type]
+
+    def __call__(self, x: Any, y: Any = 0.0, sin: Any = np.sin) -> Any:
+        """Its values."""
+        p, q, shift = self.wave
+        rise = (x if self.zeros[0] else 1.0) * (1.0 - x if self.zeros[1] else 1.0)
+        return rise * (sin(p * x + q * y + shift) + self.base)
+
+    def along(self, axis: int) -> Callable[[Any], Any]:
+        """For UFL, as a function of one coordinate."""
+        return lambda x: self(x[axis], 0.0, ufl.sin)
+
+    def plane(self, x: Any) -> Any:
+        """For UFL, as a function of both."""
+        return self(x[0], x[1], ufl.sin)
+
+
+def _weighted_fluxes(case: Case, solution: Solution, rng: np.random.Generator) -> Found:
+    """Each with a weight that is 0 at the ends at which another such part begins."""
+    held = [side.kind in ("contact", "dirichlet") for side in case.sides]
+    for i, name in enumerate(SIDES):
+        if held[i]:
+            weight = Weight.drawn(rng, held[(3, 0, 3, 0)[i]], held[(1, 2, 1, 2)[i]])
+            interval = solution.flux(name, weight=weight.along(i % 2))
+            yield name, interval, exact_flux(case, i, weight)
+
+
+Function = Callable[[Any, Any], Any]
+
+
+def exact_integral(place: int | str | None, *factors: Function) -> float:
+    """The integral of a product over an edge, the right half or the square."""
     t, weights = _gauss(np.linspace(0.0, 1.0, 9))
-    if i is None:
-        return float(weights @ case.u(*np.meshgrid(t, t)) @ weights)
-    ends = [np.zeros_like(t), np.ones_like(t)]
-    return float(weights @ case.u(*((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]))
+
+    def together(x: Any, y: Any) -> Any:
+        return np.prod([factor(x, y) + 0.0 * x for factor in factors], axis=0)
+
+    if isinstance(place, int):
+        return float(weights @ together(*edge(place, t)))
+    width = 0.5 if place == "east" else 1.0
+    return width * float(weights @ together(*np.meshgrid(1.0 - width * (1.0 - t), t)) @ weights)
 
 
-def _means(seed: int, number: int) -> Row:
-    count, none, misses = 0, 0, []
-    for k in range(number):
-        rng = np.random.default_rng((seed, k, 79))
-        case = Case(rng)
-        places = [None, *(i for i, side in enumerate(case.sides) if side.kind != "dirichlet")]
-        try:
-            solution = solved(case, rng)
-            found = {i: means.mean(solution, None if i is None else SIDES[i]) for i in places}
-        except (InputError, NotConverged):  # the same on all ranks
-            none += 1
-            continue
-        for i, interval in found.items():
-            count += 1
-            exact = exact_mean(case, i)
-            slack = NEARLY * max(abs(exact), abs(interval.value))
-            if not interval.lower - slack <= exact <= interval.upper + slack:
-                misses.append(f"case {k} of seed {seed}: {exact:g} is not in {interval}")
-        if k % 10 == 9:
-            gc.collect()
-    if none > MISSING * number:
-        misses.append(f"{none} cases have no intervals")
-    measured = f"{len(misses)} intervals that miss; {none} of {number} cases without any"
-    return Row("Means of parts and of the domain", count, measured, REFERENCE, misses)
+def _places(case: Case) -> list[int | str | None]:
+    loose = [i for i, side in enumerate(case.sides) if side.kind != "dirichlet"]
+    return [None, *(["east"] if isinstance(case, Layered) else []), *loose]
+
+
+def _named(place: int | str | None) -> str | None:
+    return SIDES[place] if isinstance(place, int) else place
+
+
+def _means(case: Case, solution: Solution, rng: np.random.Generator) -> Found:
+    for place in _places(case):
+        exact = exact_integral(place, case.u) / exact_integral(place, lambda x, y: 1.0)
+        yield str(place), solution.mean(_named(place)), exact
+
+
+def _integrals(case: Case, solution: Solution, rng: np.random.Generator) -> Found:
+    """Means with what is above 0."""
+    for place in _places(case):
+        weight = Weight.drawn(rng)
+        found = solution.integral(_named(place), weight.plane)
+        yield f"integral over {place}", found, exact_integral(place, case.u, weight)
+        weight = replace(weight, base=1.5)
+        found = solution.mean(_named(place), weight.plane)
+        exact = exact_integral(place, case.u, weight) / exact_integral(place, weight)
+        yield f"mean over {place}", found, exact
 
 
 def _smooth(levels: int, bounds: str | None) -> Row:
@@ -664,8 +743,8 @@ def terms(seed: int, quick: bool) -> Group:
         "Reaction, loss of heat, several parts",
         "−∇·(κ∇u) + c u = f on the unit square, each edge a part of its own: Dirichlet, Neumann, "
         "Robin, or contact from below, from above or both, with a flux or a loss of heat of its "
-        "own. Passed: no bound below the error in either norm, J(u) and what flows through the "
-        f"parts inside their intervals, at most {MISSING:.0%} without bounds.",
+        "own. Passed: no bound below the error in either norm, J(u), what flows through the parts "
+        f"and integrals of u inside their intervals, at most {MISSING:.0%} without bounds.",
         [
             told(_drawn(seed, 4 if quick else 500, Case, DRAWN)),
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
@@ -676,8 +755,10 @@ def terms(seed: int, quick: bool) -> Group:
                 told(_smooth(1 if quick else 4, bounds))
                 for bounds in (None, "lower", "upper", "both")
             ),
-            told(_fluxes(seed, 2 if quick else 100, apart, "contact anywhere")),
-            told(_fluxes(seed, 2 if quick else 100, settled, "contact everywhere or nowhere")),
-            told(_means(seed, 1 if quick else 50)),
+            told(_intervals(FLUXES, seed, 2 if quick else 100, 78, apart, _fluxes)),
+            told(_intervals(SETTLED, seed, 2 if quick else 100, 78, settled, _fluxes)),
+            told(_intervals(WEIGHTED, seed, 2 if quick else 50, 80, mixed, _weighted_fluxes)),
+            told(_intervals(MEANS, seed, 1 if quick else 50, 79, Case, _means)),
+            told(_intervals(INTEGRALS, seed, 1 if quick else 50, 81, mixed, _integrals)),
         ],
     )

@@ -369,7 +369,7 @@ def _solve_steps(
             last = [solution, *last[:back]]
             if len(records) == done > 0 and len(last) == 1:  # the one that it goes on from
                 continue
-            tell(series.step_record(len(records) + 1, time, solution))
+            tell(series.step_record(len(records) + 1, time, solution, case.quantities))
             chosen = len(records) in strip.chosen(case.time.steps)
             if chosen:
                 moments.append(strip.moment(time, solution))
@@ -384,7 +384,7 @@ def _solve_steps(
         if len(kept) < len(records):
             _keep(keep, kept, records[len(kept) :])
         screen.progress("writing")
-        finest = output.level_record(last[0], None, case.quantities)
+        finest = output.level_record(last[0]) | {"quantities": records[-1]["quantities"]}
         with naming("--out"):
             whole = report([finest], failure is None)
             names = output.write_output(folder, whole, last[0], resumable=True, moments=moments)
@@ -394,7 +394,8 @@ def _solve_steps(
         screen.text(series.legend(case.units))
         screen.line("")
         screen.text(f"at the end {facts(finest, case.units)}")
-        screen.text(series.certified(records))
+        for sentence in (series.certified(records), *series.over_time(records, case.units)):
+            screen.text(sentence)
         screen.text(f"the last step's own problem, {certified(finest, case.units)}")
         screen.text(series.times(records))
         screen.text(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,14 @@ from ..mesh.domain import Domain
 from .expressions import Expression
 from .reference import EXPRESSIONS
 
+Weights = Mapping[str, str | None]
+"""Where weights are used: the part or material by key, None for all of the domain."""
 
-def _used_on(key: str, domain: Domain) -> int | None:
+
+def _used_on(key: str, domain: Domain, weights: Weights) -> int | None:
     """The part of the boundary that an expression is used on, or None for the domain."""
+    if key in weights:
+        return domain.parts.get(weights[key] or "")
     section, name, *_ = key.split(".", 2)
     if section == "boundary":
         return domain.parts[name]
@@ -25,17 +31,18 @@ def _used_on(key: str, domain: Domain) -> int | None:
     return domain.parts[told.used_on] if told is not None and told.used_on else None
 
 
-def _used_in(key: str, expressions: Collection[str], domain: Domain) -> BoolArray:
+def _used_in(key: str, expressions: Collection[str], domain: Domain, weights: Weights) -> BoolArray:
     """The local cells in which a datum that is used on no part of the boundary is used."""
     section, name, *_ = bare(key).split(".", 2)
     bared = {bare(each) for each in expressions}
     tdim, materials = domain.mesh.topology.dim, domain.materials
     used = np.ones(domain.mesh.topology.index_map(tdim).size_local, dtype=bool)
-    if section == "material":
-        return materials.where(name)[: len(used)]
-    for material in materials.numbers:
-        if section == "data" and f"material.{material}.{name}" in bared:
-            used &= ~materials.where(material)[: len(used)]
+    material = name if section == "material" else weights.get(key)
+    if material is not None:
+        return materials.where(material)[: len(used)]
+    for other in materials.numbers:
+        if section == "data" and f"material.{other}.{name}" in bared:
+            used &= ~materials.where(other)[: len(used)]
     return used
 
 
@@ -49,13 +56,18 @@ def is_kappa(key: str) -> bool:
     return key.endswith(".coefficient") and not key.startswith("boundary.")
 
 
-def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
+def check_values(
+    expressions: Mapping[str, Expression],
+    domain: Domain,
+    weights: Weights = MappingProxyType({}),
+) -> None:
     """Insist on finite data, and on a positive coefficient; collective.
 
     Args:
         expressions: The data by key, ``data.f`` … ``exact.u``.
         domain: They are evaluated at vertices and midpoints of its cells or, where they belong to
             a part of the boundary, of that part's facets.
+        weights: Where those that are weights are used.
 
     Raises:
         InputError: The message names the key and the first such point from the left.
@@ -65,8 +77,8 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
     digits = 11 - math.ceil(math.log10(size))
     bad: tuple[Any, ...] = (math.inf,)
     for number, (key, expression) in enumerate(expressions.items()):
-        part = _used_on(key, domain)
-        which = _used_in(key, expressions, domain) if part is None else domain.facets(part)
+        part = _used_on(key, domain, weights)
+        which = _used_in(key, expressions, domain, weights) if part is None else domain.facets(part)
         points = _points(domain, domain.mesh.topology.dim - (part is not None), which, digits)
         values = expression.numpy(points)
         wrong = ~np.isfinite(values)
@@ -88,7 +100,10 @@ def check_values(expressions: Mapping[str, Expression], domain: Domain) -> None:
         what = "above 0" if is_kappa(key) else "0 or more"
         there = "there" if key.startswith("material.") else "everywhere"
         raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} {there}")
-    part, named = _used_on(key, domain), {value: name for name, value in domain.parts.items()}
+    part, named = (
+        _used_on(key, domain, weights),
+        {value: name for name, value in domain.parts.items()},
+    )
     where = "in the domain" if part is None else f"on the {named[part]} part"
     raise InputError(
         f"{message}; it must be finite everywhere {where}"

@@ -30,6 +30,7 @@ from ..levels import check_pieces, solve_levels
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
+from ..quantities import Quantity
 from ..solution import Solution
 from .datacheck import bare, check_values, is_kappa
 from .expressions import Expression, check_name, parse
@@ -58,6 +59,7 @@ from .reference import (
     MATERIAL,
     PART,
     QUANTITIES,
+    QUANTITY,
     SECTIONS,
     TYPES,
     allowed,
@@ -128,8 +130,7 @@ class ProblemFile:
         mode: "uniform" or "adaptive".
         levels: Number of meshes, the coarsest included.
         adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
-        quantities: The kind of each quantity that is asked for, "force", "flux" or "mean", and its
-            part of the boundary or its material, None for all of the domain, by name.
+        quantities: What is asked for in an interval, by name.
         time: What [time] says; None for a problem without time.
         units: What [units] and [names] say.
         said: All that levels depend on, by key, as it was written.
@@ -145,7 +146,7 @@ class ProblemFile:
     mode: str
     levels: int
     adaptive: Mapping[str, Any]
-    quantities: Mapping[str, tuple[str, str | None]]
+    quantities: Mapping[str, Quantity]
     time: Time | None
     units: Units
     said: Mapping[str, Any]
@@ -177,7 +178,8 @@ class ProblemFile:
         cells = topology.index_map(topology.dim).size_global
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
-        check_values(self.expressions, domain)
+        weights = {f"quantities.{name}.weight": q.place for name, q in self.quantities.items()}
+        check_values(self.expressions, domain, weights)
         forms = Diffusion(self.problem, domain.mesh, "CR", domain.parts, domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
@@ -261,7 +263,11 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         raise InputError("exact.u: this key is missing; an expression in x and y is needed")
     domain, size = _domain(sections["domain"], path.parent, tuple(parts), materials)
     clock = Clock() if "time" in table else None
+    quantities = _quantities(sections["quantities"], parts, materials)
     expressions = _expressions(sections, parts, materials, clock)
+    for name, quantity in quantities.items():
+        if (weight := expressions.get(f"quantities.{name}.weight")) is not None:
+            quantities[name] = quantity._replace(weight=_data(weight))
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
     adaptive = {name: get(refine, "refine", name, *how) for name, how in ADAPTIVE.items()}
@@ -284,7 +290,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         adaptive=adaptive,
         time=None if clock is None else _time(sections, expressions, mode, clock),
-        quantities=_quantities(sections["quantities"], parts, materials),
+        quantities=quantities,
         units=Units(**_words(sections, "units"), names=_words(sections, "names")),
         said={
             f"{name}.{key}": value
@@ -326,25 +332,28 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _quantities(
     table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], materials: Iterable[str]
-) -> dict[str, tuple[str, str | None]]:
-    """[quantities]: each a kind and a place of a type that goes with it."""
+) -> dict[str, Quantity]:
+    """[quantities]: each a kind and a place of a type that goes with it; yet without weights."""
     types = {name: name for name in PARTS} | {name: part["type"] for name, part in parts.items()}
-    found: dict[str, tuple[str, str | None]] = {}
+    found: dict[str, Quantity] = {}
     for name, value in table.items():
         key = f"quantities.{name}"
-        if not isinstance(value, dict) or len(value) != 1:
+        kinds = [kind for kind in QUANTITIES if isinstance(value, dict) and kind in value]
+        if isinstance(value, dict):
+            insist_known(value, key, allowed(QUANTITY))
+        if len(kinds) != 1:
             raise InputError(
-                f'{key}: {{ force = "PART" }}, {{ flux = "PART" }} or {{ mean = "PLACE" }} is'
-                f" needed, found {shown(value)}"
+                f'{key}: {{ force = "PART" }}, {{ flux = "PART" }}, {{ mean = "PLACE" }} or'
+                f' {{ integral = "PLACE" }}, perhaps with a weight, is needed, found {shown(value)}'
             )
-        insist_known(value, key, tuple(QUANTITIES))
-        ((kind, place),) = value.items()
+        (kind,) = kinds
         own = [each for each, what in types.items() if what in QUANTITIES[kind]]
-        if kind == "mean":
+        of_u = kind in ("mean", "integral")
+        if of_u:
             own += [*materials, DOMAIN]
-        read = one_of(own)(f"{key}.{kind}", place)
+        place = one_of(own)(f"{key}.{kind}", value[kind])
         # own ends with all of the domain, unless something else is called so
-        found[name] = kind, None if kind == "mean" and own.index(read) == len(own) - 1 else read
+        found[name] = Quantity(kind, None if of_u and own.index(place) == len(own) - 1 else place)
     return found
 
 
@@ -538,7 +547,7 @@ def _expressions(
     materials: Mapping[str, Mapping[str, Any]],
     clock: Clock | None,
 ) -> dict[str, Expression]:
-    """Read [define], [data], [boundary.NAME], [material.NAME], [exact] and `initial` of [time]."""
+    """Read [define] and what may be an expression in other sections."""
     names: dict[str, Expression] = {}
     define = sections["define"]
     if clock is not None:
@@ -555,6 +564,7 @@ def _expressions(
         **{f"boundary.{name}": (PART, table) for name, table in parts.items()},
         **{f"material.{name}": (MATERIAL, table) for name, table in materials.items()},
         "time": ("time", sections["time"]),
+        **{f"quantities.{name}": (QUANTITY, each) for name, each in sections["quantities"].items()},
     }
     given = {
         f"{section}.{key}": value

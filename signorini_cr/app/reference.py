@@ -56,6 +56,8 @@ PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
 MATERIAL = "material.NAME"
 """The sections of the materials."""
+QUANTITY = "quantities.NAME"
+"""What is wanted in an interval; on one line each, usually."""
 KINDS: dict[str, type[Condition]] = {
     kind.__name__.lower(): kind for kind in (Contact, Dirichlet, Neumann, Robin)
 }
@@ -67,8 +69,18 @@ QUANTITIES = {
     "force": ("contact",),
     "flux": ("dirichlet",),
     "mean": ("contact", "neumann", "robin"),
+    "integral": ("contact", "neumann", "robin"),
 }
-"""Kinds of quantities, and the types of the parts that each is of; means are of materials, too."""
+"""Kinds of quantities, and the types of the parts that each is of; the last two are of materials,
+too."""
+QUANTITIES_EXAMPLE = [
+    'push = { force = "floor" }',
+    'moment = { force = "floor", weight = "x" }',
+    'inflow = { flux = "top" }',
+    'mean_air = { mean = "air" }',
+    'stored = { integral = "domain", weight = "where(y < 0.5, 2, 1)" }',
+]
+"""What they look like."""
 DOMAIN = "domain"
 """All of the domain, where a quantity is of that."""
 
@@ -165,6 +177,18 @@ KEYS = (
         "backward difference of second order.", 'scheme = "bdf2"'),
     Key("time", "initial", EXPRESSION, "0", "u at the time 0.", 'initial = "8 - 2*y"'),
     Key("time", "capacity", "a number above 0", "1", "What multiplies ∂u/∂t.", "capacity = 2e6"),
+    Key(QUANTITY, "force", "a contact part", "", "The contact force ∫ λ on it.",
+        'force = "contact"'),
+    Key(QUANTITY, "flux", "a dirichlet part", "", "The flux ∫ κ∂ₙu through it, into the domain.",
+        'flux = "dirichlet"'),
+    Key(QUANTITY, "mean", "another part, a material, or domain", "", "The mean of u over it.",
+        'mean = "neumann"'),
+    Key(QUANTITY, "integral", "another part, a material, or domain", "", "The integral of u over "
+        "it.", 'integral = "domain"'),
+    Key(QUANTITY, "weight", EXPRESSION, "1", "w, of either sign, beside one of these: it makes "
+        "∫ w λ of the force, ∫ w κ∂ₙu of the flux, ∫ w u of the integral, and of the mean "
+        "∫ w u / ∫ w. For a force or a flux it is to be continuous on the part, and 0 where the "
+        "part touches other dirichlet or contact parts.", 'weight = "1 - x**2"'),
     Key("units", "x", WORD, "not told", "Of lengths, along both axes.", 'x = "m"'),
     Key("units", "u", WORD, "not told", "Of u.", 'u = "°C"'),
     Key("units", "time", WORD, "not told", "Of t.", 'time = "h"'),
@@ -199,10 +223,10 @@ ABOUT = {
     "units": "Optional. What is printed, written and drawn says them; nothing is converted, all "
     "data are to be in these units.",
     "names": "Optional. What stands in pictures beside x, y, u and the pressure.",
-    "quantities": "Optional. What is wanted in an interval that is sure to hold it, each under a "
-    "name of your own: the contact force ∫ λ on a contact part, or the flux ∫ κ∂ₙu into the domain "
-    "through a dirichlet part, both of which must not touch other dirichlet or contact parts; or "
-    f"the mean of u on another part, in a material, or with `{DOMAIN}` on all of the domain.",
+    QUANTITY: "Optional. What is wanted in an interval that is sure to hold it, each under a "
+    "name of your own: one of `force`, `flux`, `mean` and `integral`, and where it is wanted. A "
+    "part of a force or a flux must not touch other dirichlet or contact parts, where these have "
+    f"no bounds, unless a `weight` vanishes there; `{DOMAIN}` is all of the domain.",
 }
 """The sections, and what is said of each."""
 
@@ -233,23 +257,19 @@ def page() -> str:
         "",
     ]
     for section, about in ABOUT.items():
-        lines += [f"## [{section}]" if section else "## Title", "", about, ""]
+        title = "quantities" if section == QUANTITY else section
+        lines += [f"## [{title}]" if section else "## Title", "", about, ""]
         if section == "define":
             example = ["[define]", 'r = "sqrt(x**2 + y**2)"', 'w = "r**1.5*cos(1.5*atan2(y, x))"']
             lines += ["```toml", *example, "```", ""]
             continue
-        if section == "quantities":
-            example = [
-                'push = { force = "contact" }',
-                'inflow = { flux = "dirichlet" }',
-                'mean_air = { mean = "air" }',
-            ]
-            lines += ["```toml", "[quantities]", *example, "```", ""]
-            continue
         lines += ["| key | value | if left out | |", "|---|---|---|---|"]
         keys = [key for key in KEYS if key.section == section]
         lines += [f"| `{k.name}` | {k.value} | {k.default} | {k.about} |" for k in keys]
-        lines += ["", "```toml", *([f"[{section}]"] if section else [])]
+        lines += ["", "```toml", *([f"[{title}]"] if section else [])]
+        if section == QUANTITY:
+            lines += QUANTITIES_EXAMPLE
+            keys = []
         lines += [("# or: " if key.name == "mesh" else "") + key.example for key in keys]
         lines += ["```", ""]
     names = ", ".join(f"`{name}`" for name in FUNCTIONS)

@@ -36,7 +36,7 @@ from .sums import Sums, Totals
 
 if TYPE_CHECKING:
     from ..vi.level import Level
-    from ..vi.solved import Solved
+    from ..vi.solved import Found
 
 
 SHARES = ("flux", "companion", "contact", "load", "neumann", "boundary", "solver")
@@ -205,7 +205,7 @@ ADRIFT = (
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
-def certify(solution: Solved, sweeps: int = 2, flux_from: Solved | None = None) -> Certificate:
+def certify(solution: Found, sweeps: int = 2, flux_from: Found | None = None) -> Certificate:
     """Bound the error of a solution; collective.
 
     Args:
@@ -265,7 +265,7 @@ class _Known:
     carried: float
 
 
-def _equilibrated(solution: Solved, base: Solved) -> _Known:
+def _equilibrated(solution: Found, base: Found) -> _Known:
     """Make y from u_h, and enclose f, g and κ as finely as it calls for; collective.
 
     Raises:
@@ -322,7 +322,7 @@ def _equilibrated(solution: Solved, base: Solved) -> _Known:
     return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
 
 
-def _companion(solution: Solved, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
+def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
     """Make v, improve y where that promises much, and integrate the gap; collective."""
     cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     if solution.element != "CR":

@@ -16,7 +16,7 @@ from ..data.diffusion import diffusion
 from ..data.loads import reacts, trace_of
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
-from ..fem.conditions import Condition, facets_of
+from ..fem.conditions import Condition, Data, facets_of
 from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
 from ..jit import compiled
@@ -24,6 +24,7 @@ from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
 from .gap import apart
+from .weights import Beyond, Weight
 
 NO_BOUNDS = "the contact force has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
@@ -65,30 +66,45 @@ def made_of(solution: Certified) -> Made:
     return certificate._made
 
 
-def interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
-    """Bound ∫ λ over parts; collective.
+def interval(
+    solution: Certified, conditions: Sequence[Condition], weight: Data | None = None
+) -> Interval:
+    """Bound ∫ λ over parts, or ∫ λ ω with a weight ω; collective.
 
     With φ = 1 on them and φ = 0 on the rest of Γ0 and Γ1 it is a(u, φ) − χ(φ), and the certificate
     knows a ball that A u is in. φ is found by solving for nearly the least ‖Aφ‖, as accurately as
-    the figures deserve; that costs about as much as the solve.
+    the figures deserve; that costs about as much as the solve. With a weight ω it is φ + ℓ that is
+    ω on the parts, see `Weight`.
     """
     made = made_of(solution)
     if made.varies or made.level.domain.mesh.topology.dim != 2:
         raise InputError(f"{NO_BOUNDS}: {VARIES if made.varies else SPATIAL}")
     cells = made.cells()
-    phi = _weight(solution, conditions)
+    given = None if weight is None else Weight.of(made, cells, conditions, weight)
+    if given is None:
+        phi = _weight(solution, conditions)
+    else:
+        phi = extended(given.values, given.known, made)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     work, slack = against(made, cells, at)
-    force = sum(through(made, cells, condition) for condition in conditions)
-    value, middle, energy, more = cells.total(
-        force, force + 0.5 * work, square(made, cells, at), unsure(made, at, slack)
-    )
+    (energy,) = cells.total(square(made, cells, at))
+    if given is None:
+        beyond = Beyond(force=sum(through(made, cells, condition) for condition in conditions))
+    else:
+        beyond = given.beyond(made, cells, float(np.sqrt(energy)))
     at_fixed = any(condition.fixed is not None for condition in conditions)
     # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
     exits = at_fixed or made.on_contact_alone
-    reach = made.reach * np.sqrt(energy) + (more if exits else 0.0)
+    more = unsure(made, at, slack, beyond) if exits else 0.0
+    value, middle, lifted, more = cells.total(
+        beyond.force, beyond.force + 0.5 * work, beyond.square, beyond.unsure + more
+    )
+    # ℓ meets all of A(u − v), of which one half is known to be at most the radius
+    reach = made.reach * (np.sqrt(energy) + 2.0 * np.sqrt(lifted)) + more
     # a force off one bound only has its sign
     signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
+    if min(cells.comm.allgather(beyond.least)) < 0.0:
+        signs = set()
     lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
     lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
     return Interval(float(value), lower, upper)
@@ -102,16 +118,19 @@ def through(made: Made, cells: Cells, condition: Condition) -> float:
     return float(np.sum(made.through(cells)[side.local, side.cells]))
 
 
-def unsure(made: Made, at: FloatArray, slack: FloatArray) -> float:
-    """Bound what is left of −div y = f times φ where φ does not vanish on Γ0; this rank's share.
+def unsure(
+    made: Made, at: FloatArray, slack: FloatArray, beyond: Beyond = Beyond(force=0.0)
+) -> float:
+    """Bound what is left of −div y = f times φ + ℓ where it does not vanish on Γ0; rank's share.
 
     Args:
         made: What is left.
         at: φ of P1 at the cells' vertices, shape (3, cells).
         slack: From `against`.
+        beyond: ℓ.
     """
-    largest = np.abs(at).max(initial=0.0)
-    return float(np.sum(slack) + made.missed * largest)
+    largest = np.abs(at).max(initial=0.0) + beyond.mean
+    return float(np.sum(slack) + beyond.left + made.missed * largest)
 
 
 def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray]:

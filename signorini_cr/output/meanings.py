@@ -108,8 +108,9 @@ LEVEL = {
     "contact.force_bounds.lower": "∫_Γ1 λ is not below it.",
     "contact.force_bounds.upper": "∫_Γ1 λ is not above it.",
     "contact.force_bounds.reason": "Why the force has no bounds; null where it has.",
-    "quantities": "What [quantities] asks for, by name: its `kind`, `value`, that of u_h, `lower` "
-    "and `upper`, between which that of u is, and `reason` where these are null.",
+    "quantities": "What [quantities] asks for, by name: its `kind`, whether it is `weighted`, "
+    "`value`, that of u_h, `lower` and `upper`, between which that of u is, and `reason` where "
+    "these are null.",
     "error_h1": "‖∇_h(u − u_h)‖; null where u is not known.",
     "error_l2": "‖u − u_h‖; null where u is not known.",
     "rate_h1": "Of error_h1, against the level before. The printed column rate.",
@@ -159,6 +160,8 @@ STEP = {
     "energy": "J(u_h) of the step's own problem, in which the steps before are data.",
     "bound_h1": "Of that problem: ‖∇_h(u − u_h)‖ is not above it.",
     "bound_energy_norm": "The same of the energy norm.",
+    "quantities": "What [quantities] asks for, of the step's own problem: by name, what it is in "
+    "a level. Columns as quantities_heat_lower.",
     "seconds": "Wall time, bounds included.",
 }
 """The columns of times.csv."""

@@ -73,6 +73,7 @@ def run_page(
         known = [
             f"At the end {tables.facts(level, units)}",
             series.certified(steps),
+            *series.over_time(steps, units),
             f"the last step's own problem, {tables.certified(level, units)}",
         ]
     parts = [

@@ -27,8 +27,7 @@ from .. import __version__
 from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
 from ..estimate.force import NO_BOUNDS
-from ..force import flux, force_bounds
-from ..means import NO_MEAN, mean
+from ..means import NO_MEAN
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .strip import Moment, plot_strip
@@ -40,6 +39,7 @@ from .vtu import write_solution
 
 if TYPE_CHECKING:
     from ..mesh.domain import Domain
+    from ..quantities import Quantity
     from ..restart import Restart
     from ..solution import Solution
 
@@ -73,16 +73,15 @@ Record = dict[str, Any]
 def level_record(
     solution: Solution,
     previous: Mapping[str, Any] | None = None,
-    quantities: Mapping[str, tuple[str, str | None]] = MappingProxyType({}),
+    quantities: Mapping[str, Quantity] = MappingProxyType({}),
 ) -> Record:
     """The numbers of one level, as they stand in report.json.
 
     Args:
         solution: What was found on this mesh.
         previous: The record of the level before, for the rates.
-        quantities: The kind, "force", "flux" or "mean", and the part of the boundary or material,
-            None for all of the domain, of what is wanted in an interval, by name. Each takes about
-            as long as the solve, or twice as long for a mean.
+        quantities: What is wanted in an interval, by name. Each takes about as long as the solve,
+            or twice as long for a mean or an integral of u.
 
     Returns:
         Nothing but dict, list, str, int, float, bool and None; not-a-number and infinity
@@ -117,10 +116,7 @@ def level_record(
                 "transitions": contact.transitions[:, :gdim],
                 "force_bounds": _bounded(solution, None),
             },
-            "quantities": {
-                name: {"kind": what[0], **_bounded(solution, what)}
-                for name, what in quantities.items()
-            },
+            "quantities": bounded(solution, quantities),
             "error_h1": h1,
             "error_l2": l2,
             "rate_h1": _rate("error_h1", h1, solution, previous),
@@ -138,14 +134,20 @@ def level_record(
     )
 
 
-def _bounded(solution: Solution, what: tuple[str, str | None] | None) -> Record:
+def bounded(solution: Solution, quantities: Mapping[str, Quantity]) -> dict[str, Record]:
+    """What is wanted of a solution, as it stands in report.json; collective."""
+    return {
+        name: {"kind": what.kind, "weighted": what.weight is not None, **_bounded(solution, what)}
+        for name, what in quantities.items()
+    }
+
+
+def _bounded(solution: Solution, what: Quantity | None) -> Record:
     """A quantity, None for the contact force, or nothing, and why; collective."""
     try:
         if what is not None:
-            kind, place = what
-            known = mean(solution, place) if kind == "mean" else flux(solution, str(place))
-            return {**known._asdict(), "reason": None}
-        lower, upper = force_bounds(solution)
+            return {**what.of(solution)._asdict(), "reason": None}
+        lower, upper = solution.force_bounds()
         return {"lower": lower, "upper": upper, "reason": None}
     except InputError as error:
         value = {} if what is None else {"value": None}

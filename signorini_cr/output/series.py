@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
 from ..errors import on_root
-from ..rounding import at_most, known
+from ..rounding import at_most, interval, known
 from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
-from .report import FILES, plain, report_json
+from .report import FILES, bounded, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
-from .tables import Column, explained, levels_csv, rows_of
+from .tables import Column, explained, levels_csv, rows_of, unit_of
 from .units import GLUE, Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
+    from ..quantities import Quantity
     from ..restart import Restart
     from ..solution import Solution
 
@@ -41,9 +43,22 @@ MEASURED = {"time": "time", "contact": "x", "force": "force"}
 """The columns whose unit may be told."""
 
 
-def step_record(step: int, time: float, solution: Solution) -> dict[str, Any]:
-    """The numbers of a step, as they stand in report.json; collective."""
+def step_record(
+    step: int,
+    time: float,
+    solution: Solution,
+    quantities: Mapping[str, Quantity] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """The numbers of a step, as they stand in report.json; collective.
+
+    Args:
+        step: Its number, from 1.
+        time: Its end.
+        solution: Of its own problem, in which the steps before are data.
+        quantities: What is wanted of that in an interval, by name.
+    """
     contact, certificate = solution.contact, solution.certificate
+    asked = bounded(solution, quantities)
     return dict(
         plain(
             {
@@ -57,6 +72,7 @@ def step_record(step: int, time: float, solution: Solution) -> dict[str, Any]:
                 "energy": solution.energy,
                 "bound_h1": certificate.bound_h1,
                 "bound_energy_norm": certificate.bound_energy_norm,
+                "quantities": asked,
                 "seconds": sum(solution.seconds.values()),
             }
         )
@@ -92,6 +108,23 @@ def certified(records: Sequence[Mapping[str, Any]]) -> str:
         "certified: in no step is ‖∇_h(u − u_h)‖ of its own problem, in which the steps before"
         f" are data, above {at_most(max(bounds))}"
     )
+
+
+def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
+    """What is certain about each quantity in all steps, a sentence each."""
+    said = []
+    for name, last in records[-1]["quantities"].items():
+        found = [record["quantities"][name] for record in records]
+        reasons = [each["reason"] for each in found if each["reason"] is not None]
+        if reasons:
+            said.append(f"{name} has no bounds in {len(reasons)} steps: {reasons[0]}")
+            continue
+        lower, upper = min(each["lower"] for each in found), max(each["upper"] for each in found)
+        ends = interval(lower, upper).replace(" ", GLUE)
+        said.append(
+            f"certified: {name} of each step's own problem is in {ends}{unit_of(last, units)}"
+        )
+    return said
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:

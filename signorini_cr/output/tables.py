@@ -96,11 +96,19 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     wanted = {"the contact force": record["contact"]["force_bounds"], **record["quantities"]}
     for name, found in wanted.items():
         if found["reason"] is None:
-            unit = units.after("u" if found.get("kind") == "mean" else "force")
+            unit = unit_of(found, units)
             facts.append(f"{name} is in {_interval(found['lower'], found['upper'], unit)}")
         else:
             facts.append(f"{name} has no bounds: {found['reason']}")
     return "; ".join(facts)
+
+
+def unit_of(found: Mapping[str, Any], units: Units) -> str:
+    """The unit of a quantity, "" where it depends on a weight's or is not told."""
+    if found.get("kind") == "mean":
+        return units.after("u")
+    told = found.get("kind") != "integral" and not found.get("weighted")
+    return units.after("force") if told else ""
 
 
 def _interval(lower: float, upper: float, measured: str = "") -> str:

@@ -12,24 +12,29 @@ from .contact import Contact
 from .level import Level
 
 
-class Solved(Protocol):
-    """u_h on one mesh; the attributes are those of :class:`~signorini_cr.solution.Solution`."""
+class Found(Protocol):
+    """A discrete function and what it is to solve, which is all that a certificate asks for."""
 
     level: Level
     u: fem.Function
-    residual: fem.Function
-    contact: Contact
-    energy: float
-    seconds: dict[str, float]
 
     @property
     def domain(self) -> Domain:
         """Mesh and boundary parts."""
 
     @property
-    def problem(self) -> Problem:
-        """The data."""
-
-    @property
     def element(self) -> str:
         """The element's name."""
+
+
+class Solved(Found, Protocol):
+    """u_h on one mesh; the attributes are those of :class:`~signorini_cr.solution.Solution`."""
+
+    residual: fem.Function
+    contact: Contact
+    energy: float
+    seconds: dict[str, float]
+
+    @property
+    def problem(self) -> Problem:
+        """The data."""

@@ -215,14 +215,14 @@ class System:
         V = self._data.V
         topology = V.mesh.topology
         owned = topology.index_map(topology.dim - 1).size_local
-        facets = np.concatenate([each.facets for each in bounds])
-        dofs = np.concatenate(
-            [unknowns(V, each.facets, each.components)[:, :, 0] for each in bounds]
-        )
+        none, only = np.empty(0, dtype=np.int32), np.zeros(1, dtype=np.int32)
+        rows = [(none, only), *((each.facets, each.components) for each in bounds)]
+        facets = np.concatenate([each for each, _ in rows])
+        dofs = np.concatenate([unknowns(V, *row)[:, :, 0] for row in rows])
         # with bounds on both sides a facet is there twice
         self.bounded_facets, first = np.unique(facets[facets < owned], return_index=True)
         self.contact_dofs = dofs[facets < owned][first]
-        size = len(self.bounded_facets), bounds[0].ends.shape[1]
+        size = len(self.bounded_facets), topology.dim
         self.obstacles_at_vertices = np.stack([np.full(size, -np.inf), np.full(size, np.inf)])
         for each in bounds:
             own = each.facets < owned

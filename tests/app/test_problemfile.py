@@ -335,7 +335,11 @@ all = { mean = "domain" }
 """
     )
     case = read(text)
-    asked = {"side": ("mean", "neumann"), "low": ("mean", "low"), "all": ("mean", None)}
+    asked = {
+        "side": ("mean", "neumann", None),
+        "low": ("mean", "low", None),
+        "all": ("mean", None, None),
+    }
     assert case.quantities == asked
     *_, solution = solve_levels(case.problem, case.mesh(), 1)
     solution_record = level_record(solution, None, case.quantities)
@@ -346,7 +350,54 @@ all = { mean = "domain" }
     measured = Units(u="K", force="W")
     wanted = {"heat": {**found["low"], "kind": "flux"}, "low": found["low"]}
     bounds = {"contact": {"force_bounds": {"reason": "x"}}, "quantities": wanted}
-    told = certified(solution_record | bounds, measured).replace("\u00a0", " ")
-    assert re.search(r"heat is in \[[^]]*\] W, .*; low is in \[[^]]*\] K, ", told)
+    told = certified(solution_record | bounds, measured)
+    assert re.search(r"heat is in \[[^]]*\]\sW, .*; low is in \[[^]]*\]\sK, ", told)
     named = read(text.replace("[material.low]", "[material.domain]").replace('"low"', '"domain"'))
-    assert named.quantities == {**asked, "low": ("mean", "domain"), "all": ("mean", "domain")}
+    renamed = {name: ("mean", "domain", None) for name in ("low", "all")}
+    assert named.quantities == {**asked, **renamed}
+
+
+def test_weights_are_expressions(read) -> None:
+    """u = −1 on the obstacle; λ = −∂u/∂y = 0 there but for what f brings."""
+    text = (
+        SQUARE
+        + """
+[define]
+tent = "1 - abs(x)"
+[data]
+dirichlet = -1
+obstacle = -9
+[material.low]
+polygon = [[0, 0], [1, 0], [1, 0.5], [0, 0.5]]
+[quantities]
+push = { force = "contact", weight = "tent*(1 - x)*x" }
+low = { integral = "low", weight = "1/(3 - y) + x" }
+tilt = { mean = "low", weight = "2" }
+all = { integral = "domain", weight = "x - y" }
+"""
+    )
+    case = read(text)
+    domain = case.mesh()
+    case.check(domain)
+    *_, solution = solve_levels(case.problem, domain, 1)
+    record = level_record(solution, None, case.quantities)
+    exact = {"push": 0.0, "low": -(np.log(3 / 2.5) + 0.25), "tilt": -1.0, "all": 0.0}
+    for name, each in record["quantities"].items():
+        assert each["weighted"] and each["reason"] is None
+        assert each["lower"] <= exact[name] <= each["upper"]
+        assert each["upper"] - each["lower"] < 1e-8
+    told = certified(record, Units(u="K", force="W"))
+    assert re.search(r"tilt is in \[[^]]*\]\sK,", told)
+    assert re.search(r"push is in \[[^]]*\],", told) and re.search(r"all is in \[[^]]*\],", told)
+    for old, new, said in [
+        ('"x - y"', '"log(x - 5)"', "quantities.all.weight: the value at"),
+        ('"1/(3 - y) + x"', '"log(0.4 - y)"', "quantities.low.weight: the value at"),
+        ('"x - y"', '"x < y"', "quantities.all.weight: a number is needed"),
+        ('"x - y"', '"x - z"', "quantities.all.weight:"),
+        ('weight = "2"', 'weigth = "2"', "quantities.tilt.weigth: there is no such key"),
+        ('mean = "low", ', 'mean = "low", flux = "contact", ', "quantities.tilt: { force"),
+    ]:
+        with pytest.raises(InputError, match=re.escape(said)):
+            other = read(text.replace(old, new))
+            other.check(other.mesh())
+    read(text.replace('"1/(3 - y) + x"', '"log(0.6 - y)"')).check(domain)  # finite where it is used

@@ -16,7 +16,7 @@ from signorini_cr import options
 from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import _parser
 from signorini_cr.app.problemfile import load
-from signorini_cr.app.reference import ABOUT, KEYS, MATERIAL, PART, TYPES
+from signorini_cr.app.reference import ABOUT, KEYS, MATERIAL, PART, QUANTITY, TYPES
 from signorini_cr.fem.problem import Material, Problem
 
 BASE = {
@@ -163,6 +163,8 @@ def test_examples_are_read(key, tmp_path: Path) -> None:
         sections["domain"]["boundary"] = 'boundary = ["contact", "dirichlet", "NAME", "NAME"]'
     if key.section == MATERIAL:
         sections[MATERIAL]["polygon"] = "polygon = [[0, 0], [1, 0], [0, 1]]"
+    if (key.section, key.name) == (QUANTITY, "weight"):
+        sections[QUANTITY]["force"] = 'force = "contact"'
     sections[key.section][key.name] = key.example
     lines = [*sections.pop("").values()]
     for name, rows in sections.items():
@@ -177,7 +179,7 @@ def test_every_expression_of_the_table_is_used() -> None:
     for section, has in (("data", Problem), ("material.NAME", Material)):
         keys = {key.name for key in KEYS if key.section == section and key.is_expression}
         assert keys and keys <= {each.name for each in fields(has)}
-    for section in (PART, "exact", "time"):
+    for section in (PART, QUANTITY, "exact", "time"):
         assert any(key.section == section and key.is_expression for key in KEYS)
     keys = {key.name for key in KEYS if key.section == PART} - {"type"}
     assert keys == {name for names in TYPES.values() for name in names}

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 
@@ -101,7 +102,14 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     with (out / "times.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == list(report["times"][0]) == list(STEP)
+    asked = [
+        f"quantities_{name}_{key}"
+        for name in ("inflow", "whole")
+        for key in ("kind", "weighted", "value", "lower", "upper", "reason")
+    ]
+    assert list(report["times"][0]) == list(STEP)
+    columns = [asked if name == "quantities" else [name] for name in STEP]
+    assert list(rows[0]) == [name for names in columns for name in names]
     assert len(rows) == len(report["times"]) == len(expected) == 6
     for step, (row, record, (time, force, active)) in enumerate(
         zip(rows, report["times"], expected, strict=True), start=1
@@ -119,7 +127,24 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
     assert sorted(path.name for path in out.glob("step_*.vtu")) == [name for _, name in named]
     assert not (out / "convergence.png").exists() and (out / "mine.txt").exists()
     assert is_picture(out / "strip.png")
+    for row, record in zip(rows, report["times"], strict=True):
+        for name, found in record["quantities"].items():
+            assert found["lower"] < found["value"] < found["upper"]
+            assert float(row[f"quantities_{name}_upper"]) == found["upper"]
+    assert len({record["quantities"]["whole"]["value"] for record in report["times"]}) == 6
+    for name in ("inflow", "whole"):
+        ends = [
+            pick(record["quantities"][name][end] for record in report["times"])
+            for pick, end in ((min, "lower"), (max, "upper"))
+        ]
+        told = re.search(
+            rf"certified: {name} of each step's own problem is in \[(.*?), (.*?)\]", flat
+        )
+        low, high = (float(text.replace("−", "-")) for text in told.groups())
+        assert low <= ends[0] and ends[1] <= high
+        assert (low, high) == pytest.approx(ends, rel=0.1, abs=0.1)
     (level,) = report["levels"]
+    assert level["quantities"] == report["times"][-1]["quantities"]
     assert level["contact"]["force"] == report["times"][-1]["force"]
     for found in level["quantities"].values():
         assert found["lower"] < found["value"] < found["upper"]

@@ -19,7 +19,7 @@ from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate as module
 from signorini_cr.estimate import cusps
 from signorini_cr.estimate.certificate import certify
-from signorini_cr.estimate.force import _weight
+from signorini_cr.estimate.force import _weight, interval
 from signorini_cr.force import force_bounds
 from signorini_cr.means import mean
 from signorini_cr.mesh.families import structured
@@ -517,15 +517,19 @@ def test_force():
         phi=_weight(solution, diffusion(solution.level.data).forms.bounded),
     )
     agrees(certificate, found)
-    low, high = force_bounds(solution)
+    bounded = diffusion(solution.level.data).forms.bounded
+    _, low, high = interval(solution, bounded)
     assert np.isclose((low + high) / 2, found.force, rtol=1e-6)
     assert np.isclose((high - low) / 2, found.reach, rtol=1e-6)
+    # There is contact all along, and a dual solution tells more
+    lower, upper = force_bounds(solution)
+    assert low <= lower <= upper <= high and upper - lower < 0.4 * (high - low)
     # A cusp pulls at a cell's vertices: half of ∫ κ∇ψ·∇φ
     pull = SimpleNamespace(at=np.array([0]), pulls=lambda _: (np.full((3, 1), 0.02), None))
     object.__setattr__(certificate._made, "cusps", pull)
     phi = _weight(solution, diffusion(solution.level.data).forms.bounded)
     change = 0.01 * phi.x.array[phi.function_space.dofmap.list[0]].sum()
-    middle = sum(force_bounds(solution)) / 2
+    middle = sum(interval(solution, bounded)[1:]) / 2
     assert np.isclose(middle, found.force + WORLD.allreduce(change), rtol=1e-6)
 
 
@@ -575,6 +579,8 @@ def test_contact_alone_holds_the_domain():
         assert low <= -1 / 3 <= high
         low, high = force_bounds(solution)
         assert low <= 2.0 * (1 + 1e-12) and high >= 2.0 * (1 - 1e-12) and high - low < 1e-6
+        _, low, high = solution.flux("floor", weight=lambda x: ufl.sin(x[0]))
+        assert low <= 1 - np.cos(2.0) <= high and high - low < 0.1
         with pytest.raises(InputError, match="how high it is"):
             mean(solution)
 

@@ -1,0 +1,213 @@
+"""Weights of the user's own on parts of the boundary, extended into Ω.
+
+ω on the parts, 0 on the rest of Γ0 and Γ1, is the trace of φ + ℓ: φ in P1 has ω's values at the
+vertices, and ℓ is what it lacks on the facets, lifted into their cells as u_D is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from ..arrays import FloatArray, Int32Array
+from ..data.diffusion import diffusion
+from ..data.jets import Enclosure
+from ..data.moments import OnFacets, OnParts, Trace
+from ..data.ranges import Pieces
+from ..errors import InputError
+from ..fem.cells import BoundaryFacets, Cells, measures, pick
+from ..fem.conditions import Condition, Data, facets_of
+from ..fem.problem import Forms, as_expression
+from ..fem.space import function_space, shared_sum
+from .certificate import Made
+from .lifting import JUMP, Cubic, Lift, lift
+
+SHARE = 1e-2
+"""What ‖Aℓ‖ need not be known better than, in parts of ‖Aφ‖, or thereabouts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beyond:
+    """What a weight is against y, and what it has beyond P1; this rank's shares.
+
+    Attributes:
+        force: ∫ ω (y·n + t − g̃) over the parts.
+        unsure: How far it may be from that.
+        square: ‖Aℓ‖².
+        left: Bound of what is left of −div y = f, tested by ℓ, where e does not vanish on the part.
+        mean: Bound of |ℓ_T|.
+        least: ω is not below it.
+    """
+
+    force: float
+    unsure: float = 0.0
+    square: float = 0.0
+    left: float = 0.0
+    mean: float = 0.0
+    least: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """A weight on some parts of the boundary.
+
+    Attributes:
+        trace: ω.
+        parts: Its values on the facets of owned cells.
+        values: The P1 function that has ω's values at the parts' vertices, and 0 at others.
+        known: Local dofs of the vertices of the parts, Γ0 and Γ1, ghosts included.
+        scale: The largest of the values.
+    """
+
+    trace: Trace
+    parts: OnParts
+    values: fem.Function
+    known: Int32Array
+    scale: float
+
+    @classmethod
+    def of(cls, made: Made, cells: Cells, conditions: Sequence[Condition], weight: Data) -> Weight:
+        """Evaluate a weight on the parts of some conditions; collective.
+
+        Raises:
+            InputError: It is no scalar, or not 0 where the parts meet the rest of Γ0 and Γ1.
+        """
+        domain, data = cells.domain, diffusion(made.level.data)
+        trace = data.compiled.trace(scalar(weight, data.forms))
+        parts = OnParts.of([OnFacets.of(each, trace, domain) for each in conditions], cells)
+        V, side, ends = function_space(domain.mesh, "P1"), parts.side, parts.ends
+        own = V.dofmap.list[side.cells[:, None], cells.others[side.local]].T
+        values, marks = fem.Function(V), fem.Function(V)
+        for function, amounts in ((values, ends), (marks, np.ones_like(ends))):
+            np.add.at(function.x.array, own, amounts)
+            shared_sum(domain.mesh.comm, V.dofmap.index_map, function.x.array)
+        chosen = marks.x.array > 0.0
+        values.x.array[chosen] /= marks.x.array[chosen]
+        others = facets_of(
+            domain, [c for c in (*data.forms.fixed, *data.forms.bounded) if c not in conditions]
+        )
+        marks.x.array[:] = 0.0
+        marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, others)] = 1.0
+        rest = shared_sum(domain.mesh.comm, V.dofmap.index_map, marks.x.array) > 0.0
+        largest = float(np.abs(ends).max(initial=0.0))
+        scale = max(domain.mesh.comm.allgather(largest if np.isfinite(ends).all() else np.inf))
+        if not np.isfinite(scale):
+            raise InputError("the weight is not finite at a vertex of the part")
+        _insist_on_zero(values, chosen & rest, scale)
+        values.x.array[rest] = 0.0
+        return cls(trace, parts, values, np.flatnonzero(chosen | rest).astype(np.int32), scale)
+
+    def beyond(self, made: Made, cells: Cells, size: float) -> Beyond:
+        """Integrate it against y, and bound what it has beyond P1; collective.
+
+        Args:
+            made: y.
+            cells: The mesh.
+            size: ‖Aφ‖.
+
+        Raises:
+            InputError: The weight jumps, or has no enclosure.
+        """
+        side = self.parts.side
+        dofs = self.values.function_space.dofmap.list
+        ends = self.values.x.array[dofs[side.cells[:, None], cells.others[side.local]].T]
+        none, height = np.zeros(len(side.cells)), self.parts.middle - ends.mean(axis=0)
+        most = _largest(made)
+        goal = SHARE * size / np.sqrt(max(cells.comm.allgather(most.max(initial=1e-300))))
+        coarse, fine = (
+            lift(cells, side, self.trace, None, Cubic(ends, bend, none), self.scale, goal, False)
+            for bend in (none, height)
+        )
+        reasons = [each.reason for each in (coarse, fine)]
+        for reason in (words for rank in cells.comm.allgather(reasons) for words in rank if words):
+            raise InputError(reason.replace("u_D", "the weight"))
+        length = measures(cells, side)
+        pressure = pressed(made, cells, side) / length
+        unsure = float(np.abs(pressure) @ fine.beyond)
+        if made.beyond is not None:  # through Γ0 y has the curl of bumps, which is affine
+            bumps = np.abs(made.beyond.heights[side.dofs])
+            unsure += float(bumps @ (np.ptp(ends, axis=0) / 3.0 + 4.0 * coarse.edge / length**0.5))
+        over_cells = coarse.area / np.sqrt(cells.volume[side.cells])
+        left = np.abs(made.left[side.cells])
+        if made.taken_up is not None:
+            left = np.where(made.taken_up[side.cells], 0.0, left)
+        return Beyond(
+            float(pressure @ (length * (ends.mean(axis=0) + 2.0 / 3.0 * height))),
+            unsure,
+            _square(made, cells, side, coarse, most),
+            float(left @ over_cells),
+            float(np.bincount(side.cells, over_cells).max(initial=0.0)),
+            _least(self.trace, cells, side),
+        )
+
+
+def scalar(weight: Data, forms: Forms) -> ufl.core.expr.Expr:
+    """A weight as an expression in the coordinates of the mesh that the forms were written for.
+
+    Raises:
+        InputError: It is no scalar, or on another mesh.
+    """
+    found = as_expression(weight, forms.x)
+    if found.ufl_shape != ():
+        raise InputError(f"the weight has the shape {found.ufl_shape}; a scalar is needed")
+    if any(each != forms.mesh.ufl_domain() for each in ufl.domain.extract_domains(found)):
+        raise InputError("the weight is given on another mesh than the data")
+    return found
+
+
+def pressed(made: Made, cells: Cells, side: BoundaryFacets) -> FloatArray:
+    """∫_F (y·n + t − g̃) on facets of Γ0 and Γ1, but for what is in σ, shape (n,)."""
+    known, edge = np.zeros(len(cells.exterior)), made.segments
+    known[edge.facets.dofs] = edge.through
+    if made.shed is not None:
+        known[edge.facets.dofs] -= made.shed
+    return np.asarray(made.through(cells)[side.local, side.cells] - known[side.dofs])
+
+
+def _largest(made: Made) -> FloatArray:
+    """The largest eigenvalue of κ, constant on each cell, shape (cells,) or ()."""
+    if made.stretch is None or not len(made.stretch):
+        return made.kappa
+    return np.asarray(made.kappa / np.linalg.eigvalsh(made.stretch)[:, 0] ** 2)
+
+
+def _square(
+    made: Made, cells: Cells, side: BoundaryFacets, lifted: Lift, most: FloatArray
+) -> float:
+    """Bound ‖Aℓ‖², this rank's share."""
+    which, place = np.unique(side.cells, return_inverse=True)
+    steep, area = (np.bincount(place, row) for row in (lifted.steep, lifted.area))
+    loss, edge = np.zeros(len(cells.exterior)), made.segments
+    loss[edge.facets.dofs] = edge.loss
+    found = pick(most, which) @ steep**2 if most.ndim else float(most) * np.sum(steep**2)
+    found += np.sum(pick(made.reaction, which) * area**2)
+    return float(found + loss[side.dofs] @ lifted.edge**2)
+
+
+def _least(trace: Trace, cells: Cells, side: BoundaryFacets) -> float:
+    """A lower bound of a weight on facets of this rank."""
+    if trace.constant is not None:
+        return trace.constant
+    boxes = Pieces.of_facets(cells, side).boxes(cells, decide=True)
+    low = Enclosure(boxes)(trace.deviation.expression).low + np.zeros(len(side.cells))
+    return float(np.min(np.nan_to_num(low, nan=-np.inf), initial=np.inf))
+
+
+def _insist_on_zero(values: fem.Function, where: FloatArray, scale: float) -> None:
+    """Refuse a weight that does not vanish at some vertices; collective."""
+    V = values.function_space
+    wrong = np.flatnonzero(where & (np.abs(values.x.array) > JUMP * scale))
+    at = V.tabulate_dof_coordinates()[wrong, :2]
+    own = [(*map(float, x), float(w)) for x, w in zip(at, values.x.array[wrong], strict=True)]
+    found = sorted(each for rank in V.mesh.comm.allgather(own) for each in rank)
+    if found:
+        x, y, value = found[0]
+        raise InputError(
+            f"the weight is {value:.4g} at ({x:.6g}, {y:.6g}), where the part touches another one"
+            " on which u is set or bounded; it must vanish there, as what flows through is no"
+            " bounded functional of the solution otherwise"
+        )
