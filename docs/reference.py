@@ -71,8 +71,8 @@ def _options() -> list[str]:
     named = " or ".join(f"`{name}`" for name in others)
     lines += [
         "",
-        f"`-{P}smoother NAME` is the program's own: what smooths in the cycle, `{first}`, the default, "
-        f"or {named}.",
+        f"`-{P}smoother NAME` is the program's own: what smooths in the cycle, `{first}`, "
+        f"the default, or {named}.",
         "`jacobi` takes twice the steps, and gives the same figures on any number of ranks.",
     ]
     return lines

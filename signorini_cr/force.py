@@ -13,6 +13,7 @@ from .data.moments import OnParts
 from .dual import certified
 from .errors import InputError
 from .estimate.certificate import Made
+from .estimate.flux import unbalanced
 from .estimate.force import (
     Certified,
     Interval,
@@ -121,6 +122,12 @@ def _corrected(
         if bent or of_phi.thirds is not None:
             return None
         product = bound * dual.bound_companion
+        if held:  # z's certificate asks of e what only z does: to vanish where there is contact
+            left = of_phi.left if of_phi.taken_up is None else of_phi.left * ~of_phi.taken_up
+            around = diffusion(made.level.data).cells  # these know Γ0
+            product += bound * unbalanced(made.level, around, left, made.least, 0.0, made.reaction)
+            if not np.isfinite(product):
+                return None
         work, slack = against(made, cells, at)
         own, work, energy, more = cells.total(
             sum(through(made, cells, c) for c in conditions if c not in free),

@@ -141,8 +141,8 @@ class Certificate:
 class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
-    κ is given by its means, as `Coefficient` has them; whether it varies within cells is told. hats
-    and segments are moments of f and g, left is ∫_T (f + div y), in s where c has taken it up, and
+    κ is given by its means, as `Coefficient` has them, and by least, a lower bound of its
+    eigenvalues; whether it varies within cells is told. hats and segments are moments of f and g, left is ∫_T (f + div y), in s where c has taken it up, and
     shed what b has. forces are this rank's shares of the contact forces in y, by the parts'
     numbers, missed that of what quadrature may have missed of f and g. reach is the radius of the
     ball around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and
@@ -156,6 +156,7 @@ class Made:
     level: Level
     w: FloatArray
     kappa: FloatArray
+    least: FloatArray
     stretch: FloatArray | None
     excess: FloatArray
     vertices: FloatArray
@@ -484,6 +485,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         level=known.level,
         w=known.w,
         kappa=known.kappa.mean,
+        least=known.kappa.least,
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,
