@@ -142,15 +142,15 @@ class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
     κ is given by its means, as `Coefficient` has them, and by least, a lower bound of its
-    eigenvalues; whether it varies within cells is told. hats and segments are moments of f and g, left is ∫_T (f + div y), in s where c has taken it up, and
-    shed what b has. forces are this rank's shares of the contact forces in y, by the parts'
-    numbers, missed that of what quadrature may have missed of f and g. reach is the radius of the
-    ball around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and
-    ‖Aℓ‖ alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last
-    row is about. on_contact_alone tells that part of the domain is held by contact alone: (2) is
-    then for functions that vanish there. contact are y's forces off each bound, facet by facet,
-    above bounds what they make of v + ℓ − α, and complementary is a bound of what λ makes of that
-    and they make of u − α.
+    eigenvalues; whether it varies within cells is told. hats and segments are moments of f and g,
+    left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are this
+    rank's shares of the contact forces in y, by the parts' numbers, missed that of what quadrature
+    may have missed of f and g. reach is the radius of the ball around the middle of p and b that
+    A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds of ℓ, which
+    v lacks, and bounded the facet dofs of Γ1 that its last row is about. on_contact_alone tells
+    that part of the domain is held by contact alone: (2) is then for functions that vanish there.
+    contact are y's forces off each bound, facet by facet, above bounds what they make of v + ℓ − α,
+    and complementary is a bound of what λ makes of that and they make of u − α.
     """
 
     level: Level
