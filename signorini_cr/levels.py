@@ -247,7 +247,13 @@ def solve_level(
             lend(system) as cycle,
             system.vectors(u, residual) as vectors,
         ):
-            data = Data(system.row_sums, system.data_rounding, system.data_rounded, system.offset)
+            data = Data(
+                row_sums=system.row_sums,
+                rounding=system.data_rounding,
+                rounded=system.data_rounded,
+                loads=system.chi.x.array[system.bounded],
+                offset=system.offset,
+            )
             iterations = solve_vi(cycle, vectors, system.residual_scale, monitor=told, data=data)
     except NotConverged as failure:
         if level.physics.problem.form is not None and "DIVERGED_INDEFINITE" in failure.reason:

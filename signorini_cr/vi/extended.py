@@ -38,6 +38,10 @@ KNOWN = 1e-2
 GAIN = 0.5
 """What a refinement must take away of what is wrong to be worth another one."""
 
+REMAINDER = 1e-9
+"""Forces below this part of the loads on their rows, with which others nearly cancel, are measured
+against it."""
+
 SAMPLES = 3
 """Times that data are changed; the largest answer counts."""
 
@@ -86,13 +90,14 @@ class Extended:
         stiffness.exact = True
         stiffness.sort(vectors.x, vectors.b)
 
-    def settle(self, rounding: DataRounding, loose: float) -> Settled:
+    def settle(self, rounding: DataRounding, loads: FloatArray, loose: float) -> Settled:
         """Find active set and forces, and how well they are known; collective.
 
         On return x and the residual are those that contact is read from.
 
         Args:
             rounding: Draws what rounding may have done to the data.
+            loads: χ in the bounded dofs, shape (n,).
             loose: How many times more than usual may be wrong with the forces.
 
         Raises:
@@ -102,7 +107,8 @@ class Extended:
         open_by_data = np.max([self._answer(*rounding(n), n) for n in range(SAMPLES)], axis=0)
         errors = 2.0 * left + open_by_data
         forces, made_of = self._sums(self._forces()), self._stiffness.made_of
-        total = forces.sum()
+        of_loads = self._sums(np.where(self.active.mask, np.abs(loads), 0.0)).sum()
+        total = max(float(forces.sum()), REMAINDER * float(of_loads))
         # what drowns in its errors is no force where these are nothing against what it is made of,
         # or against all forces
         none = (forces <= LOST * errors) & (
@@ -111,10 +117,12 @@ class Extended:
         )
         sizes = np.maximum(forces, self._stiffness.least)
         sizes[none] = np.maximum(made_of, total)[none]
-        relative = errors / np.maximum(sizes, 1e-300)
+        # each class is solved for itself; what data leave open is measured against all forces
+        solved = 2.0 * left / np.maximum(sizes, 1e-300)
+        given = open_by_data / np.maximum(np.maximum(sizes, total), 1e-300)
         self._write(none)
-        worst = int(np.argmax(relative))
-        return Settled(float(relative[worst]), bool(open_by_data[worst] > 2.0 * left[worst]))
+        by_data = float(given.sum())
+        return Settled(float(solved.max()) + by_data, by_data > float(solved.max()))
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what is here alone."""

@@ -88,13 +88,15 @@ class Data:
     Attributes:
         row_sums: `System.row_sums`.
         rounding: `System.data_rounding`.
-        rounded: Sum of what that may change, `System.data_rounded`.
+        rounded: Bound of what that may change, summed up, `System.data_rounded`.
+        loads: χ in the bounded dofs, shape (n,).
         offset: `System.offset`.
     """
 
     row_sums: Callable[[], FloatArray]
     rounding: DataRounding
     rounded: float
+    loads: FloatArray
     offset: float
 
 
@@ -317,7 +319,7 @@ class NewtonTest:
         assert self._data is not None
         extended = Extended(self._linear, self._cycle.operator, bounds, self._stiffness, vectors)
         try:
-            settled = extended.settle(self._data.rounding, self._loose)
+            settled = extended.settle(self._data.rounding, self._data.loads, self._loose)
             active = extended.active.dofs
         except NotConverged as failure:
             self.failure = failure.reason
