@@ -85,7 +85,7 @@ class Solver:
         system = self._level.system
         self._stack = ExitStack()
         self._stack.callback(hierarchy.free)
-        lent = hierarchy.multigrid(system.operator, system.owned_dirichlet)
+        lent = hierarchy.multigrid(system.operator, system.owned_dirichlet, again=self._held)
         self._cycle = self._stack.enter_context(lent)
 
     def __enter__(self) -> Self:

@@ -85,7 +85,8 @@ class ReducedSolver:
         ksp: The inner solver, CG with the V-cycle unless options say otherwise.
         iterations: Its steps so far.
         active: The active set of the last reduced system.
-        reached: Norm of the residual that it left last.
+        reached: Norm of the residual that it left last, that of rounding where it left less
+            and rounding is next to nothing.
         force_errors: What it left wrong with the forces on active dofs, summed over each class of
             stiffness, by the last change of the forces and the rate at which it converged;
             infinite where that is not known.
@@ -165,6 +166,10 @@ class ReducedSolver:
                 test = self._run(forces)
         self._residual.array[self.active.bounded] = forces
         self.reached, self.force_errors = test.reached, test.force_errors
+        if not self._stiffness.varied:  # or what is rounding in one class may be much in another
+            rounding = NOISE * self._cycle.finest.rounding(self._x, self.active.dofs)
+            if rounding <= SETTLING_LIMIT * self.ksp.getTolerances()[1]:
+                self.reached = max(self.reached, rounding)
         reduced.array[:] = self._step.array_r[inactive]
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())

@@ -113,6 +113,11 @@ class Stiffness:
             self._differences, self._weights = _differences(grid.matrix)
         release(diagonal)
 
+    @property
+    def varied(self) -> bool:
+        """Whether there are several classes of diagonal entries."""
+        return self._kinds > 1
+
     def _classes(self, diagonal: FloatArray) -> IndexArray:
         decades = np.log10(diagonal / self._smallest) / DECADES
         return np.maximum(decades, 0.0).astype(np.intp)
