@@ -13,7 +13,7 @@ from dolfinx import fem
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import Cells, vertex_rows
-from ..fem.conditions import Condition, may_change, number
+from ..fem.conditions import Condition, number
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
@@ -64,7 +64,7 @@ class Moments:
     @cached_property
     def of_f(self) -> VolumeMoments:
         """Moments of f."""
-        if self.earlier is not None and not may_change(self.compiled.forms.f):
+        if self.earlier is not None and not self.compiled.may_change(self.compiled.forms.f):
             return self.earlier.of_f
         return VolumeMoments.of(self.compiled.f, self.cells)
 
@@ -83,7 +83,8 @@ class Moments:
     def edges(self) -> tuple[NeumannMoments, ...]:
         """Moments of the fluxes that are known, one for each condition."""
         natural = self.compiled.forms.natural
-        if self.earlier is not None and not any(may_change(each.flux) for each in natural):
+        changing = self.compiled.may_change
+        if self.earlier is not None and not any(changing(each.flux) for each in natural):
             return self.earlier.edges
         sampled = (
             OnFacets.of(each, self.compiled.trace(each.flux), self.domain) for each in natural
@@ -193,7 +194,8 @@ class DiffusionOnMesh:
         before: Callable[[DiffusionOnMesh], tuple[OnFacets, ...]],
     ) -> tuple[OnFacets, ...]:
         """Sample data on facets, with their signs, unless they are what they were."""
-        if self._earlier is not None and not any(may_change(datum) for *_, datum in data):
+        changing = self.compiled.may_change
+        if self._earlier is not None and not any(changing(datum) for *_, datum in data):
             return before(self._earlier)
         return tuple(
             OnFacets.of(condition, self.compiled.trace(datum), self.domain, sign)
@@ -211,12 +213,16 @@ class DiffusionOnMesh:
 
     @cached_property
     def fixed(self) -> tuple[Imposed, ...]:
-        """u_D on Γ0."""
+        """u_D on Γ0; the same object as before where that is what it was."""
+        if self._earlier is not None and self.u_D is self._earlier.u_D:
+            return self._earlier.fixed
         return tuple(on_facets.imposed for on_facets in self.u_D)
 
     @cached_property
     def bounds(self) -> tuple[Imposed, ...]:
-        """α and −β on Γ1."""
+        """α and −β on Γ1; the same object as before where that is what it was."""
+        if self._earlier is not None and self.alpha is self._earlier.alpha:
+            return self._earlier.bounds
         return tuple(on_facets.imposed for on_facets in self.alpha)
 
     def chi(self) -> FloatArray:
@@ -255,7 +261,18 @@ class DiffusionOnMesh:
 
     def energy(self, u: fem.Function) -> float:
         """a_h(u, u), this rank's cells' share."""
-        return float(fem.assemble_scalar(self.forms.a_of_w.on(self.domain, (), [u])))
+        if self._earlier is None:
+            form = self.forms.a_of_w.on(self.domain, (), [u])
+        else:
+            w, form = self._earlier._a_of_w
+            w.x.array[:] = u.x.array
+        return float(fem.assemble_scalar(form))
+
+    @cached_property
+    def _a_of_w(self) -> tuple[fem.Function, fem.Form]:
+        """A function w and a_h(w, w), for those who ask again and again."""
+        w = fem.Function(self.V)
+        return w, self.forms.a_of_w.on(self.domain, (), [w])
 
     def _assembled(self, kernel: Kernel | None) -> FloatArray:
         nodes, block = self.V.dofmap.index_map, self.V.dofmap.index_map_bs

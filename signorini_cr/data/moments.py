@@ -25,7 +25,7 @@ from ufl.core.expr import Expr
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import BoundaryFacets, Cells
-from ..fem.conditions import Condition
+from ..fem.conditions import Condition, may_change
 from ..fem.physics import Imposed
 from ..fem.problem import Forms, number
 from ..fem.space import facet_entities, facet_quadrature
@@ -556,6 +556,7 @@ class Compiled:
         self.forms = forms
         self._rule = Rule(forms.mesh, forms.problem.quadrature_degree)
         self._traces: dict[Expr, Trace] = {}
+        self._changing: dict[Expr, bool] = {}
 
     @cached_property
     def f(self) -> Volume:
@@ -567,6 +568,12 @@ class Compiled:
         """Coefficient; collective."""
         kappa = self.forms.kappa
         return (Tensor if ufl.shape(kappa) else Volume)(kappa, self.forms.mesh, self._rule)
+
+    def may_change(self, expression: Expr) -> bool:
+        """As `conditions.may_change`, found out once: UFL goes through the whole expression."""
+        if expression not in self._changing:
+            self._changing[expression] = may_change(expression)
+        return self._changing[expression]
 
     def trace(self, expression: Expr) -> Trace:
         """Values of a condition's datum on facets; collective."""

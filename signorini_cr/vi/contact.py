@@ -16,8 +16,7 @@ from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.physics import OnMesh
-from ..fem.space import facet_measures
-from ..fem.walk import along_boundary
+from ..fem.space import ghosted_vector
 from ..garbage import release
 from ..multigrid.parents import Layout
 from .active import ActiveSet
@@ -140,16 +139,15 @@ def contact_facts(
         iterations: What the solver says about its errors.
     """
     mesh, facets, dofs = data.domain.mesh, system.bounded_facets, system.contact_dofs
-    vertices, measure = facet_measures(mesh, facets)
+    there = system.contact_facets
+    measure = there.measure
     at_dofs = _AtDofs.of(system, u, residual)
     layout, total = Layout.of_space(u.function_space), _Totals(mesh.comm)
-    share = np.zeros(len(u.x.array))  # of Γ1 that is a dof's
-    np.add.at(share, dofs, (measure / dofs.shape[1])[:, None])
-    pressure = at_dofs.force / layout.shared_sum(share)[system.bounded]
+    pressure = at_dofs.force / there.share
 
     def on_facets(values: FloatArray) -> FloatArray:
         """Values at bounded dofs, 0 at others, as the facets see them."""
-        everywhere = np.zeros(len(share))
+        everywhere = np.zeros(len(u.x.array))
         everywhere[system.bounded] = values
         return layout.shared_sum(everywhere)[dofs]
 
@@ -159,7 +157,7 @@ def contact_facts(
     local = data.at_vertices(u, facets)
     means = dofs.shape[1] > 1
     fields: dict[str, npt.NDArray] = {
-        "vertices": vertices,
+        "vertices": there.vertices,
         "measure": measure,
         "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]),
         "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]),
@@ -168,7 +166,7 @@ def contact_facts(
         "active": is_active,
         "gap_at_vertices": np.minimum(local - below, above - local),
     }
-    table, transitions = along_boundary(mesh, facets, fields)
+    table, transitions = there.walk.along(fields)
     of_load = float(np.sqrt(total.sum(at_dofs.left @ at_dofs.left))) / (
         system.residual_scale or 1.0
     )
@@ -216,8 +214,9 @@ class _AtDofs:
     def of(cls, system: System, u: fem.Function, residual: fem.Function) -> _AtDofs:
         """Compare what is there with what rounding makes of it; collective."""
         bounded = system.bounded
-        with system.vectors(u, residual) as vectors:
-            terms = system.operator.magnitude(vectors.x) + np.abs(system.b.x.array[bounded])
+        vector = ghosted_vector(u.function_space, u.x.array)
+        terms = system.operator.magnitude(vector) + np.abs(system.b.x.array[bounded])
+        release(vector)
         entries = system.A.getDiagonal()
         diagonal = entries.array_r.copy()
         release(entries)
