@@ -43,7 +43,7 @@ from .cycle import (
 from .parents import Layout, Parents
 from .pattern import empty_matrix
 from .transfer import Transfer, inclusion, prolongation
-from .whole import suits_whole
+from .whole import Whole, suits_whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,10 @@ class Hierarchy:
         if again and suits_whole(
             operator.matrix, mesh.domain.mesh.topology.dim, len(operator.dofs)
         ):
-            return Grid(operator, dofs, dirichlet, whole=True)
+            grid = Grid(operator, dofs, dirichlet, whole=True)
+            if isinstance(grid.solver, Whole) and grid.solver.is_accurate():
+                return grid
+            _free(grid)
         if self._given_up or not (dofs.cr or mesh.parents):
             return Grid(operator, dofs, dirichlet, alone=self._given_up)
         while len(self._chain) < max(len(self.meshes) - 1, 1):

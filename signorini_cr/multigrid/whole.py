@@ -24,6 +24,10 @@ COLUMNS = 4_000_000
 """Numbers that all columns of the inverse may have together: 32 MB."""
 
 
+ACCURACY = 1e-6
+"""What the factors may have of constants for an error."""
+
+
 def suits_whole(matrix: PETSc.Mat, dimension: int, bounded: int) -> bool:
     """Whether a matrix is small enough.
 
@@ -82,6 +86,17 @@ class Whole:
             values = x.array
             values -= (self._schur @ values[self._constrained]) @ self._theirs
             values[self._constrained] = 0.0
+
+    def is_accurate(self) -> bool:
+        """Whether constants are found: a matrix that hardly anything holds may be singular to it.
+
+        With dofs on the obstacle it need not be; so other solvers are to be taken.
+        """
+        matrix, _ = self._pc.getOperators()
+        self._unit.set(1.0)
+        matrix.mult(self._unit, self._image)
+        self._pc.apply(self._image, self._unit)
+        return bool(np.abs(self._unit.array_r - 1.0).max(initial=0.0) <= ACCURACY)
 
     def describe(self, why: str = "") -> str:
         """What it is, in words."""
