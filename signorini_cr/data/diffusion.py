@@ -11,7 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from .. import compat
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.cells import Cells, vertex_rows
 from ..fem.conditions import Condition, number
 from ..fem.physics import Imposed, OnMesh
@@ -128,6 +128,7 @@ class DiffusionOnMesh:
         else:
             self.V = earlier.V
         self._earlier = earlier
+        self._ends: tuple[Int32Array, Int32Array, IndexArray] | None = None
         self.moments = Moments(compiled, domain, self.V, source, rate, earlier)
 
     def renewed(self, source: FloatArray | None, rate: FloatArray) -> DiffusionOnMesh:
@@ -255,9 +256,13 @@ class DiffusionOnMesh:
 
     def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
         """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
-        mesh = self.domain.mesh
-        cells, local = facet_entities(mesh, facets).T
-        return np.take_along_axis(vertex_values(u, cells), facet_corners(mesh)[local], axis=1)
+        if self._earlier is not None:
+            return self._earlier.at_vertices(u, facets)
+        if self._ends is None or self._ends[0] is not facets:
+            cells, local = facet_entities(self.domain.mesh, facets).T
+            self._ends = facets, cells, facet_corners(self.domain.mesh)[local]
+        _, cells, corners = self._ends
+        return np.take_along_axis(vertex_values(u, cells), corners, axis=1)
 
     def energy(self, u: fem.Function) -> float:
         """a_h(u, u), this rank's cells' share."""

@@ -142,7 +142,7 @@ def contact_facts(
     there = system.contact_facets
     measure = there.measure
     at_dofs = _AtDofs.of(system, u, residual)
-    layout, total = Layout.of_space(u.function_space), _Totals(mesh.comm)
+    layout = Layout.of_space(u.function_space)
     pressure = at_dofs.force / there.share
 
     def on_facets(values: FloatArray) -> FloatArray:
@@ -157,8 +157,6 @@ def contact_facts(
     local = data.at_vertices(u, facets)
     means = dofs.shape[1] > 1
     fields: dict[str, npt.NDArray] = {
-        "vertices": there.vertices,
-        "measure": measure,
         "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]),
         "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]),
         "u": local.mean(axis=1),
@@ -167,23 +165,37 @@ def contact_facts(
         "gap_at_vertices": np.minimum(local - below, above - local),
     }
     table, transitions = there.walk.along(fields)
-    of_load = float(np.sqrt(total.sum(at_dofs.left @ at_dofs.left))) / (
-        system.residual_scale or 1.0
-    )
+    sums = [
+        np.sum(at_dofs.force),
+        np.sum(measure[is_active]),
+        len(facets),
+        np.sum(is_active),
+        np.sum(np.abs(at_dofs.force * at_dofs.gap)),
+        at_dofs.left @ at_dofs.left,
+    ]
+    ends = at_dofs.gap, at_dofs.side * pressure
+    least = np.array([np.min(each, initial=np.inf) for each in ends])
+    comm = mesh.comm
+    force, length, number, number_active, complementarity, squares = comm.allreduce(np.array(sums))
+    comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+    min_gap, min_pressure = least
+    of_load = float(np.sqrt(squares)) / (system.residual_scale or 1.0)
     return Contact(
-        comm=mesh.comm,
+        comm=comm,
         facets=facets,
+        vertices=there.vertices,
+        measure=measure,
         **fields,
         active_set=at_dofs.active,
-        force=total.sum(at_dofs.force),
-        length=total.sum(measure[is_active]),
-        number=int(total.sum(np.ones(len(facets)))),
-        number_active=int(total.sum(is_active)),
+        force=float(force),
+        length=float(length),
+        number=int(number),
+        number_active=int(number_active),
         transitions=transitions,
         kkt=Kkt(
-            min_gap=total.min(at_dofs.gap),
-            min_pressure=total.min(at_dofs.side * pressure) + 0.0,  # no -0
-            complementarity=total.sum(np.abs(at_dofs.force * at_dofs.gap)),
+            min_gap=float(min_gap),
+            min_pressure=float(min_pressure) + 0.0,  # no -0
+            complementarity=float(complementarity),
             residual=max(of_load, iterations.imbalance),
             force_error=iterations.force_error,
         ),
@@ -234,16 +246,3 @@ class _AtDofs:
 def _bound(values: FloatArray) -> FloatArray:
     """Bounds as they are told: infinite where PETSc's number says that there is none."""
     return np.where(np.abs(values) < PETSc.INFINITY, values, np.copysign(np.inf, values))
-
-
-class _Totals:
-    """Reductions over all ranks of arrays that may be empty on some."""
-
-    def __init__(self, comm: MPI.Comm):
-        self.comm = comm
-
-    def sum(self, values: npt.ArrayLike) -> float:
-        return float(self.comm.allreduce(float(np.sum(values))))
-
-    def min(self, values: npt.NDArray) -> float:
-        return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), op=MPI.MIN))

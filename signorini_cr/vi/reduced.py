@@ -166,10 +166,12 @@ class ReducedSolver:
                 test = self._run(forces)
         self._residual.array[self.active.bounded] = forces
         self.reached, self.force_errors = test.reached, test.force_errors
-        if not self._stiffness.varied:  # or what is rounding in one class may be much in another
+        next_to_nothing = SETTLING_LIMIT * self.ksp.getTolerances()[1]
+        # with several classes what is rounding in one may be much in another
+        if test.reached < next_to_nothing and not self._stiffness.varied:
             rounding = NOISE * self._cycle.finest.rounding(self._x, self.active.dofs)
-            if rounding <= SETTLING_LIMIT * self.ksp.getTolerances()[1]:
-                self.reached = max(self.reached, rounding)
+            if rounding <= next_to_nothing:
+                self.reached = max(test.reached, rounding)
         reduced.array[:] = self._step.array_r[inactive]
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
