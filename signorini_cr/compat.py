@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import basix
 import cffi
@@ -177,6 +178,10 @@ def compile_expression(expression: Any, points: FloatArray, mesh: Mesh) -> fem.E
     return compiled(mesh.comm, fem.Expression, expression + nothing, points, mesh.comm)
 
 
+_functions: WeakKeyDictionary[fem.Expression, list[Any]] = WeakKeyDictionary()
+"""Those in each expression: UFL takes long to find them."""
+
+
 def bound(expression: fem.Expression, own: Callable[[Any], Any]) -> fem.Expression:
     """A compiled expression with other functions in it, of the same element.
 
@@ -185,7 +190,9 @@ def bound(expression: fem.Expression, own: Callable[[Any], Any]) -> fem.Expressi
         own: The function to take in the place of one in the expression.
     """
     data = expression.ufl_expression
-    functions = ufl.algorithms.extract_coefficients(data)
+    if expression not in _functions:
+        _functions[expression] = ufl.algorithms.extract_coefficients(data)
+    functions = _functions[expression]
     if all(own(function) is function for function in functions):
         return expression
     code = expression.ufcx_expression

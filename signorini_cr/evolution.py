@@ -85,7 +85,7 @@ class Solver:
         if like is None:
             for _ in range(levels - 1):
                 self._refined.append(refine(self._refined[-1][0] if self._refined else domain))
-        self._stack = ExitStack()
+        self._stack, self._solved = ExitStack(), 0
         self._set_up()
 
     def _set_up(self) -> None:
@@ -98,9 +98,11 @@ class Solver:
         self._held = self._level.loose is None
         system = self._level.system
         self._stack.callback(self._hierarchy.free)
-        lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet)
+        # what has served a single solve will not stay for many
+        again = self._held and self._solved != 1
+        lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, again)
         self._cycle = self._stack.enter_context(lent)
-        self._assembled = self.physics.a.values()
+        self._assembled, self._solved = self.physics.a.values(), 0
 
     def _carry_down(self) -> None:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
@@ -164,6 +166,7 @@ class Solver:
             check_operator(self.physics, self._domain)
             self.close()
             self._set_up()
+        self._solved += 1
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
         own = None if source is None else source.x.array
         data = diffusion(self._level.data).renewed(own, np.asarray(rate, dtype=np.float64))

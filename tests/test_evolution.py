@@ -193,6 +193,45 @@ def test_what_changes_between_solves_is_assembled_anew(make, levels, where):
         assert found.bound_energy_norm == pytest.approx(alone.bound_energy_norm, rel=1e-4)
 
 
+@pytest.mark.serial
+def test_factors_serve_as_long_as_the_matrix_is_the_same():
+    """On one small mesh: kept while f, u_D or the obstacle change, made anew for another κ or b."""
+    domain = SQUARE.mesh(0.15)
+    numbers = {"f": 3.0, "obstacle": -0.05, "u_D": 0.1, "kappa": 1.0, "b": 0.5}
+    data = {name: fem.Constant(domain.mesh, value) for name, value in numbers.items()}
+    problem = Problem(
+        f=lambda x: -data["f"] * (0.2 + x[0]),
+        coefficient=data["kappa"],
+        conditions={
+            "floor": Contact(data["u_D"] + data["obstacle"]),
+            "right": Robin(coefficient=data["b"], external=data["u_D"] - 0.1),
+            "top": Dirichlet(data["u_D"]),
+            "left": Neumann(),
+        },
+    )
+    changes = [
+        *(("f", 2.0), ("f", 5.0), ("obstacle", -0.08), ("u_D", 0.0), ("kappa", 0.6), ("f", 4.0)),
+        *(("obstacle", -0.1), ("u_D", 301.0), ("b", 3.0), ("f", 6.0), ("kappa", 1.5)),
+        ("kappa", 0.8),
+    ]
+    forces, kinds, solution = [], [], None
+    with Solver(problem, domain) as solver:
+        for name, value in changes:
+            data[name].value = value
+            solution = solver.solve(before=solution)
+            alone = solve(problem, domain)
+            assert np.allclose(solution.u.x.array, alone.u.x.array, rtol=0, atol=1e-7)
+            assert solution.contact.force == pytest.approx(alone.contact.force, rel=1e-6)
+            assert 0 < solution.contact.number_active == alone.contact.number_active
+            assert solution.energy == pytest.approx(alone.energy, rel=1e-6)
+            forces.append(solution.contact.force)
+            kinds.append(solution.iterations.preconditioner)
+    changed = np.abs(np.diff(forces)) > 1e-3
+    assert changed.tolist() == [name != "u_D" for name, _ in changes[1:]]  # all is relative to it
+    # factors are not worth while for what changes each time
+    assert [kind == "a direct solver" for kind in kinds] == [True] * (len(changes) - 1) + [False]
+
+
 @pytest.mark.parametrize("scheme", ["euler", "bdf2"])
 def test_all_of_the_equation_may_depend_on_the_time(scheme):
     """u = (1 + t) y is in the space, and both schemes are exact for it."""

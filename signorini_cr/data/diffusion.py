@@ -14,9 +14,9 @@ from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from .. import compat
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.cells import Cells, measures, vertex_rows
-from ..fem.conditions import Condition, is_by_cells, may_change, number
+from ..fem.conditions import Condition, is_by_cells, number
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
@@ -71,7 +71,7 @@ class Moments:
     @cached_property
     def of_f(self) -> VolumeMoments:
         """Moments of f."""
-        if self.earlier is not None and not may_change(self.compiled.forms.f):
+        if self.earlier is not None and not self.compiled.may_change(self.compiled.forms.f):
             return self.earlier.of_f
         return VolumeMoments.of(self.compiled.f, self.cells)
 
@@ -90,7 +90,8 @@ class Moments:
     def edges(self) -> tuple[NeumannMoments, ...]:
         """Moments of the fluxes that are known, one for each condition."""
         natural = self.compiled.forms.natural
-        if self.earlier is not None and not any(may_change(each.flux) for each in natural):
+        changing = self.compiled.may_change
+        if self.earlier is not None and not any(changing(each.flux) for each in natural):
             return self.earlier.edges
         sampled = (
             OnFacets.of(each, self.compiled.trace(each.flux), self.domain) for each in natural
@@ -175,6 +176,7 @@ class DiffusionOnMesh:
         else:
             self.V = earlier.V
         self._earlier = earlier
+        self._ends: tuple[Int32Array, Int32Array, IndexArray] | None = None
         self.moments = Moments(compiled, domain, self.V, source, rate, earlier)
 
     def renewed(self, source: FloatArray | None, rate: FloatArray) -> DiffusionOnMesh:
@@ -236,7 +238,8 @@ class DiffusionOnMesh:
         before: Callable[[DiffusionOnMesh], tuple[OnFacets, ...]],
     ) -> tuple[OnFacets, ...]:
         """Sample data on facets, with their signs, unless they are what they were."""
-        if self._earlier is not None and not any(may_change(datum) for *_, datum in data):
+        changing = self.compiled.may_change
+        if self._earlier is not None and not any(changing(datum) for *_, datum in data):
             return before(self._earlier)
         return tuple(
             OnFacets.of(condition, self.compiled.trace(datum), self.domain, sign)
@@ -254,12 +257,16 @@ class DiffusionOnMesh:
 
     @cached_property
     def fixed(self) -> tuple[Imposed, ...]:
-        """u_D on Γ0."""
+        """u_D on Γ0; the same object as before where that is what it was."""
+        if self._earlier is not None and self.u_D is self._earlier.u_D:
+            return self._earlier.fixed
         return tuple(on_facets.imposed for on_facets in self.u_D)
 
     @cached_property
     def bounds(self) -> tuple[Imposed, ...]:
-        """α and −β on Γ1."""
+        """α and −β on Γ1; the same object as before where that is what it was."""
+        if self._earlier is not None and self.alpha is self._earlier.alpha:
+            return self._earlier.bounds
         return tuple(on_facets.imposed for on_facets in self.alpha)
 
     def chi(self) -> FloatArray:
@@ -308,13 +315,28 @@ class DiffusionOnMesh:
 
     def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
         """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
-        mesh = self.domain.mesh
-        cells, local = facet_entities(mesh, facets).T
-        return np.take_along_axis(vertex_values(u, cells), facet_corners(mesh)[local], axis=1)
+        if self._earlier is not None:
+            return self._earlier.at_vertices(u, facets)
+        if self._ends is None or self._ends[0] is not facets:
+            cells, local = facet_entities(self.domain.mesh, facets).T
+            self._ends = facets, cells, facet_corners(self.domain.mesh)[local]
+        _, cells, corners = self._ends
+        return np.take_along_axis(vertex_values(u, cells), corners, axis=1)
 
     def energy(self, u: fem.Function) -> float:
         """a_h(u, u), this rank's cells' share."""
-        return float(fem.assemble_scalar(self.forms.a_of_w.on(self.domain, (), [u])))
+        if self._earlier is None:
+            form = self.forms.a_of_w.on(self.domain, (), [u])
+        else:
+            w, form = self._earlier._a_of_w
+            w.x.array[:] = u.x.array
+        return float(fem.assemble_scalar(form))
+
+    @cached_property
+    def _a_of_w(self) -> tuple[fem.Function, fem.Form]:
+        """A function w and a_h(w, w), for those who ask again and again."""
+        w = fem.Function(self.V)
+        return w, self.forms.a_of_w.on(self.domain, (), [w])
 
     def _assembled(self, kernel: Kernel | None) -> FloatArray:
         nodes, block = self.V.dofmap.index_map, self.V.dofmap.index_map_bs

@@ -73,18 +73,19 @@ class VolumeMoments:
         k = len(w)
         total = sum_rows(w)
         middle = total / k
-        hats = (w - middle) / (k * (k + 1))  # means of (w − w_T) λ_i
-        variance = dot_rows(w - middle, hats)
-        rows = [*hats, *((total / 45.0 - w / 15.0) if k == 3 else np.zeros_like(w))]
-        if self.hats is None or self.bumps is None or self.variance is None:
-            return VolumeMoments(self.mean - c * middle, -c * np.stack(rows), c**2 * variance)
-        variance = self.variance - 2.0 * c * dot_rows(w, self.hats) + c**2 * variance
-        of_f = [*self.hats, *self.bumps]
-        return VolumeMoments(
-            self.mean - c * middle,
-            np.stack([a - c * b for a, b in zip(of_f, rows, strict=True)]),
-            np.maximum(variance, 0.0),
-        )
+        deviation, rows = w - middle, np.zeros((2 * k, w.shape[1]))
+        hats = np.divide(deviation, k * (k + 1), out=rows[:k])  # means of (w − w_T) λ_i
+        variance = dot_rows(deviation, hats)
+        if k == 3:
+            rows[k:] = total / 45.0 - w / 15.0
+        rows *= -c
+        variance *= c**2
+        if self.hats is not None and self.bumps is not None and self.variance is not None:
+            rows[:k] += self.hats
+            rows[k:] += self.bumps
+            variance += self.variance - 2.0 * c * dot_rows(w, self.hats)
+            np.maximum(variance, 0.0, out=variance)
+        return VolumeMoments(self.mean - c * middle, rows, variance)
 
     @classmethod
     def of(cls, f: Volume, cells: Cells) -> VolumeMoments:
@@ -635,6 +636,8 @@ def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> F
     for part in blocks(cells.number):
         values[:, part] = load.shares(cells, part)
     for edge in edges:
+        if edge.g.vanishes:
+            continue
         for row, share in zip(values, edge.to_cells(), strict=True):
             np.add.at(row, edge.side.cells, share)
     return cells.over_facets(values, shared=False)

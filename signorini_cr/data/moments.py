@@ -25,7 +25,7 @@ from ufl.core.expr import Expr
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import BoundaryFacets, Cells
-from ..fem.conditions import Condition
+from ..fem.conditions import Condition, may_change
 from ..fem.physics import Imposed
 from ..fem.problem import Forms, number
 from ..fem.simplified import simplified
@@ -581,6 +581,7 @@ class Compiled:
         self._rule = Rule(forms.mesh, forms.problem.quadrature_degree)
         self._traces: dict[Expr, Trace] = {}
         self._by_cells: dict[Expr, fem.Expression] = {}
+        self._changing: dict[Expr, bool] = {}
 
     @cached_property
     def f(self) -> Volume:
@@ -600,6 +601,12 @@ class Compiled:
             found = compat.compile_expression(expression, middle, self.forms.mesh)
             self._by_cells[expression] = found
         return self._by_cells[expression]
+
+    def may_change(self, expression: Expr) -> bool:
+        """As `conditions.may_change`, found out once: UFL goes through the whole expression."""
+        if expression not in self._changing:
+            self._changing[expression] = may_change(expression)
+        return self._changing[expression]
 
     def trace(self, expression: Expr) -> Trace:
         """Values of a condition's datum on facets; collective."""

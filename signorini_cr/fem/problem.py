@@ -347,7 +347,7 @@ class Forms:
         """The conditions that bound u: their parts make Γ1."""
         return tuple(c for c in self.conditions if c.bounds)
 
-    @property
+    @cached_property
     def natural(self) -> tuple[Condition, ...]:
         """The conditions that know of a flux."""
         return tuple(c for c in self.conditions if c.flux is not None)
@@ -404,7 +404,7 @@ class Forms:
         """Whether κ is a number on each cell of the coarsest mesh."""
         return self.problem.form is None and (self.uniform or is_by_cells(self.kappa))
 
-    @property
+    @cached_property
     def loaded(self) -> bool:
         """Whether f or a flux is more than the number 0."""
         return any(number(data) != 0.0 for data in (self.f, *(c.flux for c in self.natural)))

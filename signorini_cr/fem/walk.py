@@ -2,45 +2,98 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from dolfinx.mesh import Mesh
+from mpi4py import MPI
 
-from ..arrays import FloatArray, Int32Array, Int64Array
+from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from .space import facet_entities
 
 
-def along_boundary(
-    mesh: Mesh, facets: Int32Array, fields: dict[str, npt.NDArray]
-) -> tuple[dict[str, npt.NDArray] | None, FloatArray]:
-    """Sort the contact facets along the boundary and find the transition points; collective.
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """The order of the contact facets of all ranks, known to rank 0 alone.
 
     A surface has no such order: for d = 3 the facets are sorted by their midpoints, arc_length
     is NaN, and there are no transition points.
 
-    Args:
-        mesh: The mesh.
-        facets: The contact facets that this rank owns, shape (n,).
-        fields: What `Contact` has of them: vertices, measure, obstacle, upper, u, pressure, active
-            and gap_at_vertices.
-
-    Returns:
-        The table on rank 0 (None elsewhere), and the transition points on all ranks.
+    Attributes:
+        comm: The ranks.
+        place: Columns that depend on nothing but the mesh, in that order: part, arc_length, x, y
+            and length; none on other ranks.
+        order: The order, shape (n,).
+        way: What transition points are found with, for d = 2.
     """
-    columns = dict(fields)
-    if mesh.topology.dim == 2:
-        columns["reverse"] = _clockwise(mesh, facets, fields["vertices"])
-    gathered = mesh.comm.gather(columns, root=0)
-    table = None
-    transitions: FloatArray = np.zeros((0, 3))
-    if gathered is not None:
-        rows = {name: np.concatenate([part[name] for part in gathered]) for name in columns}
-        if "reverse" in rows:
-            table, transitions = _ordered(rows)
-        else:
-            table = _by_position(rows)
-    return table, mesh.comm.bcast(transitions, root=0)
+
+    comm: MPI.Comm
+    place: dict[str, npt.NDArray]
+    order: Int64Array
+    way: _Way | None
+
+    @classmethod
+    def of(cls, mesh: Mesh, facets: Int32Array, vertices: FloatArray, measure: FloatArray) -> Walk:
+        """Find it; collective.
+
+        Args:
+            mesh: The mesh.
+            facets: The contact facets that this rank owns, shape (n,).
+            vertices: Their vertices' coordinates, shape (n, d, 3).
+            measure: Their measures, shape (n,).
+        """
+        columns: dict[str, npt.NDArray] = {"vertices": vertices, "measure": measure}
+        if mesh.topology.dim == 2:
+            columns["reverse"] = _clockwise(mesh, facets, vertices)
+        rows = _gathered(mesh.comm, columns)
+        if not rows:
+            return cls(mesh.comm, {}, np.empty(0, dtype=np.int64), None)
+        midpoints, length = rows["vertices"].mean(axis=1), rows["measure"]
+        # The same order whatever the ranks held: by coordinates first
+        order, way = np.lexsort(midpoints.T[::-1]), None
+        part: Int64Array = np.zeros(len(order), dtype=np.int64)
+        arc_length: FloatArray = np.full(len(order), np.nan)
+        if mesh.topology.dim == 2:
+            way, part, arc_length = _Way.of(rows["vertices"], rows["reverse"], length, order)
+            order = np.lexsort([way.steps, part])
+        place = {"part": part, "arc_length": arc_length, "x": midpoints[:, 0]}
+        place |= {"y": midpoints[:, 1], "length": length}
+        return cls(mesh.comm, {name: each[order] for name, each in place.items()}, order, way)
+
+    def along(
+        self, fields: dict[str, npt.NDArray]
+    ) -> tuple[dict[str, npt.NDArray] | None, FloatArray]:
+        """Sort what is found on the facets, and find the transition points; collective.
+
+        Args:
+            fields: What `Contact` has of them: obstacle, upper, u, pressure, active and
+                gap_at_vertices.
+
+        Returns:
+            The table on rank 0 (None elsewhere), and the transition points on all ranks.
+        """
+        rows = _gathered(self.comm, fields)
+        transitions: FloatArray = np.zeros((0, 3))
+        if rows and self.way is not None:
+            transitions = self.way.transitions(rows)
+        if self.comm.size > 1:
+            transitions = self.comm.bcast(transitions, root=0)
+        if not rows:
+            return None, transitions
+        place = {name: column.copy() for name, column in self.place.items()}
+        return place | _columns(rows, self.order), transitions
+
+
+def _gathered(comm: MPI.Comm, columns: dict[str, npt.NDArray]) -> dict[str, npt.NDArray]:
+    """The columns of all ranks on rank 0, one below the other; none on other ranks; collective."""
+    if comm.size == 1:
+        return columns
+    gathered = comm.gather(columns, root=0)
+    if gathered is None:
+        return {}
+    return {name: np.concatenate([part[name] for part in gathered]) for name in columns}
 
 
 def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDArray:
@@ -51,42 +104,59 @@ def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDAr
     return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
 
 
-def _columns(
-    rows: dict[str, npt.NDArray], part: npt.NDArray, arc_length: FloatArray
-) -> dict[str, npt.NDArray]:
-    """The columns of the table, rows in the order they are in."""
-    midpoints = rows["vertices"].mean(axis=1)
+def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.NDArray]:
+    """The columns of the table that depend on the solution or its bounds."""
     names = ["obstacle", "upper"] if np.isfinite(rows["upper"]).any() else ["obstacle"]
     bounds = {name: np.where(np.isfinite(rows[name]), rows[name], np.nan) for name in names}
     given = bounds | {name: rows[name] for name in ("u", "pressure", "active")}
-    place = {"part": part, "arc_length": arc_length, "x": midpoints[:, 0], "y": midpoints[:, 1]}
-    return place | {"length": rows["measure"]} | given
+    return {name: column[order] for name, column in given.items()}
 
 
-def _by_position(rows: dict[str, npt.NDArray]) -> dict[str, npt.NDArray]:
-    """Sort the facets of a surface by their midpoints."""
-    order = np.lexsort(rows["vertices"].mean(axis=1).T[::-1])
-    table = _columns(rows, np.zeros(len(order), dtype=np.int64), np.full(len(order), np.nan))
-    return {name: column[order] for name, column in table.items()}
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """How the boundary passes through the contact facets, Ω to the left.
 
+    Attributes:
+        ends: Vertices in that order, shape (n, 2, 3).
+        flip: Whether they have changed places, shape (n,).
+        before: For each facet the one that ends where it begins, itself where there is none.
+        part: The connected piece of Γ1, from 0.
+        steps: How many facets there are from the first one of it.
+    """
 
-def _ordered(rows: dict[str, npt.NDArray]) -> tuple[dict[str, npt.NDArray], FloatArray]:
-    """Put facets in the order in which the boundary passes through them, Ω to the left."""
-    flip = rows["reverse"]
-    ends = np.where(flip[:, None, None], rows["vertices"][:, ::-1], rows["vertices"])
-    gaps = np.where(flip[:, None], rows["gap_at_vertices"][:, ::-1], rows["gap_at_vertices"])
-    before = _predecessors(ends)
-    # The same order whatever the ranks held: by coordinates first
-    rank = np.empty(len(ends), dtype=np.int64)
-    rank[np.lexsort(ends.mean(axis=1).T[::-1])] = np.arange(len(ends))
-    length = rows["measure"]
-    first, steps, distance = _way_from_first(_cut(before, rank), length)
-    part = np.unique(rank[first], return_inverse=True)[1]
-    order = np.lexsort([steps, rank[first]])
-    table = _columns(rows, part, distance + 0.5 * length[first])
-    points, behind = _transitions(before, ends, gaps, rows)
-    along = np.lexsort([steps[behind], part[behind]])
-    return {name: column[order] for name, column in table.items()}, points[along]
+    ends: FloatArray
+    flip: BoolArray
+    before: Int64Array
+    part: Int64Array
+    steps: Int64Array
+
+    @classmethod
+    def of(
+        cls, vertices: FloatArray, flip: BoolArray, length: FloatArray, sorted_: Int64Array
+    ) -> tuple[_Way, Int64Array, FloatArray]:
+        """Find it, and the part of each facet and how far its midpoint is from the beginning.
+
+        Args:
+            vertices: Shape (n, 2, 3).
+            flip: Whether Ω lies to the right, shape (n,).
+            length: Shape (n,).
+            sorted_: The facets by their position.
+        """
+        ends = np.where(flip[:, None, None], vertices[:, ::-1], vertices)
+        before = _predecessors(ends)
+        rank = np.empty(len(ends), dtype=np.int64)
+        rank[sorted_] = np.arange(len(ends))
+        first, steps, distance = _way_from_first(_cut(before, rank), length)
+        part = np.unique(rank[first], return_inverse=True)[1]
+        return cls(ends, flip, before, part, steps), part, distance + 0.5 * length[first]
+
+    def transitions(self, rows: dict[str, npt.NDArray]) -> FloatArray:
+        """Find the transition points, in order along the boundary, shape (m, 3)."""
+        gaps = rows["gap_at_vertices"]
+        gaps = np.where(self.flip[:, None], gaps[:, ::-1], gaps)
+        points, behind = _transitions(self.before, self.ends, gaps, rows)
+        found: FloatArray = points[np.lexsort([self.steps[behind], self.part[behind]])]
+        return found
 
 
 def _predecessors(ends: FloatArray) -> Int64Array:

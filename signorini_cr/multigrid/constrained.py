@@ -67,6 +67,7 @@ class ConstrainedMatrix:
         sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
         self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)
         self._product = self._rows.createVecLeft()
+        self._magnitudes: PETSc.Mat | None = None
         # All own rows with an entry in such a column, as the pattern is symmetric
         near = self._marks(column)
         near_numbers = numbers_of(A, np.flatnonzero(near))
@@ -120,13 +121,15 @@ class ConstrainedMatrix:
 
     def magnitude(self, x: PETSc.Vec) -> FloatArray:
         """|A| |x| in the dofs that can be constrained, shape (n,): what a row of A x is made of."""
-        rows, sizes = self._rows.duplicate(copy=True), x.duplicate()
-        start, column, value = rows.getValuesCSR()
-        rows.setValuesCSR(start, column, np.abs(value))
-        rows.assemble()
+        if self._magnitudes is None:
+            self._magnitudes = self._rows.duplicate(copy=True)
+            start, column, value = self._rows.getValuesCSR()
+            self._magnitudes.setValuesCSR(start, column, np.abs(value))
+            self._magnitudes.assemble()
+        sizes = x.duplicate()
         sizes.array[:] = np.abs(x.array_r)
-        rows.mult(sizes, self._product)
-        release(rows, sizes)
+        self._magnitudes.mult(sizes, self._product)
+        release(sizes)
         return self._product.array_r.copy()
 
     def flows(self, x: PETSc.Vec, b: PETSc.Vec) -> FloatArray:
@@ -144,7 +147,7 @@ class ConstrainedMatrix:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the matrix."""
-        release(self._rows, self._product, self._at_columns, self._to_columns)
+        release(self._rows, self._magnitudes, self._product, self._at_columns, self._to_columns)
 
     def _marks(self, numbers: Int32Array) -> BoolArray:
         """Which owned dofs any rank names by their global numbers; collective."""

@@ -38,6 +38,7 @@ from .constrained import ConstrainedMatrix, numbers_of
 from .parents import Layout
 from .smoothing import smoother
 from .transfer import Transfer
+from .whole import Whole
 
 PATIENCE = 40
 """CG steps on one mesh after which the chain is given up in a linear system that takes many.
@@ -80,6 +81,7 @@ class Grid:
         transfer: Transfer | None = None,
         sweeps: int = SWEEPS,
         alone: bool = False,
+        whole: bool = False,
     ):
         """Prepare a space for the cycle; collective.
 
@@ -90,11 +92,14 @@ class Grid:
             transfer: What writes functions of the next coarser space in this one, if there is one.
             sweeps: Number of sweeps of the smoother before and after.
             alone: Whether this takes the place of a chain.
+            whole: Whether it does so from the beginning, by `Whole`.
         """
         self.operator, self.dofs, self.dirichlet = operator, dofs, dirichlet
         self.transfer, self._sweeps, self.held = transfer, sweeps, dirichlet
-        self.solver: Bottom | TwoGrids
-        if transfer is None:
+        self.solver: Bottom | TwoGrids | Whole
+        if whole:
+            self.solver = Whole(self.matrix, operator.dofs)
+        elif transfer is None:
             self.solver = Bottom(self.matrix, dofs.cells.shape[1] - 1, alone)
         else:
             self.solver = TwoGrids(self.matrix, dofs, transfer, sweeps)
@@ -256,7 +261,7 @@ class Multigrid:
     def describe(self) -> str:
         """What the cycle is, in words."""
         bottom = self.grids[-1].solver
-        assert isinstance(bottom, Bottom)
+        assert not isinstance(bottom, TwoGrids)
         if self.given_up:
             where = " on a coarser mesh" if self._inherited else ""
             return bottom.describe(f", as multigrid took {PATIENCE} CG steps{where}")

@@ -43,6 +43,7 @@ from .cycle import (
 from .parents import Layout, Parents
 from .pattern import empty_matrix
 from .transfer import Transfer, inclusion, prolongation
+from .whole import Whole, suits_whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,14 +117,17 @@ class Hierarchy:
         self.meshes = (*self.meshes, NestedMesh(finest.physics, domain, parents))
 
     @contextmanager
-    def multigrid(self, operator: ConstrainedMatrix, dirichlet: Int32Array) -> Iterator[Multigrid]:
+    def multigrid(
+        self, operator: ConstrainedMatrix, dirichlet: Int32Array, again: bool = False
+    ) -> Iterator[Multigrid]:
         """Lend the cycle that starts with the discrete space on the finest mesh; collective.
 
         Args:
             operator: The space's matrix, the identity in the rows and columns of the dofs on Γ0.
             dirichlet: Its owned dofs on Γ0, local numbers.
+            again: Whether the matrix as it is, definite, will be solved with again and again.
         """
-        grid = self._discrete_space(operator, dirichlet)
+        grid = self._discrete_space(operator, dirichlet, again)
         below = [] if grid.transfer is None else self._chain
         cycle = Multigrid(
             [grid, *reversed(below)],
@@ -149,10 +153,19 @@ class Hierarchy:
         self._free_operators()
         self._chain = []
 
-    def _discrete_space(self, operator: ConstrainedMatrix, dirichlet: Int32Array) -> Grid:
+    def _discrete_space(
+        self, operator: ConstrainedMatrix, dirichlet: Int32Array, again: bool
+    ) -> Grid:
         """Prepare the discrete space, and the chain below it if there is to be one."""
         mesh = self.meshes[-1]
         dofs = Layout.of_space(mesh.V)
+        if again and suits_whole(
+            operator.matrix, mesh.domain.mesh.topology.dim, len(operator.dofs)
+        ):
+            grid = Grid(operator, dofs, dirichlet, whole=True)
+            if isinstance(grid.solver, Whole) and grid.solver.is_accurate():
+                return grid
+            _free(grid)
         if self._given_up or not (dofs.cr or mesh.parents):
             return Grid(operator, dofs, dirichlet, alone=self._given_up)
         while len(self._chain) < max(len(self.meshes) - 1, 1):

@@ -16,8 +16,7 @@ from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.physics import OnMesh
-from ..fem.space import facet_measures
-from ..fem.walk import along_boundary
+from ..fem.space import ghosted_vector
 from ..garbage import release
 from ..multigrid.parents import Layout
 from .active import ActiveSet
@@ -140,16 +139,15 @@ def contact_facts(
         iterations: What the solver says about its errors.
     """
     mesh, facets, dofs = data.domain.mesh, system.bounded_facets, system.contact_dofs
-    vertices, measure = facet_measures(mesh, facets)
+    there = system.contact_facets
+    measure = there.measure
     at_dofs = _AtDofs.of(system, u, residual, 0.0 if iterations.extended else NOISE)
-    layout, total = Layout.of_space(u.function_space), _Totals(mesh.comm)
-    share = np.zeros(len(u.x.array))  # of Γ1 that is a dof's
-    np.add.at(share, dofs, (measure / dofs.shape[1])[:, None])
-    pressure = at_dofs.force / layout.shared_sum(share)[system.bounded]
+    layout = Layout.of_space(u.function_space)
+    pressure = at_dofs.force / there.share
 
     def on_facets(values: FloatArray) -> FloatArray:
         """Values at bounded dofs, 0 at others, as the facets see them."""
-        everywhere = np.zeros(len(share))
+        everywhere = np.zeros(len(u.x.array))
         everywhere[system.bounded] = values
         return layout.shared_sum(everywhere)[dofs]
 
@@ -160,8 +158,6 @@ def contact_facts(
     offset = system.offset
     means = dofs.shape[1] > 1
     fields: dict[str, npt.NDArray] = {
-        "vertices": vertices,
-        "measure": measure,
         "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]) + offset,
         "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]) + offset,
         "u": local.mean(axis=1) + offset,
@@ -169,24 +165,38 @@ def contact_facts(
         "active": is_active,
         "gap_at_vertices": np.minimum(local - (below - offset), above - offset - local),
     }
-    table, transitions = along_boundary(mesh, facets, fields)
-    of_load = float(np.sqrt(total.sum(at_dofs.left @ at_dofs.left))) / (
-        system.residual_scale or 1.0
-    )
+    table, transitions = there.walk.along(fields)
+    sums = [
+        np.sum(at_dofs.force),
+        np.sum(measure[is_active]),
+        len(facets),
+        np.sum(is_active),
+        np.sum(np.abs(at_dofs.force * at_dofs.gap)),
+        at_dofs.left @ at_dofs.left,
+    ]
+    ends = at_dofs.gap, at_dofs.side * pressure
+    least = np.array([np.min(each, initial=np.inf) for each in ends])
+    comm = mesh.comm
+    force, length, number, number_active, complementarity, squares = comm.allreduce(np.array(sums))
+    comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+    min_gap, min_pressure = least
+    of_load = float(np.sqrt(squares)) / (system.residual_scale or 1.0)
     return Contact(
-        comm=mesh.comm,
+        comm=comm,
         facets=facets,
+        vertices=there.vertices,
+        measure=measure,
         **fields,
         active_set=at_dofs.active,
-        force=total.sum(at_dofs.force),
-        length=total.sum(measure[is_active]),
-        number=int(total.sum(np.ones(len(facets)))),
-        number_active=int(total.sum(is_active)),
+        force=float(force),
+        length=float(length),
+        number=int(number),
+        number_active=int(number_active),
         transitions=transitions,
         kkt=Kkt(
-            min_gap=total.min(at_dofs.gap),
-            min_pressure=total.min(at_dofs.side * pressure) + 0.0,  # no -0
-            complementarity=total.sum(np.abs(at_dofs.force * at_dofs.gap)),
+            min_gap=float(min_gap),
+            min_pressure=float(min_pressure) + 0.0,  # no -0
+            complementarity=float(complementarity),
             residual=max(of_load, iterations.imbalance),
             force_error=iterations.force_error,
         ),
@@ -219,8 +229,9 @@ class _AtDofs:
     ) -> _AtDofs:
         """Compare what is there with what rounding makes of it, in parts; collective."""
         bounded = system.bounded
-        with system.vectors(u, residual) as vectors:
-            terms = system.operator.magnitude(vectors.x) + np.abs(system.b.x.array[bounded])
+        vector = ghosted_vector(u.function_space, u.x.array)
+        terms = system.operator.magnitude(vector) + np.abs(system.b.x.array[bounded])
+        release(vector)
         entries = system.A.getDiagonal()
         diagonal = entries.array_r.copy()
         release(entries)
@@ -238,16 +249,3 @@ class _AtDofs:
 def _bound(values: FloatArray) -> FloatArray:
     """Bounds as they are told: infinite where PETSc's number says that there is none."""
     return np.where(np.abs(values) < PETSc.INFINITY, values, np.copysign(np.inf, values))
-
-
-class _Totals:
-    """Reductions over all ranks of arrays that may be empty on some."""
-
-    def __init__(self, comm: MPI.Comm):
-        self.comm = comm
-
-    def sum(self, values: npt.ArrayLike) -> float:
-        return float(self.comm.allreduce(float(np.sum(values))))
-
-    def min(self, values: npt.NDArray) -> float:
-        return float(self.comm.allreduce(float(np.min(values, initial=np.inf)), op=MPI.MIN))

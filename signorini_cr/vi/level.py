@@ -85,5 +85,7 @@ class Level:
         """Pieces without a Dirichlet facet, None if there are none."""
         if self.held:
             return None
-        found = Loose.of(self.V, self.system.held)
+        found = Loose.of(self.V, self.system.dirichlet)
+        if found.count:  # what else may hold them takes a form of its own to be known
+            found = Loose.of(self.V, self.system.held)
         return found if found.count else None

@@ -22,6 +22,7 @@ the obstacle that rounding decides whether it touches, the solver goes on to twi
 from __future__ import annotations
 
 from collections.abc import Callable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from mpi4py import MPI
@@ -145,7 +146,9 @@ class Stiffness:
             b: Right-hand side.
         """
         if self._window is None:
-            self._window = _windows(self._grid)
+            if self._grid not in _known_windows:
+                _known_windows[self._grid] = _windows(self._grid)
+            self._window = _known_windows[self._grid]
         made_of = self._grid.operator.flows(x, b)
         around: FloatArray = np.zeros(WINDOWS**3)
         np.maximum.at(around, self._window, made_of)
@@ -233,6 +236,10 @@ class Stiffness:
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free the differences."""
         release(self._differences)
+
+
+_known_windows: WeakKeyDictionary[Grid, IndexArray] = WeakKeyDictionary()
+"""Those of grids that may be solved on again."""
 
 
 def _windows(grid: Grid) -> IndexArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from dolfinx import fem
@@ -16,7 +17,8 @@ from scipy.linalg.blas import dasum
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import InputError, raise_together
 from ..fem.physics import Imposed, OnMesh
-from ..fem.space import ghosted_vector, shared_maximum, unknowns
+from ..fem.space import facet_measures, ghosted_vector, shared_maximum, unknowns
+from ..fem.walk import Walk
 from ..garbage import release
 from ..multigrid.constrained import ConstrainedMatrix
 from ..multigrid.parents import Layout
@@ -52,6 +54,34 @@ class Vectors:
     upper: PETSc.Vec
     x: PETSc.Vec
     residual: PETSc.Vec
+
+
+@dataclass(frozen=True, eq=False)
+class ContactFacets:
+    """Where the owned facets of Γ1 are, whatever holds there.
+
+    Attributes:
+        vertices: Their vertices' coordinates, shape (n, d, 3).
+        measure: Their length, shape (n,).
+        share: What part of Γ1 is a dof's with a bound, by its measure, shape (dofs,).
+        walk: Their order.
+    """
+
+    vertices: FloatArray
+    measure: FloatArray
+    share: FloatArray
+    walk: Walk
+
+    @classmethod
+    def of(cls, system: System) -> ContactFacets:
+        """Look at a system's mesh; collective."""
+        V, dofs = system.u_D.function_space, system.contact_dofs
+        vertices, measure = facet_measures(V.mesh, system.bounded_facets)
+        share: FloatArray = np.zeros(len(system.u_D.x.array))
+        np.add.at(share, dofs, (measure / dofs.shape[1])[:, None])
+        share = Layout.of_space(V).shared_sum(share)[system.bounded]
+        walk = Walk.of(V.mesh, system.bounded_facets, vertices, measure)
+        return cls(vertices, measure, share, walk)
 
 
 class System:
@@ -92,30 +122,27 @@ class System:
         Raises:
             InputError: Data are not finite, or κ is not above 0.
         """
-        self._data, V = data, data.V
+        self._data, self._like, V = data, like, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
         if like is not None and data.fixed is like._data.fixed and data.bounds is like._data.bounds:
             self._take_boundary(like)
         else:
             self._read_boundary(layout.size[0])
-        bc, a = self._bc(self.u_D), data.a
         if like is None:
-            self.A = _assembled(a, bc, layout)
+            self.A = _assembled(data.a, self._bc(self.u_D), layout)
             self.operator = ConstrainedMatrix(self.A, self.bounded)
         else:
             self.A, self.operator = like.A, like.operator
         self.chi = fem.Function(V)
         self.chi.x.array[:] = data.chi()
+        layout.shared_sum(self.chi.x.array)
+        same = like if like is not None and self.u_D is like.u_D else None
         self.b = fem.Function(V)
         self.b.x.array[:] = self.chi.x.array
-        if self.offset and (of_constants := data.of_constants()) is not None:
-            self.b.x.array[:] -= self.offset * of_constants
-        fem.apply_lifting(self.b.x.array, [a], [[bc]])
-        for vector in (self.chi, self.b):
-            layout.shared_sum(vector.x.array)
+        self.b.x.array[:] += self._lifting() if same is None else same._known_lifting
         self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b.x.array)
-        self.residual_scale = self._scale()
+        self.residual_scale = self._scale(self._trivial() if same is None else same._known_trivial)
 
     def _read_boundary(self, owned: int) -> None:
         """Take values and bounds from the data; collective.
@@ -161,19 +188,58 @@ class System:
         self.contact_dofs: Int32Array = like.contact_dofs
         self.obstacles_at_vertices: FloatArray = like.obstacles_at_vertices
 
-    def _scale(self) -> float:
-        """Measure the trivial start's residual; collective."""
+    def _lifting(self) -> FloatArray:
+        """What u_D and the offset add to b, ghosts up to date, shape (dofs,); collective."""
+        found: FloatArray = np.zeros(len(self.u_D.x.array))
+        if self.offset and (of_constants := self._data.of_constants()) is not None:
+            found -= self.offset * of_constants
+        fem.apply_lifting(found, [self._data.a], [[self._bc(self.u_D)]])
+        return Layout.of_space(self._data.V).shared_sum(found)
+
+    @cached_property
+    def _known_lifting(self) -> FloatArray:
+        """The same for those who have the same values, and ask again and again."""
+        return self._lifting()
+
+    @cached_property
+    def contact_facets(self) -> ContactFacets:
+        """The facets of Γ1; found when first asked for, collectively."""
+        return ContactFacets.of(self) if self._like is None else self._like.contact_facets
+
+    @cached_property
+    def _known_trivial(self) -> list[FloatArray]:
+        """As `_trivial` has it, for those who have the same values, and ask again and again."""
+        return self._trivial()
+
+    def _trivial(self) -> list[FloatArray]:
+        """A times the most trivial start, and A times that without its constant; collective."""
         bounded = (self.lower > PETSc.NINFINITY) | (self.upper < PETSc.INFINITY)
         comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
         bottom, top = _range(comm, values)
         middle = 0.5 * (bottom + top) if bottom <= top else 0.0
-        norms = []
+        products, start = [], self.A.createVecRight()
+        product, owned = self.A.createVecLeft(), self.A.getLocalSize()[0]
+        dirichlet, bounded = self.owned_dirichlet, bounded[:owned]
         for number in dict.fromkeys((middle, -self.offset)):
-            start, residual = (fem.Function(self.u_D.function_space) for _ in range(2))
-            start.x.array[:] = number
-            start.x.array[self.dirichlet] = values
-            start.x.array[bounded] = np.clip(number, self.lower[bounded], self.upper[bounded])
-            norms.append(self.residual(start, residual))
+            start.array[:] = number
+            start.array[dirichlet] = self.u_D.x.array[dirichlet]
+            own = self.lower[:owned][bounded], self.upper[:owned][bounded]
+            start.array[bounded] = np.clip(number, *own)
+            self.A.mult(start, product)
+            products.append(product.array_r.copy())
+        release(start, product)
+        return products
+
+    def _scale(self, trivial: Sequence[FloatArray]) -> float:
+        """Measure the trivial start's residual; collective.
+
+        Args:
+            trivial: As `_trivial` has it.
+        """
+        comm, b = self._data.V.mesh.comm, self.b.x.array[: self.A.getLocalSize()[0]]
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = np.array([np.sum((each - b) ** 2) for each in trivial])
+        norms = np.sqrt(comm.allreduce(squares))
         scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
         if not np.isfinite(norms).all():
             raise InputError("data: so large that their squares overflow; choose other units")
