@@ -112,7 +112,8 @@ def test_bounds_have_their_names(bounds, names, signs):
         return
     axes = figure.axes[0]
     assert axes.get_ylabel() == f"{signs}, facet means"
-    assert [text.get_text() for text in axes.texts] == ["$u_h$", *names]
+    # they stand in the order of their heights, which the mesh decides
+    assert sorted(text.get_text() for text in axes.texts) == sorted(["$u_h$", *names])
 
 
 def test_the_mark_sits_where_the_bar_ends():

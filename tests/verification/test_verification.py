@@ -112,7 +112,7 @@ def test_quick_suite_passes(shared_tmp_path):
     assert "**no**" not in text
     for title in ("Contact forces", "Random problems", "Bounds and energies", "Thin cells"):
         assert title in text
-    assert len(re.findall(r"\| yes \|", text)) == 4 + 2 + len(manufactured.CLASSES) + 2
+    assert len(re.findall(r"\| yes \|", text)) == 4 + 2 + len(manufactured.CLASSES) + 4
 
 
 def test_no_bound_is_below_the_error_however_loose():
