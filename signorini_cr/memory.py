@@ -22,7 +22,9 @@ _WORDS = (
     "std::bad_alloc",
     "Cannot allocate memory",
     "failed to map segment",  # of a library that is being loaded
-    "returned NULL without setting an exception",  # what Python says that has no room for an error
+    # what Python says that has no room for an error
+    "returned NULL without setting an exception",
+    "error return without exception set",
     "MemoryError",  # what the other ranks are told of a rank's error, see errors.fail_together
 )
 
