@@ -2,7 +2,7 @@
 run = ./container/run
 
 # A rank that fails can leave the others waiting; no run goes without an end.
-limit = timeout --kill-after=20 1500
+limit = timeout --kill-after=20 2400
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
