@@ -312,14 +312,13 @@ class System:
         """Bound of what rounding of u_D and of the loads may change in b, summed up; collective."""
         owned, fixed = self.A.getLocalSize()[0], self.owned_dirichlet
         b, chi = self.b.x.array[:owned], self.chi.x.array[:owned]
-        # BLAS needs no array for absolute values; on Γ0 b has u_D, which is no force
-        b[fixed], values = 0.0, b[fixed]
-        size = dasum(b) + 2.0 * dasum(chi)  # b − χ is u_D's share
+        b[fixed], values = 0.0, b[fixed]  # on Γ0 b has u_D, which is no force
+        size = _sum_of_sizes(b) + 2.0 * _sum_of_sizes(chi)  # b − χ is u_D's share
         b[fixed] = values
         if self.offset:
             sums = self.row_sums()
             sums[fixed] = 0.0
-            size += abs(self.offset) * dasum(sums)
+            size += abs(self.offset) * _sum_of_sizes(sums)
         return DATUM * float(self.u_D.function_space.mesh.comm.allreduce(float(size)))
 
     def data_rounding(self, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -367,6 +366,11 @@ class System:
             vector.destroy()
         r.x.scatter_forward()
         return norm
+
+
+def _sum_of_sizes(values: FloatArray) -> float:
+    """Sum up absolute values; BLAS makes no array of them, but refuses an empty one."""
+    return float(dasum(values)) if len(values) else 0.0
 
 
 def _range(comm: MPI.Comm, values: FloatArray) -> tuple[float, float]:
