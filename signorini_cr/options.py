@@ -5,15 +5,19 @@ from __future__ import annotations
 import atexit
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
+from typing import ParamSpec, TypeVar
 
 from petsc4py import PETSc
 
 from .errors import InputError
 from .garbage import release
 from .memory import ran_out_of_memory
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 PREFIX = "signorini_"
 """Prefix of the PETSc options that reach the solver, as in ``-signorini_snes_atol 1e-12``."""
@@ -221,18 +225,33 @@ def read_word(name: str, allowed: Sequence[str]) -> str:
 
 
 @contextmanager
-def explained() -> Iterator[None]:
+def explained() -> Iterator[Callable[[Callable[P, T]], Callable[P, T]]]:
     """Say what is behind errors of PETSc in a block.
 
-    What Python code raises that PETSc calls, a monitor for one, comes out as it was raised.
+    What Python code raises that PETSc calls, a monitor for one, comes out as it was raised. PETSc
+    hands on a number only, and the exception, which is pending meanwhile, gets lost where Python
+    happens to collect its garbage on the way; so a function is to be given to PETSc as the
+    context makes it, which keeps what it raises.
 
     Raises:
         InputError: PETSc stopped, and options have been set.
     """
+    kept: list[Exception] = []
+
+    def keep(function: Callable[P, T]) -> Callable[P, T]:
+        def keeping(*args: P.args, **kwargs: P.kwargs) -> T:
+            try:
+                return function(*args, **kwargs)
+            except Exception as error:
+                kept.append(error)
+                raise
+
+        return keeping
+
     try:
-        yield
+        yield keep
     except PETSc.Error as error:
-        origin: BaseException = error
+        origin: BaseException = kept.pop(0) if kept else error
         while isinstance(origin, PETSc.Error) and origin.__cause__ is not None:
             origin = origin.__cause__
         if not isinstance(origin, PETSc.Error):

@@ -133,6 +133,7 @@ def solve_vi(
     # looked up here, as the linear solver has to know; what is below rounding is all the same to it
     wanted = max(read_number("snes_atol", target), 1e-30 * target)
     snes = PETSc.SNES().create(cycle.matrix.getComm())
+    comm = snes.getComm().tompi4py()
     stiffness = Stiffness(cycle.finest, None if data is None else data.row_sums)
     bounds = Bounds(*(each.array_r[cycle.operator.dofs] for each in (vectors.lower, vectors.upper)))
     linear = ReducedSolver(
@@ -148,9 +149,11 @@ def solve_vi(
     things: tuple[PETSc.Object, ...] = ()
     try:
         things = _prepare(snes, linear, stiffness, vectors, target)
-        snes.setConvergenceTest(lambda snes, step, norms: test(snes, step, norms[2]))
-        _report(snes, linear, monitor)
-        with explained():
+        with explained() as keep:
+            snes.setConvergenceTest(keep(lambda snes, step, norms: test(snes, step, norms[2])))
+            # all ranks report, though there may be a monitor on one of them only
+            if comm.allreduce(monitor is not None, op=MPI.LOR):
+                snes.setMonitor(keep(_reporting(comm, linear, monitor)))
             snes.solve(None, vectors.x)
         reason, inner = snes.getConvergedReason(), linear.ksp.getConvergedReason()
         extended = test.doubtful and reason > 0
@@ -206,9 +209,10 @@ def _prepare(
     return outer, jacobian
 
 
-def _report(snes: PETSc.SNES, linear: ReducedSolver, monitor: Monitor | None) -> None:
-    """Have the monitor called, which only some of the ranks may have; collective."""
-    comm = snes.getComm().tompi4py()
+def _reporting(
+    comm: MPI.Comm, linear: ReducedSolver, monitor: Monitor | None
+) -> Callable[[PETSc.SNES, int, float], None]:
+    """Make what calls the monitor, which only some of the ranks may have."""
 
     def report(_: PETSc.SNES, step: int, norm: float) -> None:
         number = comm.allreduce(int(linear.active_now().mask.sum()))
@@ -222,9 +226,7 @@ def _report(snes: PETSc.SNES, linear: ReducedSolver, monitor: Monitor | None) ->
             error = caught
         fail_together(comm, error)
 
-    # all ranks report, though there may be a monitor on one of them only
-    if comm.allreduce(monitor is not None, op=MPI.LOR):
-        snes.setMonitor(report)
+    return report
 
 
 def _stopped(reason: int, inner: int) -> str:
@@ -346,9 +348,10 @@ class NewtonTest:
         errors += self._close(x, facts.active, moving=not sure)
         total = facts.forces.sum()
         of_data = np.where(facts.forces > 0.0, self._of_data(x, facts.active), 0.0)
-        relative = np.maximum(
-            errors / np.maximum(facts.sizes, 1e-300), of_data / max(total, 1e-300)
-        )
+        with np.errstate(over="ignore"):  # no forces at all: everything is too much beside them
+            relative = np.maximum(
+                errors / np.maximum(facts.sizes, 1e-300), of_data / max(total, 1e-300)
+            )
         noise = np.zeros_like(errors)
         if (relative > loose * FORCES).any():
             noise = LOST * NOISE * stiffness.magnitude(x)

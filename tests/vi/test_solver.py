@@ -1,5 +1,7 @@
 """The solver: bounds where they belong, errors with names, options under the prefix."""
 
+import contextlib
+
 import numpy as np
 import pytest
 import ufl
@@ -10,6 +12,7 @@ from petsc4py import PETSc
 from signorini_cr import InputError, NotConverged, Polygon, Problem, exact, solve, solve_levels
 from signorini_cr.fem.space import closure_dofs, function_space
 from signorini_cr.mesh.domain import CONTACT
+from signorini_cr.options import explained
 from signorini_cr.rounding import at_most
 
 pytestmark = pytest.mark.ranks
@@ -90,6 +93,18 @@ def test_what_a_monitor_raises_reaches_the_caller():
 
     with pytest.raises(Enough, match=r"^of that$"):
         solve(PROBLEM, SQUARE.mesh(0.25), monitor=monitor)
+
+
+def test_what_petsc_loses_on_the_way_reaches_the_caller():
+    """Garbage that Python collects while PETSc returns may take the pending exception with it."""
+
+    def monitor():
+        raise KeyError("ours")
+
+    with pytest.raises(KeyError, match="ours"), explained() as keep:
+        with contextlib.suppress(KeyError):
+            keep(monitor)()
+        raise PETSc.Error(101)
 
 
 def test_the_bottom_solver_is_named(options):
