@@ -21,8 +21,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
 from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any, TypeVar
+from types import ModuleType
+from typing import Any, TypeAlias, TypeVar
 
 import cffi
 from dolfinx import jit
@@ -32,6 +34,8 @@ from mpi4py import MPI
 from .errors import InputError, on_root
 
 T = TypeVar("T")
+Loaded: TypeAlias = tuple[list[Any], ModuleType]
+"""What FFCx asks of a form: its objects, and the module that holds them."""
 
 ABANDONED = 60.0
 """Seconds without a change from which on a source file without mark belongs to nobody."""
@@ -161,6 +165,11 @@ def _sum(library: Path) -> str:
     return hashlib.blake2b(library.read_bytes(), digest_size=16).hexdigest()
 
 
+def _mark(folder: Path, name: str) -> Path:
+    """What FFCx puts beside a form's source file when its library is whole."""
+    return folder / f"{name}.c.cached"
+
+
 def _library(folder: Path, name: str) -> Path | None:
     """A form's shared library, if it is there."""
     places = (folder / (name + suffix) for suffix in EXTENSION_SUFFIXES)
@@ -191,7 +200,7 @@ def _ends_early(library: Path) -> bool:
 
 def _remove_damaged(folder: Path, name: str) -> None:
     """Take a form away whose library is not as it was made, so that it is compiled anew."""
-    mark, library = folder / f"{name}.c.cached", _library(folder, name)
+    mark, library = _mark(folder, name), _library(folder, name)
     if not mark.exists():
         return
     if library is not None and not _ends_early(library):
@@ -211,14 +220,32 @@ def _remove_damaged(folder: Path, name: str) -> None:
             path.unlink(missing_ok=True)
 
 
+def _load(library: Path, name: str, objects: Any) -> Loaded:
+    """Load a form's library from where it is known to be."""
+    # FFCx has Python list the folder instead, for each form, and there may be thousands in it
+    spec = spec_from_file_location(name, library)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return [getattr(module.lib, each) for each in objects], module
+
+
 def _watch() -> None:
-    """Have FFCx look before it loads, and note what it makes."""
+    """Have FFCx look before it loads, load a form once only, and note what it makes."""
     find, load = ffcx_jit.get_cached_module, ffcx_jit._load_objects
+    known: dict[tuple[str, str], Loaded] = {}
 
     @wraps(find)
     def found(module_name: str, object_names: Any, cache_dir: Any, *others: Any) -> Any:
-        _remove_damaged(Path(cache_dir), module_name)
-        return find(module_name, object_names, cache_dir, *others)
+        key = str(cache_dir), module_name
+        if key not in known:
+            folder = Path(cache_dir)
+            _remove_damaged(folder, module_name)
+            library = _library(folder, module_name)
+            if library is None or not _mark(folder, module_name).exists():
+                return find(module_name, object_names, cache_dir, *others)
+            known[key] = _load(library, module_name, object_names)
+        return known[key]
 
     @wraps(load)
     def loaded(cache_dir: Any, module_name: str, *others: Any) -> Any:

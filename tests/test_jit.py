@@ -143,6 +143,16 @@ def test_a_damaged_library_is_made_anew(kind: str, noted: bool, cache: Path) -> 
     assert names <= {".c", ".cached", ".so", ".o", ".sum"}
 
 
+def test_a_form_is_loaded_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not for each solve anew, and whatever else there is in the folder."""
+    loads: list[str] = []
+    load = jit._load
+    monkeypatch.setattr(jit, "_load", lambda *facts: (loads.append(facts[1]), load(*facts))[1])
+    values = [COMM.allreduce(fem.assemble_scalar(make(3.0))) for _ in range(4)]
+    assert values == pytest.approx([0.75] * 4, rel=1e-12)
+    assert len(loads) == 1
+
+
 @pytest.mark.parametrize("kind", ["file", "device", "nowhere"])
 def test_where_forms_cannot_be_kept_they_are_compiled_all_the_same(
     kind: str, shared_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
