@@ -91,22 +91,35 @@ def _interruptible() -> Iterator[list[int]]:
     That may reach us as another error, of PETSc, whose callback it was raised in. An import is left
     to finish, as libraries that are being loaded may end the process, and so is `_keep`, so that
     what is told of files is true; and whoever is told twice within a second, by the user and by
-    mpirun, say, is told once.
+    mpirun, say, is told once. Where Python drops what is raised, in a finalizer, say, it is told
+    anew.
     """
     asked: list[int] = []
     latest = -math.inf
+
+    def soon(number: int) -> None:
+        again = threading.Timer(0.05, os.kill, (os.getpid(), number))
+        again.daemon = True
+        again.start()
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal latest
         asked.append(number)
         if _must_not_be_disturbed(frame):
-            again = threading.Timer(0.05, os.kill, (os.getpid(), number))
-            again.daemon = True
-            again.start()
+            soon(number)
         elif time.monotonic() - latest > 1.0:
             latest = time.monotonic()
             raise KeyboardInterrupt
 
+    def dropped(facts: sys.UnraisableHookArgs) -> None:
+        nonlocal latest
+        if asked and issubclass(facts.exc_type, KeyboardInterrupt):
+            latest = -math.inf
+            soon(asked[0])
+        else:
+            drop(facts)
+
+    drop, sys.unraisablehook = sys.unraisablehook, dropped
     found: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():  # others can't be interrupted
         # not where it is ignored, as in the background
@@ -116,6 +129,7 @@ def _interruptible() -> Iterator[list[int]]:
     try:
         yield asked
     finally:
+        sys.unraisablehook = drop
         for each, handler in found.items():
             signal.signal(each, handler)
 

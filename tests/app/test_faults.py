@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
 
 import helpers
@@ -248,6 +249,27 @@ def test_an_interruption_inside_a_callback_is_one(
     assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.serial
+def test_a_signal_is_not_lost_in_a_finalizer() -> None:
+    """Python drops what is raised there, and would go on as if nothing had been asked."""
+
+    class Thing:
+        pass
+
+    def told(_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+
+    thing = Thing()
+    watch = weakref.ref(thing, told)
+    with cli._interruptible() as asked:
+        del thing
+        assert watch() is None and asked == [signal.SIGTERM]
+        with pytest.raises(KeyboardInterrupt):
+            for _ in range(300):
+                time.sleep(0.01)
 
 
 @pytest.mark.serial

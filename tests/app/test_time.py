@@ -1,6 +1,7 @@
 """[time] in a problem file: what is solved, what is left behind, what is refused."""
 
 import csv
+import functools
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -52,6 +53,26 @@ def case(shared_tmp_path):
         return path
 
     return write
+
+
+def in_scheme(scheme):
+    return CASE.replace("steps = 6", f'steps = 6\nscheme = "{scheme}"')
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Gives what a run that nothing ends leaves behind, made once for a scheme."""
+    folder = COMM.bcast(tmp_path_factory.mktemp("whole"), root=0)
+
+    @functools.cache
+    def made(scheme):
+        path = folder / f"{scheme}.toml"
+        if COMM.rank == 0:
+            path.write_text(in_scheme(scheme), encoding="utf-8")
+        assert solved(path, folder / scheme) == 0
+        return folder / scheme
+
+    return made
 
 
 def steps_by_hand():
@@ -220,12 +241,11 @@ def assert_same(one, other):
 @pytest.mark.parametrize("scheme", ["euler", "bdf2"])
 @pytest.mark.parametrize("after", [1, 2, 4])
 def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
-    scheme, after, case, shared_tmp_path, monkeypatch, capfd
+    scheme, after, case, whole, shared_tmp_path, monkeypatch, capfd
 ):
     """Ended in the midst of a step; what was finished before is there, and nothing is lost."""
-    path = case(CASE.replace("steps = 6", f'steps = 6\nscheme = "{scheme}"'))
-    whole, out = shared_tmp_path / "whole", shared_tmp_path / "out"
-    assert solved(path, whole) == 0
+    path, whole = case(in_scheme(scheme)), whole(scheme)
+    out = shared_tmp_path / "out"
     with monkeypatch.context() as patch:
         original = evolution.Solver.solve
         calls = []
@@ -254,11 +274,9 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
 
 @pytest.mark.serial
 @pytest.mark.parametrize("first, then", [(1, 2), (2, 1)])
-def test_on_another_number_of_ranks(first, then, case, shared_tmp_path, monkeypatch):
+def test_on_another_number_of_ranks(first, then, case, whole, shared_tmp_path, monkeypatch):
     """Three of six steps are done, with two steps behind each as bdf2 has them."""
-    text = CASE.replace("steps = 6", 'steps = 6\nscheme = "bdf2"')
-    whole, out = shared_tmp_path / "whole", shared_tmp_path / "out"
-    assert solved(case(text), whole) == 0
+    text, whole, out = in_scheme("bdf2"), whole("bdf2"), shared_tmp_path / "out"
     (shared_tmp_path / "run.py").write_text(
         "import sys\n"
         "from signorini_cr import evolution\n"
