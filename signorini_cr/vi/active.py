@@ -61,18 +61,34 @@ class ActiveSet:
 
     @classmethod
     def without(
-        cls, bounded: Int32Array, inactive: npt.NDArray[np.integer], size: int
+        cls, bounded: Int32Array, inactive: npt.NDArray[np.integer], first: int
     ) -> ActiveSet:
         """Take over what PETSc has decided.
 
         Args:
             bounded: Owned dofs with a bound, local numbers, ascending, shape (n,).
-            inactive: All other owned dofs but the active ones, local numbers.
-            size: Number of owned dofs.
+            inactive: All other owned dofs but the active ones, global numbers, ascending.
+            first: Global number of the first owned dof.
         """
-        outside = np.ones(size, dtype=bool)
-        outside[inactive] = False
-        return cls(bounded, outside[bounded])
+        # bounded dofs are few, and all others many
+        if not len(inactive):
+            return cls(bounded, np.ones(len(bounded), dtype=bool))
+        numbers = bounded.astype(inactive.dtype) + inactive.dtype.type(first)
+        place = np.searchsorted(inactive, numbers)
+        return cls(bounded, inactive.take(place, mode="clip") != numbers)
+
+    def take_rest(self, values: FloatArray, rest: FloatArray) -> None:
+        """Copy the values of all other owned dofs, in pieces, as there are few active ones.
+
+        Args:
+            values: Values of all owned dofs.
+            rest: Those without the active ones.
+        """
+        active = self.dofs
+        starts = np.concatenate([[0], active + 1]).tolist()
+        ends = np.append(active, len(values)).tolist()
+        for gone, (start, end) in enumerate(zip(starts, ends, strict=True)):
+            rest[start - gone : end - gone] = values[start:end]
 
     @property
     def dofs(self) -> Int32Array:

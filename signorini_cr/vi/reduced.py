@@ -161,9 +161,8 @@ class ReducedSolver:
     def solve(self, outer: PETSc.KSP, _: PETSc.Vec, reduced: PETSc.Vec) -> None:
         """Solve the reduced system; its right-hand side is the residual that SNES keeps."""
         self._stiffness.sort(self._x, self._b)
-        first, end = self.matrix.getOwnershipRange()
-        inactive = self._snes.getVIInactiveSet().array - first
-        self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, end - first)
+        inactive, first = self._snes.getVIInactiveSet().array, self.matrix.getOwnershipRange()[0]
+        self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, first)
         forces = self._residual.array_r[self.active.bounded].copy()
         self._residual.array[self.active.dofs] = 0.0
         with self._cycle.constrained(self.active.dofs, deep=self._uses_cycle):
@@ -179,7 +178,7 @@ class ReducedSolver:
             rounding = NOISE * self._cycle.finest.rounding(self._x, self.active.dofs)
             if rounding <= next_to_nothing:
                 self.reached = max(test.reached, rounding)
-        reduced.array[:] = self._step.array_r[inactive]
+        self.active.take_rest(self._step.array_r, reduced.array)
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 

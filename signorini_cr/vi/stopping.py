@@ -104,11 +104,12 @@ class Stiffness:
         """
         self._grid, self._comm = grid, grid.matrix.getComm().tompi4py()
         diagonal = grid.matrix.getDiagonal()
-        free = np.ones(diagonal.local_size, dtype=bool)
-        free[grid.dirichlet] = False
-        entries = diagonal.array_r
-        low = self._comm.allreduce(float(entries.min(initial=np.inf, where=free)), op=MPI.MIN)
-        high = self._comm.allreduce(float(entries.max(initial=0.0, where=free)), op=MPI.MAX)
+        entries = diagonal.array
+        entries[grid.dirichlet] = np.inf
+        low = self._comm.allreduce(float(entries.min(initial=np.inf)), op=MPI.MIN)
+        entries[grid.dirichlet] = 0.0
+        high = self._comm.allreduce(float(entries.max(initial=0.0)), op=MPI.MAX)
+        entries[grid.dirichlet] = 1.0
         self._smallest, self.contrast = low, max(high / low, 1.0)
         self._kinds = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
         self._kind = self._classes(grid.operator.diagonal)
@@ -120,7 +121,8 @@ class Stiffness:
         self._differences: PETSc.Mat | None = None
         self._find_row_sums = row_sums
         if row_sums is not None and self._kinds > 1:
-            self._free, self._class = free, self._classes(entries)
+            self._free, self._class = np.ones(len(entries), dtype=bool), self._classes(entries)
+            self._free[grid.dirichlet] = False
             self._diagonal = entries.copy()
             self._take_differences(row_sums)
         release(diagonal)
@@ -247,7 +249,10 @@ def _windows(grid: Grid) -> IndexArray:
     layout, comm = grid.dofs, grid.matrix.getComm().tompi4py()
     nodes = grid.operator.dofs // layout.block
     cell = np.zeros(layout.local // layout.block, dtype=np.intp)
-    cell[layout.cells] = np.arange(len(layout.cells))[:, None]
+    wanted = np.zeros(len(cell), dtype=bool)
+    wanted[nodes] = True
+    found = np.flatnonzero(wanted[layout.cells])  # few of many
+    cell[layout.cells.ravel()[found]] = found // layout.cells.shape[1]
     corners = layout.mesh.geometry.x[compat.cell_nodes(layout.mesh)[cell[nodes]]]
     x = corners.mean(axis=1)
     ends = np.stack([x.min(axis=0, initial=np.inf), -x.max(axis=0, initial=-np.inf)])

@@ -128,6 +128,17 @@ def test_active_sets():
     with pytest.raises(ValueError, match="read-only"):
         found.mask[0] = False
     assert ActiveSet.of(bounded, 0.0, force).dofs.tolist() == [2, 6, 9]
-    inactive = np.setdiff1d(np.arange(11), [2, 9])
-    same = ActiveSet.without(bounded, inactive, 11)
+    inactive = np.setdiff1d(np.arange(11), [2, 9]).astype(np.int32)
+    same = ActiveSet.without(bounded, inactive + 100, 100)
     assert np.array_equal(same.mask, found.mask) and np.array_equal(same.bounded, bounded)
+
+
+@pytest.mark.parametrize("active", [[], [0], [10], [2, 3, 9], range(11)])
+def test_what_is_not_active(active):
+    values, active = np.arange(11.0) ** 2, np.array(active, np.int32)
+    inactive = np.setdiff1d(np.arange(11), active).astype(np.int32)
+    found = ActiveSet.without(np.arange(11, dtype=np.int32), inactive, 0)
+    assert np.array_equal(found.dofs, active)
+    rest = np.full(len(inactive), np.nan)
+    found.take_rest(values, rest)
+    assert np.array_equal(rest, values[inactive])
