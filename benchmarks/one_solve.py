@@ -187,7 +187,9 @@ def picture(rows: list[Row], path: Path) -> None:
     rows = sorted((r for r in rows if r.ranks == 1 and r.dofs > SHOWN), key=lambda r: r.dofs)
     names = list(dict.fromkeys(r.case for r in rows))
     plain = [name for name in names if "mapped" not in name]
-    hues = dict(zip(plain, [canvas.BLUE, canvas.RED, canvas.YELLOW, canvas.GREY, "black"]))
+    paints = [canvas.BLUE, canvas.RED, canvas.YELLOW, canvas.GREY, "black"]
+    paints += ["tab:green", "tab:purple", "tab:brown", "tab:pink"]
+    hues = dict(zip(plain, paints, strict=False))
     colors = [hues[name.removesuffix(" mapped")] for name in names]
     curves = [[r for r in rows if r.case == name] for name in names]
     last = [curve[-1] for curve in curves]
