@@ -138,7 +138,15 @@ def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> F
 
     Returns:
         Shape (cells, d + 1).
+
+    Raises:
+        InputError: The function has several components.
     """
+    if u.function_space.dofmap.index_map_bs > 1:
+        raise InputError(
+            f"{u.name} has {u.function_space.dofmap.index_map_bs} components, and only functions of"
+            " one are drawn and written; u.sub(0).collapse() is the first of them"
+        )
     values = u.x.array[u.function_space.dofmap.list[cells]]
     if u.function_space.element.basix_element.family is basix.ElementFamily.CR:
         return values.sum(axis=1, keepdims=True) - u.function_space.mesh.topology.dim * values

@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 from signorini_cr.compat import cell_nodes
 from signorini_cr.errors import InputError
+from signorini_cr.fem.fields import discontinuous
 from signorini_cr.fem.space import (
     closure_dofs,
     facet_entities,
@@ -37,6 +38,18 @@ def test_vertex_values_of_an_affine_function_are_its_own(mesh, element):
     u.interpolate(lambda x: 2.0 - 3.0 * x[0] + 5.0 * x[1])
     x = mesh.geometry.x[cell_nodes(mesh)]
     assert np.allclose(vertex_values(u), 2.0 - 3.0 * x[..., 0] + 5.0 * x[..., 1], atol=1e-13)
+
+
+def test_a_function_of_two_components_is_not_drawn_as_one(mesh):
+    from dolfinx.fem import Function, functionspace
+
+    u = Function(functionspace(mesh, ("CR", 1, (2,))), name="shift")
+    for of in (vertex_values, discontinuous):
+        with pytest.raises(InputError, match=r"shift has 2 components.*u\.sub\(0\)\.collapse"):
+            of(u)
+    u.interpolate(lambda x: (x[0], x[1]))
+    y = mesh.geometry.x[cell_nodes(mesh)][..., 1]
+    assert np.allclose(vertex_values(u.sub(1).collapse()), y, atol=1e-13)
 
 
 def test_facet_dof_sits_at_the_midpoint(mesh):
