@@ -66,11 +66,12 @@ def whole(tmp_path_factory):
 
     @functools.cache
     def made(scheme):
-        path = folder / f"{scheme}.toml"
+        path = folder / scheme / "case.toml"
         if COMM.rank == 0:
+            path.parent.mkdir()
             path.write_text(in_scheme(scheme), encoding="utf-8")
-        assert solved(path, folder / scheme) == 0
-        return folder / scheme
+        assert solved(path, path.parent / "out") == 0
+        return path.parent / "out"
 
     return made
 
