@@ -602,10 +602,10 @@ class Promise:
             return None
         at = np.flatnonzero(chosen[cells.vertices].any(axis=0))
         facets, inside = cells.facets[:, at], chosen[cells.vertices[:, at]]
-        there = np.zeros(len(free))
+        there = np.zeros(len(free), dtype=bool)
         for facet, (j, k) in zip(facets, cells.others, strict=True):
-            there[facet[inside[j] | inside[k]]] = 1.0
-        return loose & chosen, free & (cells.share(there) > 0.0)
+            there[facet[inside[j] | inside[k]]] = True
+        return loose & chosen, free & there
 
 
 def _limit(cells: Cells, promises: FloatArray) -> float:
