@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
@@ -28,7 +27,7 @@ from .cusps import Cusps
 from .descent import descend, nonzero
 from .flux import Flux
 from .lifting import Cubic, Lift, affine, joined, lift
-from .nearest import LARGEST, Slopes, nearest, touched
+from .nearest import LARGEST, Slopes, nearest
 from .shapes import bump_slopes, local_thirds, third_slopes
 
 Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
@@ -490,7 +489,7 @@ def _solved(
     for turn in range(ROUNDS):
         if turn > 0:
             near = promise.near(slopes, loose, free)
-        some, heights = near or (loose, free)
+        some, heights, at = near or (loose, free, slice(None))
         step = nearest(cells, kappa, slopes, some, heights)
         v, bumps, free = v + step[0], bumps + step[1], free.copy()
         down = np.zeros_like(loose)
@@ -503,11 +502,8 @@ def _solved(
         bumps[bounded] = np.clip(bumps, low, high)[bounded]
         free[out] = False
         loose = loose & ~down
-        at: slice | IndexArray = slice(None)
-        if near is not None:
-            at = touched(cells, some, heights)
-            if cusps is not None:
-                at = np.union1d(at, cusps.at)
+        if cusps is not None and not isinstance(at, slice):
+            at = np.union1d(at, cusps.at)
         excess[:, at] = v[cells.vertices[:, at]] - functional.w[:, at]
         slopes.renew(cells, kappa, excess, bumps, at)
         if turn == 0:  # where v is good otherwise
@@ -573,10 +569,10 @@ class Promise:
 
     def near(
         self, slopes: Slopes, loose: BoolArray, free: BoolArray
-    ) -> tuple[BoolArray, BoolArray] | None:
+    ) -> tuple[BoolArray, BoolArray, IndexArray] | None:
         """Choose values that are worth being solved for; collective.
 
-        They are those that hold `FOREMOST` of all promises, and all within `LAYERS` around them.
+        They are those that hold `FOREMOST` of all promise, and all within `LAYERS` around them.
 
         Args:
             slopes: Those of v.
@@ -584,18 +580,22 @@ class Promise:
             free: Which heights may be changed.
 
         Returns:
-            Which of them are to be; None if that is most of them, or nothing is promised.
+            Which of them are to be, and the cells of this rank that know of these; None if that is
+            most of the mesh, or nothing is promised.
         """
         cells = self.cells
         owned = cells.owned_vertices(), cells.owned_facets()
-        promises = (
-            cells.over_vertices(slopes.vertices) ** 2 * loose / self.vertices,
-            cells.over_facets(slopes.facets) ** 2 * free / self.facets,
-        )
-        limit = _limit(cells, np.concatenate([p[:n] for p, n in zip(promises, owned, strict=True)]))
+        promises = cells.over_vertices(slopes.vertices), cells.over_facets(slopes.facets)
+        for promise, weight, may in zip(
+            promises, (self.vertices, self.facets), (loose, free), strict=True
+        ):
+            promise *= promise
+            promise /= weight
+            promise *= may
+        limit = _limit(cells, *(p[:n] for p, n in zip(promises, owned, strict=True)))
         chosen, much = (promise > limit for promise in promises)
-        for facet, ends in zip(cells.facets, cells.others, strict=True):
-            chosen[cells.vertices[ends][:, much[facet]]] = True
+        local, at = np.nonzero(much[cells.facets])
+        chosen[cells.vertices[cells.others[local].T, at]] = True
         chosen = cells.around(chosen, LAYERS)
         few, all_ = cells.total(float(np.count_nonzero(chosen[: owned[0]])), float(owned[0]))
         if not 0.0 < few <= LARGEST * all_:
@@ -605,24 +605,28 @@ class Promise:
         there = np.zeros(len(free), dtype=bool)
         for facet, (j, k) in zip(facets, cells.others, strict=True):
             there[facet[inside[j] | inside[k]]] = True
-        return loose & chosen, free & there
+        return loose & chosen, free & there, at
 
 
-def _limit(cells: Cells, promises: FloatArray) -> float:
+def _limit(cells: Cells, *promises: FloatArray) -> float:
     """Return what those are above that hold `FOREMOST` of the whole; collective.
 
     Args:
         cells: The mesh.
-        promises: Those of this rank, shape (n,).
+        *promises: Those of this rank, shapes (n,).
     """
-    largest = cells.comm.allreduce(float(promises.max(initial=0.0)), op=MPI.MAX)
+    largest = max(cells.comm.allgather(max(float(p.max(initial=0.0)) for p in promises)))
     if largest == 0.0:
         return 0.0
+    total, number = cells.total(sum(p.sum() for p in promises), float(sum(map(len, promises))))
+    # All that are below this together are no more than the rest; mostly that leaves few
+    least = (1.0 - FOREMOST) * total / number
+    some = np.concatenate([p[p > least] for p in promises])
     # By classes, each 2^{1/4} below the one before. None ends at a value that equals the largest
     # one, or that divided by a power of 2, but for rounding
-    steps = 4.0 * np.log2(largest / np.maximum(promises, largest * 2.0**-50)) + 0.37
-    held = cells.total(*np.bincount(steps.astype(np.intp), promises, minlength=201))
-    last = int(np.searchsorted(np.cumsum(held), FOREMOST * held.sum()))
+    classes = (4.0 * np.log2(largest / some) + 0.37).astype(np.intp)
+    held = cells.total(*np.bincount(classes, some, minlength=256))
+    last = int(np.searchsorted(np.cumsum(held), FOREMOST * total))
     return float(largest * 2.0 ** ((0.37 - last - 1) / 4.0))
 
 

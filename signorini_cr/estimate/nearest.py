@@ -80,11 +80,6 @@ class Slopes:
             self.energies[part] = -dot_rows(c, at_vertices) - dot_rows(height, at_facets)
 
 
-def touched(cells: Cells, loose: BoolArray, free: BoolArray) -> IndexArray:
-    """Cells of this rank in which v changes with such values at vertices and such heights."""
-    return np.flatnonzero(loose[cells.vertices].any(axis=0) | free[cells.facets].any(axis=0))
-
-
 def nearest(
     cells: Cells, kappa: FloatArray, slopes: Slopes, loose: BoolArray, free: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -102,7 +97,7 @@ def nearest(
     """
     mesh, d = cells.domain.mesh, cells.tdim
     patch: slice | IndexArray = slice(None)
-    some = touched(cells, loose, free)
+    some = np.flatnonzero(loose[cells.vertices].any(axis=0) | free[cells.facets].any(axis=0))
     few, all_ = cells.total(float(len(some)), float(cells.number))
     if 0.0 < few <= LARGEST * all_:
         mesh, parents = compat.submesh(mesh, d, some.astype(np.int32))
