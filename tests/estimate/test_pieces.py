@@ -149,6 +149,9 @@ def test_an_obstacle_below_needs_no_lifting():
     base.ends[0] -= 0.01
     bound = lift(data.cells, side, found.trace, base, above, 1.0, 1e-3, True)
     assert bound.reason is None and not bound.steep.any()
+    # nor, where there is a bound on the other side as well, one that is not far below
+    bound = lift(data.cells, side, found.trace, None, above, 1.0, 1e-3, True)
+    assert not bound.steep.any() and not bound.area.any() and not bound.beyond.any()
 
 
 @pytest.mark.serial
@@ -716,6 +719,10 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     assert least < other and np.isclose(other, least + apart, rtol=1e-7)
     # A few steps, and what is left carried as a walk does, are between the two
     monkeypatch.setattr(flux, "STEPS", 10)
+    nearly = flux._diffused(cells, left, kappa)
+    assert not np.allclose(nearly.sum(axis=0), -left, atol=1e-2)
+    jumps = cells.over_facets(nearly)
+    assert np.allclose(jumps[~cells.exterior], 0.0) and np.allclose(jumps[free], 0.0)
     found = flux._carried(cells, left, kappa, 0.0, np.array(0.0))
     assert np.sqrt(least) < found < np.sqrt(other)
     assert np.isclose(flux._carried(cells, left, kappa, np.inf, np.array(0.0)), np.sqrt(other))
@@ -909,6 +916,8 @@ def test_slack_of_quadrature(few):
     pp, bb, vv, yy, *at_z = rng.uniform(1, 2, size=(8, 5))
     pb = 0.99 * (pp + bb) / 2 if few else rng.uniform(-0.5, 0.5, size=5)
     errors = rng.uniform(size=(7, 5)) * (1e-3 if few else 1.0)
+    errors[4:6] *= 1e-4 if few else 1.0  # there are few strips, too
+    by_norm = 0
     R, t, W, inverse_W, strip_low, strip_high, _ = errors
     found = gap._with_slack(np.stack([pp, bb, pb, vv, yy, *at_z]), errors, 2, 9)
     assert np.array_equal(found[:4], (pp, bb, pb, vv))
@@ -919,6 +928,8 @@ def test_slack_of_quadrature(few):
             norm = (1 + t[i]) * (square**0.5 + 2 * R[i] * steep[i] ** 0.5) ** 2 - square
             strips = 2 * 9 * (strip_low[i] * yy[i] + strip_high[i] * zz[i])
             assert np.isclose(found[row, i], min(products, norm + strips))
+            by_norm += norm + strips < products
+    assert by_norm > 3 if few else by_norm == 0
     assert np.allclose(found[6], W * at_z[0])
 
 

@@ -1,0 +1,588 @@
+"""What the certificate's fields are against given functions, by quadrature at points."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import basix
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from signorini_cr import InputError, Polygon, Problem, solve
+from signorini_cr.data.diffusion import diffusion
+from signorini_cr.data.loads import Certain, Segments, VolumeMoments
+from signorini_cr.estimate import certificate, cusps, force, gap, pairing, weights
+from signorini_cr.estimate.beyond import Beyond
+from signorini_cr.estimate.companion import Companion
+from signorini_cr.estimate.lifting import Lift
+from signorini_cr.estimate.sums import Totals
+from signorini_cr.fem.cells import Cells
+from signorini_cr.fem.space import function_space
+from signorini_cr.mesh.families import structured
+
+SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
+SIDES = ("contact", "neumann", "dirichlet", "neumann")
+DIRICHLET = 2
+
+
+def square(n=2):
+    return structured(Polygon(SQUARE, SIDES), n, MPI.COMM_SELF, jitter=0.2)
+
+
+class Points:
+    """Functions of cells at the points of a rule, and their integrals over the cells."""
+
+    def __init__(self, cells, degree=10):
+        points, weights_ = basix.make_quadrature(basix.CellType.triangle, degree)
+        mesh = cells.domain.mesh
+        self.cells, self.weights = cells, weights_ / weights_.sum()
+        self.hats = np.column_stack([1 - points.sum(axis=1), points]).T
+        self.corners = mesh.geometry.x[mesh.geometry.dofmap[: cells.number], :2]
+        if cells.stretch is not None:
+            self.corners = np.einsum("nij,nkj->nki", cells.stretch, self.corners)
+        inverse = np.linalg.inv(self.corners[:, 1:] - self.corners[:, :1])
+        self.gradients = np.concatenate([-inverse.sum(axis=2)[:, None], inverse.swapaxes(1, 2)], 1)
+        self.area = np.abs(np.linalg.det(self.corners[:, 1:] - self.corners[:, :1])) / 2
+        self.x = np.einsum("iq,nik->nqk", self.hats, self.corners)
+
+    def integral(self, values):
+        return self.area * (values @ self.weights)
+
+    def affine(self, c):
+        """From values at the cells' vertices, shape (3, n)."""
+        slope = np.einsum("in,nik->nk", c, self.gradients)[:, None]
+        return c.T @ self.hats, np.repeat(slope, len(self.weights), axis=1)
+
+    def of_facets(self, heights, cubic=False):
+        """Bumps 4 λ_j λ_k, or cubics λ_j λ_k (λ_j − λ_k), j to k as the mesh counts vertices."""
+        values, slopes = np.zeros(self.x.shape[:2]), np.zeros(self.x.shape)
+        global_ = self.cells.vertices
+        for i in range(3):
+            height = heights[self.cells.facets[i]]
+            j, k = (one for one in range(3) if one != i)
+            a, b = self.hats[[j, k]]
+            by_a, by_b = self.gradients[:, j, None], self.gradients[:, k, None]
+            both, bend = a * b, a[:, None] * by_b + b[:, None] * by_a
+            if cubic:
+                height = np.where(global_[j] < global_[k], height, -height)
+                bend = (a - b)[:, None] * bend + both[:, None] * (by_a - by_b)
+                both = both * (a - b)
+            scale = 1.0 if cubic else 4.0
+            values += scale * height[:, None] * both
+            slopes += scale * height[:, None, None] * bend
+        return values, slopes
+
+    def field(self, fluxes):
+        """The Raviart-Thomas field with such fluxes out of the cells."""
+        total = fluxes.sum(axis=0)[:, None, None] * self.x
+        constant = np.einsum("in,nik->nk", fluxes, self.corners)[:, None]
+        return (total - constant) / (2 * self.area)[:, None, None]
+
+
+def sums_of(*pairs):
+    return tuple(sum(parts) for parts in zip(*pairs, strict=True))
+
+
+def psi(x):
+    return 0.7 + x[..., 0] - 2 * x[..., 1] + 3 * x[..., 0] * x[..., 1]
+
+
+def moments(at, values):
+    """What is known of a load from its values at the points."""
+    mean = values @ at.weights
+    off = values - mean[:, None]
+    bumps = [4 * np.delete(at.hats, i, axis=0).prod(axis=0) for i in range(3)]
+    rows = [(off * test) @ at.weights for test in (*at.hats, *bumps)]
+    return VolumeMoments(mean, np.array(rows), off**2 @ at.weights)
+
+
+def made_up(cells, seed):
+    """v, u_h and a lifting, by random numbers."""
+    rng = np.random.default_rng(seed)
+    number, facets = cells.number, len(cells.exterior)
+    none = np.zeros(0)
+    return rng, SimpleNamespace(
+        vertices=rng.normal(size=cells.vertices.max() + 1),
+        bumps=rng.normal(size=facets),
+        w=rng.normal(size=(3, number)),
+        thirds=None,
+        cusps=None,
+        lift=(none.astype(int), none, none, none),
+        bounded=none.astype(int),
+    )
+
+
+# ---- integrals with a weight
+
+
+@pytest.mark.serial
+def test_a_weight_in_cells():
+    """ψ times u_h and v where both are polynomials, and Cauchy and Schwarz where one is not."""
+    domain = square()
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    at, there = Points(cells), np.arange(cells.number) < 3
+    rng, made = made_up(cells, 1)
+    load = moments(at, psi(at.x))
+    found = pairing.in_cells(made, cells, Certain(load), there)
+    v, _ = sums_of(at.affine(made.vertices[cells.vertices]), at.of_facets(made.bumps))
+    assert np.isclose(found.extent, at.area[:3].sum())
+    assert np.isclose(found.total, at.integral(psi(at.x)).sum())
+    assert np.isclose(found.of_u, at.integral(psi(at.x) * at.affine(made.w)[0]).sum())
+    assert np.isclose(found.of_v, at.integral(psi(at.x) * v).sum())
+    assert found.unsure == 0.0 and found.scale >= at.integral(np.abs(psi(at.x) * v)).sum()
+    assert found.missed < 1e-13
+    # ψ's mean is known up to `missed`, and ψ to `rough`
+    missed = rng.uniform(size=cells.number)
+    found = pairing.in_cells(made, cells, Certain(load, missed, 0 * missed), there)
+    assert np.isclose(found.unsure, np.abs(v @ at.weights) @ missed)
+    assert np.isclose(found.missed, missed.sum())
+    # what only norms are known of: cubics and cusps against ψ − ψ_T, a lifting against ψ
+    at_cusp, means = np.array([2, 5]), np.array([0.3, -0.4])
+    heights = rng.normal(size=(4, 2))
+    made.cusps = SimpleNamespace(at=at_cusp, means=means, heights=heights)
+    of_cusps = means * (at.area * load.mean)[at_cusp]
+    off = np.sqrt(at.integral((psi(at.x) - load.mean[:, None]) ** 2))
+    found = pairing.in_cells(made, cells, Certain(load), there)
+    assert np.isclose(found.of_v, at.integral(psi(at.x) * v).sum() + of_cusps.sum())
+    largest = 0.5 * np.abs(heights).sum(axis=0)
+    assert np.isclose(found.unsure, (off * np.sqrt(at.area))[at_cusp] @ largest)
+    found = pairing.in_cells(made, cells, Certain(load, missed, 0 * missed), there)
+    mean = v @ at.weights
+    mean[at_cusp] += means
+    expected = np.abs(mean) @ missed + (off * np.sqrt(at.area))[at_cusp] @ largest
+    assert np.isclose(found.unsure, expected)
+    made.cusps, made.thirds = None, np.zeros(len(cells.exterior))
+    made.thirds[cells.facets[0, 3]] = -0.8
+    found = pairing.in_cells(made, cells, Certain(load), there)
+    cubic, _ = at.of_facets(made.thirds, cubic=True)
+    assert np.isclose(found.of_v, at.integral(psi(at.x) * v).sum())
+    assert np.isclose(found.unsure, off @ np.sqrt(at.integral(cubic**2)))
+    assert abs(at.integral(psi(at.x) * cubic).sum()) <= found.unsure
+    made.thirds = None
+    made.lift = np.array([1, 4]), None, np.array([0.2, 0.3]), None
+    found = pairing.in_cells(made, cells, Certain(load, 0 * missed, missed), there).unsure
+    made.lift = made.lift[0], None, np.zeros(2), None
+    found -= pairing.in_cells(made, cells, Certain(load, 0 * missed, missed), there).unsure
+    norms = np.sqrt(at.integral(psi(at.x) ** 2)) + missed
+    assert 1.0 <= found / (norms[[1, 4]] @ [0.2, 0.3]) <= np.sqrt(2)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["vertices", "bump", "cubic", "cusp"])
+def test_what_v_has_beyond_its_mean_meets_what_is_rough(kind):
+    """At least |v − v_T|, times |T|^{1/2} ‖ψ − q‖, and at most twice as much."""
+    domain = square()
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    at, facet = Points(cells, 20), cells.facets[1, 3]
+    rng, made = made_up(cells, 2)
+    vertices, made.vertices, made.bumps = made.vertices, 0 * made.vertices, 0 * made.bumps
+    rough = rng.uniform(size=cells.number)
+    if kind == "vertices":
+        made.vertices = vertices
+        v, _ = at.affine(vertices[cells.vertices])
+        off = np.abs(vertices[cells.vertices] - (v @ at.weights)).max(axis=0)
+    elif kind == "bump":
+        made.bumps[facet] = -0.7
+        off = 0.7 * 2 / 3 * (cells.facets == facet).any(axis=0)
+    elif kind == "cubic":
+        made.thirds = np.zeros(len(cells.exterior))
+        made.thirds[facet] = -0.7
+        off = 0.7 / np.sqrt(108) * (cells.facets == facet).any(axis=0)  # s(1 − s)(1 − 2s) at most
+    else:
+        heights, off = np.array([[0.0], [-0.7], [0.0], [0.0]]), np.zeros(cells.number)
+        made.cusps = SimpleNamespace(at=np.array([4]), means=np.zeros(1), heights=heights)
+        t = np.linspace(0, 1, 10001)
+        off[4] = 0.7 * max((t**s - t).max() for s in cusps.EXPONENTS)
+    load = VolumeMoments(np.ones(cells.number), None, None)
+    found = pairing.in_cells(made, cells, Certain(load, 0 * rough, rough), rough > 0)
+    truth = off @ (np.sqrt(at.area) * rough)
+    limit = {"vertices": 2.0, "bump": 1.5, "cubic": 1.05, "cusp": 1.1}[kind]
+    assert truth <= found.unsure <= limit * truth * (1 + 1e-12)
+
+
+@pytest.mark.serial
+def test_rounding_of_weights():
+    """In parts of ∫ |ψ| and of ∫ |ψ v|: exactly these where ψ and v are numbers."""
+    domain = square()
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    _, made = made_up(cells, 3)
+    made.vertices[:], made.bumps[:], there = -2.0, 0.0, np.ones(cells.number)
+    load = VolumeMoments(np.full(cells.number, -3.0), None, None)
+    found = pairing.in_cells(made, cells, Certain(load), there)
+    assert np.isclose(found.missed, 3e-14, atol=0.0) and np.isclose(found.scale, 6.0)
+    made.bumps[:] = 0.5
+    assert np.isclose(pairing.in_cells(made, cells, Certain(load), there).scale, 7.5)
+
+
+def on_sides(seed, g=lambda x: ufl.sin(4 * x[1]) - 0.3 + x[0]):
+    """Values of g on two sides of the square, and what the facets' points are, by Gauss's rule."""
+    level = solve(Problem(f=1.0, g=g), square(3)).level
+    data = diffusion(level.data)
+    cells, rng = data.cells, np.random.default_rng(seed)
+    kappa = rng.uniform(0.5, 1, cells.number)
+    edge = Segments.of(data.edges[0], cells, kappa, 1.0)
+    return level, cells, kappa, edge, rng
+
+
+class OnFacets:
+    """Functions at Gauss's points of facets, shape (n, q)."""
+
+    def __init__(self, cells, side):
+        t, w = np.polynomial.legendre.leggauss(12)
+        self.s, self.cells, self.side = (t + 1) / 2, cells, side
+        nodes = cells.domain.mesh.geometry.dofmap[side.cells]
+        ends = np.array([[j for j in range(3) if j != i] for i in side.local])
+        x = cells.domain.mesh.geometry.x[np.take_along_axis(nodes, ends, axis=1), :2]
+        self.length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+        self.ends, self.weights = ends, w / 2
+        self.x = x[:, :1] + self.s[:, None] * (x[:, 1:] - x[:, :1])
+
+    def integral(self, values):
+        return self.length * (values @ self.weights)
+
+    def affine(self, c):
+        first, second = (c[self.ends[:, i], self.side.cells, None] for i in (0, 1))
+        return first * (1 - self.s) + second * self.s
+
+    def bump(self, heights):
+        return 4 * heights[self.side.dofs, None] * self.s * (1 - self.s)
+
+
+@pytest.mark.serial
+def test_a_weight_on_sides():
+    _, cells, _, edge, rng = on_sides(4)
+    _, made = made_up(cells, 5)
+    zero = np.zeros(len(edge.loss))
+    edge = replace(edge, missed=zero, rough=zero)
+    on = OnFacets(cells, edge.facets)
+    weight = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]
+    u, v = on.affine(made.w), on.affine(made.vertices[cells.vertices]) + on.bump(made.bumps)
+    found = pairing.on_side(made, cells, edge)
+    assert np.isclose(found.extent, 2.0)
+    assert np.isclose(found.total, on.integral(weight).sum(), rtol=1e-6)
+    assert np.isclose(found.of_u, on.integral(weight * u).sum(), rtol=1e-5)
+    assert np.isclose(found.of_v, on.integral(weight * v).sum(), rtol=1e-5)
+    assert np.isclose(found.scale, on.integral(np.abs(weight * v)).sum(), rtol=0.02)
+    assert np.isclose(found.missed, 1e-14 * on.integral(np.abs(weight)).sum(), rtol=0.02, atol=0.0)
+    assert found.unsure == 0.0
+    missed, rough = rng.uniform(size=(2, len(zero)))
+    assert np.isclose(
+        pairing.on_side(made, cells, replace(edge, missed=missed)).missed, missed.sum()
+    )
+    # ‖ψ‖_F ‖ℓ‖_F, where ℓ may come twice; ‖ψ − ψ_F‖ ‖c_F‖ for cubics, ‖ψ − q‖ for both
+    twice = edge.facets.dofs[[0, 3, 3]]
+    made.bounded, made.lift = twice, (None, None, None, np.array([0.2, 0.3, 0.1]))
+    norms = np.sqrt(on.integral(weight**2))
+    found = pairing.on_side(made, cells, edge).unsure
+    assert np.isclose(found, norms[[0, 3]] @ [0.2, 0.4], rtol=1e-5)
+    rougher = replace(edge, rough=rough)
+    extra = pairing.on_side(made, cells, rougher).unsure - edge_change(rougher, made)
+    assert np.isclose(extra, (norms + rough)[[0, 3]] @ [0.2, 0.4], rtol=1e-5)
+    made.lift = (None, None, None, np.zeros(3))
+    made.thirds = rng.normal(size=len(cells.exterior))
+    cubic = np.abs(made.thirds[edge.facets.dofs, None]) * (on.s * (1 - on.s) * (1 - 2 * on.s))
+    off = np.sqrt(on.integral((weight - (weight @ on.weights)[:, None]) ** 2))
+    size = np.sqrt(on.integral(cubic**2))
+    assert np.isclose(pairing.on_side(made, cells, edge).unsure, off @ size, rtol=1e-5)
+    extra = pairing.on_side(made, cells, rougher).unsure - edge_change(rougher, made)
+    largest = np.abs(cubic).max(axis=1) * np.sqrt(on.length)
+    assert off @ size + largest @ rough <= extra <= off @ size + 1.06 * largest @ rough
+
+
+def edge_change(edge, made):
+    return edge.change(made.vertices, made.bumps)
+
+
+# ---- the form and the residual against P1
+
+
+def by_points(made, cells, phi):
+    """(A v − p', Aφ) and ‖Aφ‖², point by point."""
+    at, on = Points(cells), OnFacets(cells, made.segments.facets)
+    values, slopes = at.affine(phi)
+    jump, bend = sums_of(
+        at.affine(made.vertices[cells.vertices] - made.w), at.of_facets(made.bumps)
+    )
+    kappa, c = (
+        np.broadcast_to(each, cells.number)[:, None] for each in (made.kappa, made.reaction)
+    )
+    total = at.integral(kappa * (bend * slopes).sum(axis=2) + c * jump * values)
+    total -= at.integral((at.field(made.excess) * slopes).sum(axis=2))
+    total -= at.area * (made.hats * phi).sum(axis=0)
+    square_ = at.integral(kappa * (slopes**2).sum(axis=2) + c * values**2)
+    means, loss = values @ at.weights, made.segments.loss[:, None]
+    taken = np.zeros(cells.number, bool) if made.taken_up is None else made.taken_up
+    total -= np.where(taken, made.left * means, 0.0)
+    phi_on = on.affine(phi)
+    jump_on = on.affine(made.vertices[cells.vertices] - made.w) + on.bump(made.bumps)
+    g = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]
+    g -= (g @ on.weights)[:, None]
+    on_edge = on.integral((g - loss * jump_on) * phi_on)
+    if made.shed is not None:
+        on_edge += made.shed * (phi_on @ on.weights)
+    return (
+        total.sum() - on_edge.sum(),
+        square_.sum() + on.integral(loss * phi_on**2).sum(),
+        np.where(taken, 0.0, np.abs(made.left * means)),
+    )
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("reaction", [0.0, 3.0, "some"])
+@pytest.mark.parametrize("lossy", [False, True])
+def test_the_residual_against_affine_functions(reaction, lossy):
+    level, cells, kappa, edge, rng = on_sides(6)
+    _, made = made_up(cells, 7)
+    made.level, made.kappa = level, kappa
+    some = np.where(rng.uniform(size=cells.number) < 0.5, 0.0, 2.0)
+    made.reaction = some if reaction == "some" else np.array(reaction)
+    # a cell in a corner has two facets, and one b for both in the form that finds φ
+    alone = cells.exterior[cells.facets].sum(axis=0)[edge.facets.cells] == 1
+    loss = rng.uniform(5, 9, len(edge.loss)) * alone * lossy
+    assert 3 < np.sum(alone) < len(loss)
+    made.segments = replace(edge, loss=loss)
+    made.excess, made.left = rng.normal(size=(3, cells.number)), rng.normal(size=cells.number)
+    hats = rng.normal(size=(3, cells.number))
+    made.hats = hats - hats.mean(axis=0)
+    made.taken_up = made.reaction > 0.0 if reaction == "some" else None
+    made.shed = rng.normal(size=len(loss)) if lossy else None
+    made.cells = lambda: cells
+    phi = rng.normal(size=cells.vertices.max() + 1)[cells.vertices]
+    work, size, slack = by_points(made, cells, phi)
+    found, left = force.against(made, cells, phi)
+    assert np.isclose(found, work, rtol=1e-5)
+    assert np.allclose(left, slack)
+    assert np.isclose(force.square(made, cells, phi), size)
+    made.missed = 0.25
+    beyond = weights.Beyond(force=0.0, left=0.125, mean=0.5)
+    assert np.isclose(force.unsure(made, phi, left), slack.sum() + 0.25 * np.abs(phi).max())
+    expected = slack.sum() + 0.125 + 0.25 * (np.abs(phi).max() + 0.5)
+    assert np.isclose(force.unsure(made, phi, left, beyond), expected)
+    # The function with given values that has the least ‖Aφ‖, by solving for it densely
+    V = function_space(cells.domain.mesh, "P1")
+    dofs = V.dofmap.list[: cells.number].T
+    values = fem.Function(V)
+    known = np.flatnonzero(V.tabulate_dof_coordinates()[:, 1] < 1e-9).astype(np.int32)
+    values.x.array[known] = rng.normal(size=len(known))
+    found = force.extended(values, known, made).x.array
+    units = np.eye(len(found))
+    diagonal = [force.square(made, cells, one[dofs]) for one in units]
+    both = [[force.square(made, cells, (one + two)[dofs]) for one in units] for two in units]
+    matrix = (np.array(both) - np.add.outer(diagonal, diagonal)) / 2
+    free = np.setdiff1d(np.arange(len(found)), known)
+    pull = matrix[np.ix_(free, known)] @ values.x.array[known]
+    best = values.x.array.copy()
+    best[free] = -np.linalg.solve(matrix[np.ix_(free, free)], pull)
+    assert np.array_equal(found[known], values.x.array[known])
+    least, there = best @ matrix @ best, found @ matrix @ found
+    assert least * (1 - 1e-12) <= there <= 1.001 * least
+    assert np.allclose(found, best, atol=0.02 * np.abs(best).max())
+
+
+# ---- weights of one's own
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("tensor", [False, True])
+def test_norm_of_what_a_weight_has_beyond_its_values_at_vertices(tensor):
+    """(λ ‖∇ℓ‖² + c ‖ℓ‖²) on cells, the norms added up in a corner's, λ κ's largest eigenvalue."""
+    _, cells, kappa, edge, rng = on_sides(8)
+    made = SimpleNamespace(kappa=kappa, stretch=None, segments=edge)
+    if tensor:
+        a = rng.normal(size=(cells.number, 2, 2))
+        full = a @ a.swapaxes(1, 2) + 0.1 * np.eye(2)
+        made.kappa = np.sqrt(np.linalg.det(full))
+        w, vectors = np.linalg.eigh(full / made.kappa[:, None, None])
+        made.stretch = vectors / np.sqrt(w)[:, None] @ vectors.swapaxes(1, 2)
+        kappa = w[:, 1] * made.kappa
+    most = weights._largest(made)
+    assert np.allclose(most, kappa)
+    loss = rng.uniform(1, 2, len(edge.loss))
+    made.segments, made.reaction = replace(edge, loss=loss), rng.uniform(1, 2, cells.number)
+    side = edge.facets
+    cell = side.cells[0]
+    side = replace(side, cells=np.where(np.arange(len(loss)) < 2, cell, side.cells))
+    steep, area, on_edge = rng.uniform(size=(3, len(loss)))
+    lifted = Lift(steep, area, None, None, on_edge)
+    rows = np.zeros((2, cells.number))
+    for i, at in enumerate(side.cells):
+        rows[:, at] += steep[i], area[i]
+    expected = np.sum(kappa * rows[0] ** 2 + made.reaction * rows[1] ** 2) + loss @ on_edge**2
+    assert np.isclose(weights._square(made, cells, side, lifted, most), expected)
+    made.reaction = np.array(3.0)
+    expected = np.sum(2.0 * rows[0] ** 2 + 3.0 * rows[1] ** 2) + loss @ on_edge**2
+    assert np.isclose(weights._square(made, cells, side, lifted, np.array(2.0)), expected)
+
+
+@pytest.mark.serial
+def test_the_least_value_of_a_weight():
+    level, cells, _, edge, _ = on_sides(9)
+    on, data = OnFacets(cells, edge.facets), diffusion(level.data)
+    truth = (np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]).min()
+    assert truth - 0.5 <= weights._least(data.edges[0].g, cells, edge.facets) <= truth
+    number = data.compiled.trace(ufl.as_ufl(-2.5))
+    assert weights._least(number, cells, edge.facets) == -2.5
+    # a weight on another mesh, alone or with this one's coordinates
+    forms = data.forms
+    other = fem.Function(fem.functionspace(square(2).mesh, ("Lagrange", 1)))
+    for weight in (lambda _: other, lambda x: other + x[0]):
+        with pytest.raises(InputError, match="another mesh"):
+            weights.scalar(weight, forms)
+    assert weights.scalar(lambda x: x[0], forms) == forms.x[0]
+
+
+@pytest.mark.serial
+def test_what_presses():
+    """∫_F (y·n − g + b u_h) on facets: y's flux less what is known of it, and what b has shed."""
+    _, cells, _, edge, rng = on_sides(10)
+    through, shed = rng.normal(size=(3, cells.number)), rng.normal(size=len(edge.loss))
+    made = SimpleNamespace(segments=edge, shed=None, through=lambda _: through)
+    on = OnFacets(cells, edge.facets)
+    known = on.integral(np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0])
+    own = through[edge.facets.local, edge.facets.cells]
+    assert np.allclose(weights.pressed(made, cells, edge.facets), own - known, rtol=1e-5, atol=1e-6)
+    made.shed = shed
+    found = weights.pressed(made, cells, edge.facets)
+    assert np.allclose(found, own - known + shed, rtol=1e-5, atol=1e-6)
+    free = cells.sides[DIRICHLET]
+    assert np.allclose(weights.pressed(made, cells, free), through[free.local, free.cells])
+
+
+# ---- the gap
+
+
+def random_kappa(rng, number):
+    kappa = SimpleNamespace(values=None, cut=None, tensor=None, varies=False)
+    kappa.low, kappa.high = rng.uniform(0.5, 1, number), rng.uniform(1, 3, number)
+    kappa.mean = (kappa.low + kappa.high) / 2
+    return kappa
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("bent", [False, True])
+def test_the_gap_with_a_reaction(bent):
+    """c takes up what f has beyond its mean where that is cheaper, and what y lacks."""
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    at, rng = Points(cells), np.random.default_rng(20)
+    number, kappa = cells.number, random_kappa(rng, cells.number)
+    c = np.exp(rng.uniform(0, 9, number))
+    c[:3] = 0.0
+    excess, w, P = rng.normal(size=(3, 3, number))
+    bumps = rng.normal(size=len(cells.exterior)) * bent
+    v = Companion(None, bumps, excess, None, None, None, None)
+    taken_up, left = c > 0.0, rng.normal(size=number)
+    y = SimpleNamespace(excess=P, beyond=None, taken_up=taken_up, left=left)
+    f = psi(at.x) * rng.uniform(1, 2, number)[:, None]
+    sums = gap.integrate(cells, kappa, w, moments(at, f), y, v, c)
+    jump, off = sums_of(at.affine(excess), at.of_facets(bumps))
+    u, du = at.affine(w)
+    k, field = kappa.mean[:, None, None], at.field(P)
+    pp, bb, pb = (at.integral(each.sum(axis=2)) for each in (field**2 / k, k * off**2, field * off))
+    rest = f - (f @ at.weights)[:, None]
+    norm, h2 = at.integral(rest**2), cells.lengths.max(axis=0)
+    by_slope = h2 / 3.8317059702**2 * norm / kappa.low
+    by_c = np.divide(norm, c, out=np.full(number, np.inf), where=c > 0)
+    share, taken = np.minimum(by_slope, by_c), by_c < by_slope
+    assert 3 < taken.sum() < number - 3
+    apart = at.integral(c[:, None] * jump**2)
+    given = np.divide(left**2, c * at.area, out=np.zeros(number), where=c > 0)
+    assert np.allclose(sums.apart, apart)
+    assert np.allclose(sums.zeroth, apart + given + np.where(taken, share, 0.0))
+    assert np.allclose(sums.indicators, pp + bb + share + apart + given)
+    # the field is the gradient of (s |x|²/2 − Σ P_i X_i·x) / (2 |T|)
+    potential = 0.5 * P.sum(axis=0)[:, None] * (at.x**2).sum(axis=2)
+    potential -= np.einsum("in,nik,nqk->nq", P, at.corners, at.x)
+    potential /= (2 * at.area * kappa.mean)[:, None]
+    of_p, of_b = (at.integral(rest * each) for each in (potential, jump))
+    for row, sign in ((sums.middle, 1), (sums.across, -1)):
+        more = np.where(taken, 0.0, share + 2 * (of_p + sign * of_b))
+        assert np.allclose(row, pp + bb + 2 * sign * pb + more)
+    totals, loose = sums.totals, np.where(taken_up, left, 0.0)
+    assert np.isclose(totals.flux, pp.sum()) and np.isclose(totals.cross, pb.sum())
+    assert np.isclose(totals.companion, np.sum(bb + apart))
+    assert np.isclose(totals.load, np.sum(share + given))
+    assert np.isclose(totals.load_flux, np.sum(of_p[~taken]))
+    assert np.isclose(totals.load_companion, of_b.sum() + loose @ (jump @ at.weights))
+    own = at.integral(c[:, None] * u**2 / 2)
+    steep = at.integral((k * (du + off) ** 2).sum(axis=2))
+    assert np.allclose(sums.steepness, steep)
+    energy = steep / 2 + apart / 2 - own - at.integral(f * (u + jump))
+    assert np.isclose(totals.energy, energy.sum())
+    assert np.isclose(totals.energy_slack, 1e-14 * own.sum(), atol=0.0)
+    assert totals.slack == totals.far == totals.near == 0.0
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("more", [False, True])
+def test_the_gap_where_a_tensor_varies(more):
+    """‖K^{-1/2}(y − K∇z)‖ by what K has beyond κ_T, where lengths are stretched."""
+    domain = square()
+    rng, V = np.random.default_rng(21), fem.functionspace(domain.mesh, ("CR", 1))
+    number = Cells(domain, V).number
+    a = rng.normal(size=(number, 2, 2))
+    cells = Cells(domain, V, stretch=a @ a.swapaxes(1, 2) + np.eye(2))
+    at, mean = Points(cells), rng.uniform(1, 2, number)
+    assert np.allclose(at.area, cells.volume)
+    off = 0.2 * rng.normal(size=(len(at.weights), number, 2, 2))
+    off += off.swapaxes(2, 3)
+    off = 0.5 * off * mean[:, None, None]
+    theta = np.abs(np.linalg.eigvalsh(off / mean[:, None, None])).max(axis=(0, 2))
+    off *= np.minimum(1.0, 0.8 / theta)[:, None, None]
+    theta, rough = np.minimum(theta, 0.8), rng.uniform(0.01, 0.1, number)
+    rule = SimpleNamespace(weights=at.weights, hats=at.hats)
+    kappa = SimpleNamespace(mean=mean, spread=theta, rough=rough, rule=rule)
+    kappa.apart = lambda *_: off
+    P, w, excess, rise = rng.normal(size=(4, 3, number))
+    rise -= rise.mean(axis=0)
+    bumps, thirds, heights = rng.normal(size=(3, len(cells.exterior)))
+    y = SimpleNamespace(excess=P, beyond=Beyond(heights, rise) if more else None)
+    v = Companion(None, bumps, excess, None, None, None, None, None, thirds if more else None)
+    before = rng.uniform(size=(2, number))
+    vv, far, near, energy = gap._of_tensor(
+        cells, kappa, slice(0, number), y, v, w, (before[0], before[1])
+    )
+    _, du = at.affine(w)
+    change = sums_of(at.affine(excess), at.of_facets(bumps))[1]
+    field = at.field(P) + mean[:, None, None] * du
+    if more:
+        change = change + at.of_facets(thirds, cubic=True)[1]
+        curl = at.of_facets(heights)[1]
+        field = field + np.stack([curl[..., 1], -curl[..., 0]], axis=-1)
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            way = (rise[j] - rise[i])[:, None] * (at.corners[:, j] - at.corners[:, i]) / 3
+            field = field + way[:, None] * (at.hats[i] * at.hats[j])[:, None]
+    K = mean[:, None, None, None] * np.eye(2) + off.swapaxes(0, 1)
+    kappa.values = kappa.cut = None
+    kappa.tensor = True
+    load = VolumeMoments(rng.normal(size=number), None, None)
+    sums = gap.integrate(cells, kappa, w, load, y, v)
+    grown = []
+    for gained, old, row, dz in (
+        (far, before[0], sums.across, du + change),
+        (near, before[1], sums.middle, du - change),
+    ):
+        F = field - np.einsum("nqij,nqj->nqi", K, dz)
+        truth = at.integral(np.einsum("nqi,nqij,nqj->nq", F, np.linalg.inv(K), F))
+        assert np.all(truth <= gained + old)
+        norm = np.sqrt(at.integral((F**2).sum(axis=2)) / mean)
+        steep = np.sqrt(at.integral((dz**2).sum(axis=2)) * mean)
+        bound = (norm + 2 * rough * steep) ** 2 / (1 - theta)
+        assert np.allclose(gained + old, bound) and np.allclose(row, bound)
+        F = field - mean[:, None, None] * dz
+        grown.append(np.sum(bound - at.integral((F**2).sum(axis=2)) / mean))
+    dv = du + change
+    assert np.allclose(vv, at.integral(np.einsum("nqi,nqij,nqj->nq", dv, K, dv)))
+    assert np.allclose(energy, rough * mean * at.integral((dv**2).sum(axis=2)))
+    assert np.allclose(sums.steepness, vv) and np.isclose(sums.totals.energy_slack, energy.sum())
+    assert np.allclose((sums.totals.far, sums.totals.near), grown)
+
+
+@pytest.mark.serial
+def test_rounding_of_the_bracket():
+    """In parts of ∫ κ|∇v|² and of |J(v)|, whatever the sign of that."""
+    total, ball = Totals(energy=-3.0, steepness=2.0), certificate._Ball(0.0, 0.0, 0.0, 0.0)
+    low, high = certificate._bracket(total, ball, 0.0, 0.0)
+    assert np.isclose(high - low, 1e-13, rtol=0.01, atol=0.0) and low < -3.0 < high
