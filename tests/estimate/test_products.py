@@ -8,19 +8,23 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import compute_midpoints, create_box, exterior_facet_indices, meshtags
 from mpi4py import MPI
 
-from signorini_cr import InputError, Polygon, Problem, solve
+from signorini_cr import Domain, InputError, Polygon, Problem, solve
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Certain, Segments, VolumeMoments
-from signorini_cr.estimate import certificate, cusps, force, gap, pairing, weights
+from signorini_cr.diffusion import Diffusion
+from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
-from signorini_cr.estimate.companion import Companion
-from signorini_cr.estimate.lifting import Lift
-from signorini_cr.estimate.sums import Totals
-from signorini_cr.fem.cells import Cells
+from signorini_cr.estimate.companion import Companion, Functional, Masses, _at_vertices
+from signorini_cr.estimate.lifting import Lift, affine
+from signorini_cr.estimate.sums import Sums, Totals
+from signorini_cr.fem.cells import BoundaryFacets, Cells
 from signorini_cr.fem.space import function_space
 from signorini_cr.mesh.families import structured
+from signorini_cr.multigrid.hierarchy import NestedMesh
+from signorini_cr.vi.level import Level
 
 SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
 SIDES = ("contact", "neumann", "dirichlet", "neumann")
@@ -581,8 +585,191 @@ def test_the_gap_where_a_tensor_varies(more):
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("reacts", [False, True])
+def test_the_gap_on_sides(reacts):
+    """g − g_F against the potentials of y and v; b‖v − u_h‖²_F, and what b takes up instead."""
+    _, cells, _, edge, rng = on_sides(22)
+    at, on, number = Points(cells), OnFacets(cells, edge.facets), cells.number
+    kappa = random_kappa(rng, number)
+    kappa.varies = True
+    n, where = len(edge.loss), edge.facets.cells
+    loss = np.array([0.0, 0.01, 0.02, 50.0, 60.0, 0.0])
+    shed = rng.normal(size=n) * (loss > 0)
+    edge = replace(edge, loss=loss, low=kappa.low)
+    excess, w = rng.normal(size=(2, 3, number))
+    _, made = made_up(cells, 23)
+    variance = rng.uniform(size=number)
+    rows = rng.uniform(size=(4, number))
+    sums = Sums(*(row.copy() for row in rows))
+    v = Companion(made.vertices, made.bumps, None, None, None, None, None)
+    y = SimpleNamespace(excess=excess, beyond=None, shed=shed)
+    load = SimpleNamespace(variance=variance)
+    reaction = np.where(np.arange(number) % 2, 1e3, 0.1) if reacts else np.array(0.0)
+    assert gap.integrate_edge(cells, kappa, w, load, edge, y, v, sums, reaction) == 0.0
+    jump = on.affine(made.vertices[cells.vertices] - w) + on.bump(made.bumps)
+    rest = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]
+    rest -= (rest @ on.weights)[:, None]
+    h = np.sqrt(cells.lengths.max(axis=0)[where])
+    c = h / 3.8317059702
+    strong = loss * on.length / at.area[where] * c * (c + h) > kappa.low[where]
+    assert np.array_equal(strong, loss > 1.0)
+    inverse = np.divide(1.0, loss, out=np.zeros(n), where=loss > 0)
+    apart = loss * on.integral(jump**2)
+    given = inverse * (np.where(strong, on.integral(rest**2), 0.0) + shed**2 / on.length)
+    potential = 0.5 * excess.sum(axis=0)[where, None] * (on.x**2).sum(axis=2)
+    potential -= np.einsum("in,nik,nqk->nq", excess[:, where], at.corners[where], on.x)
+    potential /= (2 * at.area * kappa.mean)[where, None]
+    of_p, of_b = (on.integral(rest * each) for each in (potential, jump))
+    cell, sizes = edge.oscillation(False)
+    square_ = sizes**2 / kappa.low[cell]
+    norm = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702 * np.sqrt(at.area * variance)
+    if reacts:
+        norm[at.area * variance * kappa.low < reaction * norm**2] = 0.0
+        assert 0 < np.sum(norm[cell] == 0.0) < len(cell)
+    more = (2 * norm[cell] * sizes + sizes**2) / kappa.low[cell]
+    spread = np.maximum(1 / kappa.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.high)
+    field = np.sqrt(at.integral((at.field(excess) ** 2).sum(axis=2)))
+    slope = np.sqrt(at.integral((at.affine(w)[1] ** 2).sum(axis=2)))
+    slack = sizes * (spread * (field + kappa.mean * slope))[cell]
+    changes = np.zeros((4, number))
+    for i, one in enumerate(where):
+        changes[0, one] += apart[i] + given[i]
+        changes[1, one] += apart[i] + given[i]
+        changes[2, one] += 2 * (of_p[i] + of_b[i]) * (not strong[i])
+        changes[3, one] += 2 * (of_p[i] - of_b[i]) * (not strong[i])
+    changes[0, cell] += square_
+    changes[2:, cell] += more + 2 * slack
+    assert np.allclose(sums.indicators, rows[0] + changes[0], rtol=1e-5)
+    assert np.allclose(sums.zeroth, changes[1], rtol=1e-5)
+    assert np.allclose(sums.middle, rows[2] + changes[2], rtol=1e-5, atol=1e-5)
+    assert np.allclose(sums.across, rows[3] + changes[3], rtol=1e-5, atol=1e-5)
+    totals, own = sums.totals, loss @ on.integral(on.affine(w) ** 2) / 2
+    expected = {
+        "companion": apart.sum(),
+        "load": given.sum() + more.sum(),
+        "neumann": square_.sum(),
+        "load_flux": of_p[~strong].sum(),
+        "load_companion": of_b.sum() + shed @ (jump @ on.weights),
+        "slack": slack.sum(),
+        "energy": apart.sum() / 2 - own,
+    }
+    for name, value in expected.items():
+        assert np.isclose(getattr(totals, name), value, rtol=1e-4), name
+    assert np.isclose(totals.energy_slack, 1e-14 * own, atol=0.0)
+
+
+@pytest.mark.serial
 def test_rounding_of_the_bracket():
     """In parts of ∫ κ|∇v|² and of |J(v)|, whatever the sign of that."""
     total, ball = Totals(energy=-3.0, steepness=2.0), certificate._Ball(0.0, 0.0, 0.0, 0.0)
     low, high = certificate._bracket(total, ball, 0.0, 0.0)
     assert np.isclose(high - low, 1e-13, rtol=0.01, atol=0.0) and low < -3.0 < high
+
+
+# ---- v to begin with, and what contact carries
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["number", "cells", "masses"])
+def test_values_at_vertices_to_begin_with(kind):
+    """Least squares: what it costs to leave u_h on cells, by κ and c, and t/b on facets."""
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng, none = np.random.default_rng(24), BoundaryFacets.joined([], 2)
+    w, side, some = rng.normal(size=(3, cells.number)), cells.sides[3], kind == "masses"
+    side = side if some else none
+    loss, toward = rng.uniform(1, 9, len(side.cells)), rng.normal(size=(3, len(side.cells)))
+    c = rng.uniform(0, 90, cells.number) if some else np.array(0.0)
+    masses = Masses(some, c, side, loss, toward, loss > 5)
+    kappa = np.array(2.0) if kind == "number" else rng.uniform(1, 3, cells.number)
+    functional = Functional(cells, w, kappa, np.array(True), masses)
+    u_D = SimpleNamespace(side=none, ends=np.zeros((2, 0)))
+    floors = SimpleNamespace(
+        side=none, signs=np.zeros(0), at_vertices=(), facets=len(cells.exterior)
+    )
+    y = SimpleNamespace(touching=np.zeros(0, dtype=bool), contact=np.zeros(0))
+    found, _ = _at_vertices(functional, u_D, floors, y)
+    rows, right = [], []
+    weight = np.sqrt(kappa + c * cells.volume) * np.ones(cells.number)
+    for cell in range(cells.number):
+        for i in range(3):
+            rows.append(weight[cell] * np.eye(len(found))[cells.vertices[i, cell]])
+            right.append(weight[cell] * w[i, cell])
+    for i, (cell, local) in enumerate(zip(side.cells, side.local, strict=True)):
+        for end, to in zip([j for j in range(3) if j != local], toward[:2, i], strict=True):
+            rows.append(np.sqrt(loss[i]) * np.eye(len(found))[cells.vertices[end, cell]])
+            right.append(np.sqrt(loss[i]) * (w[end, cell] + to))
+    assert np.allclose(found, np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("c", [0.0, 5.0])
+@pytest.mark.parametrize("sinks", [{}, {2: 7.0}])
+def test_what_contact_carries(signed, c, sinks):
+    """To facets with much of the force, cells with a c and sides with a b, by quadrature.
+
+    Where no more than sizes are known, norms of the facets' own fields add up.
+    """
+    domain = square(3)
+    V = fem.functionspace(domain.mesh, ("CR", 1))
+    cells = Cells(domain, V, (), sinks)
+    at, rng, side = Points(cells), np.random.default_rng(25), cells.sides[1]
+    left, kappa = rng.uniform(1, 2, cells.number), rng.uniform(1, 3, cells.number)
+    contact, touching = np.array([50.0, 60.0, 1.0]), np.array([True, True, True])
+    y = SimpleNamespace(contact=contact, touching=touching)
+    reaction = np.where(np.arange(cells.number) == 7, c, 0.0) if c else np.array(0.0)
+    arguments = (kappa, side, reaction, signed)
+    norm, change = flux.carried_to_contact(cells, y, left, *arguments)
+    takers = np.broadcast_to(reaction > 0, cells.number)
+    exits = [side.dofs[:2], *(cells.sides[part].dofs for part in sinks)]
+    fluxes, _ = flux._carry(cells, left, cells.layered(exits, takers), int(takers.sum()))
+    inside = ~takers
+    assert np.allclose(fluxes.sum(axis=0)[inside], -left[inside])
+    assert np.allclose(change[:2], np.abs(fluxes[side.local, side.cells])[:2]) and change[2] == 0.0
+    if not c and not sinks:
+        assert np.isclose(change.sum(), left.sum())
+
+    def norms(fluxes):
+        return np.sqrt(at.integral((at.field(fluxes) ** 2).sum(axis=2)))
+
+    units = [norms(np.outer(unit, np.ones(cells.number))) for unit in np.eye(3)]
+    of_field = norms(fluxes) if signed else (np.abs(fluxes) * units).sum(axis=0)
+    expected = np.sum(of_field**2 / kappa)
+    for part, b in sinks.items():
+        on = OnFacets(cells, cells.sides[part])
+        out = fluxes[cells.sides[part].local, cells.sides[part].cells]
+        expected += np.sum(out**2 / (b * on.length))
+    if c:
+        kept = left[7] + fluxes[:, 7].sum()
+        expected += kept**2 / (c * at.area[7])
+    assert np.isclose(norm, np.sqrt(expected))
+    # forces that are not enough, and what is not in contact
+    y.contact = 1e-3 * contact
+    assert np.isposinf(flux.carried_to_contact(cells, y, left, *arguments)[0])
+    y.contact, y.touching = contact, ~touching
+    norm, change = flux.carried_to_contact(cells, y, left, *arguments)
+    assert not change.any() and np.isfinite(norm) == bool(c or sinks)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("off", [0.0, 1e-3, -1e-3])
+def test_tetrahedra_ask_for_data_that_v_is_not_below(off):
+    mesh = create_box(MPI.COMM_SELF, [(0, 0, 0), (1, 1, 1)], (2, 2, 1))
+    mesh.topology.create_connectivity(2, 3)
+    facets = exterior_facet_indices(mesh.topology)
+    parts = np.where(compute_midpoints(mesh, 2, facets)[:, 2] < 1e-9, 1, 2).astype(np.int32)
+    domain = Domain.from_tags(mesh, meshtags(mesh, 2, facets, parts))
+    rise = lambda x: x[0] - 2 * x[1] - 9  # noqa: E731
+    data = Diffusion(Problem(f=1.0, obstacle=rise), mesh)
+    level = Level((NestedMesh(data, domain),))
+    data = diffusion(level.data)
+    alpha = data.alpha[0].seen_from(data.cells)
+    v = alpha.ends.copy()
+    v[1, 2] += off
+    found = affine(data.cells, alpha.side(data.cells), alpha.trace, v, alpha.ends, 9.0)
+    assert (found.reason is None) == (off >= 0.0)
+    x = mesh.geometry.x[:, :2][mesh.geometry.dofmap[alpha.side(data.cells).cells]]
+    on_facet = np.array([[j for j in range(4) if j != i] for i in alpha.side(data.cells).local])
+    middle = np.take_along_axis(x, on_facet[:, :, None], axis=1).mean(axis=1)
+    assert np.allclose(found.least, middle @ [1, -2] - 9)
