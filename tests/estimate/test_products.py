@@ -14,11 +14,12 @@ from mpi4py import MPI
 from signorini_cr import Domain, InputError, Polygon, Problem, solve
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Certain, Segments, VolumeMoments
+from signorini_cr.data.ranges import Pieces
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.companion import Companion, Functional, Masses, _at_vertices
-from signorini_cr.estimate.lifting import Lift, affine
+from signorini_cr.estimate.lifting import Lift, affine, gaps
 from signorini_cr.estimate.sums import Sums, Totals
 from signorini_cr.fem.cells import BoundaryFacets, Cells
 from signorini_cr.fem.space import function_space
@@ -460,7 +461,7 @@ def test_what_presses():
 def random_kappa(rng, number):
     kappa = SimpleNamespace(values=None, cut=None, tensor=None, varies=False)
     kappa.low, kappa.high = rng.uniform(0.5, 1, number), rng.uniform(1, 3, number)
-    kappa.mean = (kappa.low + kappa.high) / 2
+    kappa.mean = kappa.low + rng.uniform(0.02, 0.98, number) * (kappa.high - kappa.low)
     return kappa
 
 
@@ -582,6 +583,54 @@ def test_the_gap_where_a_tensor_varies(more):
     assert np.allclose(energy, rough * mean * at.integral((dv**2).sum(axis=2)))
     assert np.allclose(sums.steepness, vv) and np.isclose(sums.totals.energy_slack, energy.sum())
     assert np.allclose((sums.totals.far, sums.totals.near), grown)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("more", [False, True])
+def test_quadrature_on_pieces(more):
+    """The same as on whole cells, for polynomials; strips hold no more than polynomials can.
+
+    A polynomial's largest square is Σ φ_i² at a vertex times its mean, φ_i orthonormal.
+    """
+    domain = square()
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    at, rng, number = Points(cells), np.random.default_rng(26), cells.number
+    P, w, excess = rng.normal(size=(3, 3, number))
+    bumps, heights = rng.normal(size=(2, len(cells.exterior)))
+    y = SimpleNamespace(excess=P, beyond=Beyond(heights, None) if more else None)
+    v = Companion(None, bumps, excess, None, None, None, None)
+    k, errors = rng.uniform(1, 2, number), np.zeros((7, number))
+    points = basix.make_quadrature(basix.CellType.triangle, 10)[0].T
+    pairs = [(i, j) for i in range(3 if more else 2) for j in range((3 if more else 2) - i)]
+    powers = np.array([points[0] ** i * points[1] ** j for i, j in pairs])
+    vertex = np.array([float(i == j == 0) for i, j in pairs])
+    largest = vertex @ np.linalg.solve((powers * at.weights) @ powers.T, vertex)
+    errors[3] = 1e9
+    errors[4], errors[5] = rng.uniform(size=(2, number))
+    rule = SimpleNamespace(weights=at.weights, hats=at.hats)
+    kappa = SimpleNamespace(values=np.tile(k, (len(at.weights), 1)), mean=k, rule=rule)
+    whole = Pieces.of_cells(cells, np.array([1, 3, 6]))
+    found = []
+    for pieces in (whole[:0], whole, whole.halves(), whole.halves().halves()):
+        pieces = pieces[np.argsort(pieces.parent, kind="stable")]
+        inside = errors[:, pieces.parent]
+        kappa.cut = SimpleNamespace(errors=errors, pieces=pieces, errors_inside=inside)
+        kappa.inside = np.tile(k[pieces.parent], (len(at.weights), 1))
+        part = slice(1, number)
+        found.append(np.array(gap._by_quadrature(cells, kappa, part, y, v, w)))
+        assert np.allclose(found[-1], found[0])
+    u = at.affine(w)[1]
+    off, field = sums_of(at.affine(excess), at.of_facets(bumps))[1], at.field(P)
+    if more:
+        curl = at.of_facets(heights)[1]
+        field = field + np.stack([curl[..., 1], -curl[..., 0]], axis=-1)
+    of_y = at.integral(((field + k[:, None, None] * u) ** 2).sum(axis=2))
+    for row, dz in ((4, u + off), (5, u - off)):
+        of_z = at.integral((dz**2).sum(axis=2))  # affine
+        strips = 2 * (largest * errors[4] * of_y + 9 * errors[5] * of_z)
+        assert np.allclose(found[0][row], strips[1:])
+    assert np.isclose(largest, 36 if more else 9)
+    assert np.allclose(found[0][0], (at.integral((field**2).sum(axis=2)) / k)[1:])
 
 
 @pytest.mark.serial
@@ -750,6 +799,47 @@ def test_what_contact_carries(signed, c, sinks):
     y.contact, y.touching = contact, ~touching
     norm, change = flux.carried_to_contact(cells, y, left, *arguments)
     assert not change.any() and np.isfinite(norm) == bool(c or sinks)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("curved", [False, True])
+def test_how_far_v_is_off_its_bounds(sign, curved):
+    """Not further than at any of many points, and nearly as far; a bound with no range says so."""
+    level, cells, _, _, rng = on_sides(27)
+    data, side = diffusion(level.data), cells.sides[1]
+    x = data.forms.x
+    bound = ufl.sin(3 * x[0]) - 0.4 if curved else ufl.as_ufl(-0.4)
+    trace = data.compiled.trace(bound)
+    vertices = rng.normal(size=cells.vertices.max() + 1) + 0.5 * sign
+    bumps, thirds = rng.normal(size=(2, len(cells.exterior)))
+    part = SimpleNamespace(trace=trace, sign=sign, side=lambda _: side)
+    t = np.linspace(0, 1, 2001)
+    nodes = cells.domain.mesh.geometry.dofmap[side.cells]
+    (first, last) = (
+        cells.domain.mesh.geometry.x[nodes[np.arange(3), end], 0]
+        for end in np.array([[j for j in range(3) if j != i] for i in side.local]).T
+    )
+    at = first[:, None] * (1 - t) + last[:, None] * t
+    a, b = vertices[side.ends][:, :, None]
+    ways = np.where(side.ends[0] < side.ends[1], 1.0, -1.0)[:, None]
+    v = a * (1 - t) + b * t + 4 * t * (1 - t) * bumps[side.dofs, None]
+    cubic = ways * t * (1 - t) * (1 - 2 * t) * thirds[side.dofs, None]
+    alpha = np.sin(3 * at) - 0.4 if curved else -0.4
+    for heights, more in ((None, 0.0), (thirds, cubic)):
+        parts = SimpleNamespace(parts=[part, part] if heights is None else [part])
+        found = gaps(cells, parts, vertices, bumps, heights).reshape(-1, 3)
+        # bounds of either sign are given as those of s v
+        above = sign * (v + more) - alpha
+        most = 4 * np.abs(bumps) + (0 if heights is None else 3 * np.abs(thirds))
+        # what second derivatives do, or for a curve what it does in a quarter of a facet
+        rise = np.abs(np.diff(above)).max(axis=1) * 2000 / 4
+        limit = rise if curved else most[side.dofs] / 64
+        truth = above.min(axis=1)
+        assert np.all(found <= truth + 1e-12) and np.all(truth - found <= limit + 1e-5)
+        assert len(found) == len(parts.parts)
+    part.trace = data.compiled.trace(1.0 + ufl.bessel_J(1, x[0]))
+    assert np.all(np.isneginf(gaps(cells, parts, vertices, bumps, None)))
 
 
 @pytest.mark.serial
