@@ -455,6 +455,67 @@ def test_what_presses():
     assert np.allclose(weights.pressed(made, cells, free), through[free.local, free.cells])
 
 
+@pytest.mark.serial
+def test_a_weight_against_the_flux(monkeypatch):
+    """Simpson's rule for ω, and sizes times sizes for what it has beyond; made-up liftings.
+
+    Half of the curl of y's bumps, 4 h (1 − 2s)/|F|, meets ω's affine part unseen.
+    """
+    problem = Problem(f=-9.0, dirichlet=lambda x: x[0] / 4, obstacle=-0.3)
+    made = solve(problem, square(3)).certificate._made
+    cells, rng = made.cells(), np.random.default_rng(28)
+    condition = diffusion(made.level.data).forms.fixed[0]
+    side = next(each for number, each in cells.sides.items() if number == condition.number)
+    n, on = len(side.cells), OnFacets(cells, side)
+    found = weights.Weight.of(made, cells, [condition], lambda x: x[0] ** 3 - 0.5)
+    V = found.values.function_space
+    x, y = V.tabulate_dof_coordinates()[:, :2].T
+    assert np.allclose(found.values.x.array, np.where(y > 1 - 1e-9, x**3 - 0.5, 0.0))
+    assert set(found.known) == set(np.flatnonzero((y > 1 - 1e-9) | (y < 1e-9)))
+    assert found.scale == 0.5
+    lifts = [Lift(*rng.uniform(size=(5, n))) for _ in range(2)]
+    goals = []
+
+    def lift(_, side_, trace, base, v, scale, goal, obstacle):
+        assert base is None and not obstacle and scale == 0.5
+        goals.append(goal)
+        # of ω less its affine part, and less its quadratic part
+        middle = np.sum(v.ends, axis=0) / 2 + v.height
+        exact = np.sum(on.x[..., 0][:, [5, 6]], axis=1) / 2
+        return lifts[np.allclose(middle, exact**3 - 0.5)]
+
+    monkeypatch.setattr(weights, "lift", lift)
+    made = replace(made, left=rng.normal(size=cells.number), taken_up=None)
+    result = found.beyond(made, cells, 3.0)
+    assert len(goals) == 2 and np.allclose(goals, 0.03)
+    pressure = made.through(cells)[side.local, side.cells] / on.length
+    cubes = on.integral(on.x[..., 0] ** 3 - 0.5)  # Simpson's rule is exact
+    assert np.isclose(result.force, pressure @ cubes)
+    coarse, fine = lifts
+    assert np.isclose(result.unsure, np.abs(pressure) @ fine.beyond)
+    assert np.isclose(result.square, np.sum(coarse.steep**2))
+    over = coarse.area / np.sqrt(cells.volume[side.cells])
+    assert np.isclose(result.left, np.abs(made.left[side.cells]) @ over)
+    assert np.isclose(result.mean, over.max()) and len(np.unique(side.cells)) == n
+    assert -0.6 <= result.least <= -0.5
+    taken = np.arange(cells.number) == side.cells[1]
+    heights = rng.normal(size=len(cells.exterior))
+    made = replace(made, taken_up=taken, beyond=Beyond(heights, None))
+    result = found.beyond(made, cells, 3.0)
+    assert np.isclose(result.left, np.delete(np.abs(made.left[side.cells]) * over, 1).sum())
+    own = heights[side.dofs, None] * 4 * (1 - 2 * on.s) / on.length[:, None]
+    ends = found.values.x.array[V.dofmap.list[side.cells[:, None], on.ends]]
+    affine_ = ends[:, :1] * (1 - on.s) + ends[:, 1:] * on.s
+    half = np.abs(on.integral(own * affine_)) / 2
+    largest = 4 * np.abs(heights[side.dofs]) / on.length * np.sqrt(on.length) * coarse.edge
+    expected = np.abs(pressure) @ fine.beyond + np.sum(half + largest)
+    assert np.isclose(result.unsure, expected)
+    # with a reason there is none, and a corner's cell has the sum of two
+    lifts[1] = replace(lifts[1], reason="u_D jumps on a boundary facet")
+    with pytest.raises(InputError, match="the weight jumps on a boundary facet"):
+        found.beyond(made, cells, 3.0)
+
+
 # ---- the gap
 
 
