@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Polygon, Problem, solve
 from signorini_cr.data.diffusion import diffusion
-from signorini_cr.data.loads import Certain, Segments, VolumeMoments
+from signorini_cr.data.loads import Certain, Known, Segments, VolumeMoments
 from signorini_cr.data.ranges import Pieces
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
@@ -887,6 +887,42 @@ def test_what_contact_carries(signed, c, sinks):
     y.contact, y.touching = contact, ~touching
     norm, change = flux.carried_to_contact(cells, y, left, *arguments)
     assert not change.any() and np.isfinite(norm) == bool(c or sinks)
+
+
+@pytest.mark.serial
+def test_what_cells_with_a_reaction_carry():
+    """‖κ^{-1/2} q‖ and what c takes up of what arrives; ∞ where nothing takes it."""
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), ())
+    at, rng = Points(cells), np.random.default_rng(29)
+    left, kappa = rng.normal(size=cells.number), rng.uniform(1, 3, cells.number)
+    reaction = np.where(np.isin(np.arange(cells.number), [7, 11]), 0.3, 0.0)
+    found = flux._carried(cells, left, kappa, 0.0, reaction)
+    fluxes, _ = flux._carry(cells, left, cells.layered([], reaction > 0), 2)
+    squares = at.integral((at.field(fluxes) ** 2).sum(axis=2)) / kappa
+    arrived = (left + fluxes.sum(axis=0))[[7, 11]]
+    assert np.isclose(arrived.sum(), left.sum())
+    expected = squares.sum() + np.sum(arrived**2 / (0.3 * at.area[[7, 11]]))
+    assert np.isclose(found, np.sqrt(expected))
+    assert np.isposinf(flux._carried(cells, left, kappa, 0.0, 0 * reaction))
+    assert np.isposinf(flux._carried(cells, left, kappa, 0.0, np.array(0.3)))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kappa", [0.1, 1.0, 10.0])
+def test_a_reaction_that_is_strong(kappa):
+    """y need not balance the load from c h² = 3 κ on."""
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    side, number = cells.sides[1], cells.number
+    none, nothing = BoundaryFacets.joined([], 2), np.zeros(0)
+    edge = Known(none, np.zeros((2, 0)), nothing, nothing > 0)
+    for part, strong in ((0.99, False), (1.01, True)):
+        c = np.array(part * 3 * kappa / cells.lengths.max())
+        force_ = np.zeros(len(side.cells))
+        y = flux.Flux(np.ones((3, number)), force_, force_ > 0, np.ones(number), None)
+        found = flux.relax(cells, np.array(kappa), y, c, edge, side, force_ + 1.0)
+        assert (found is not None) == strong == (not np.all(y.excess == 1.0))
 
 
 @pytest.mark.serial
