@@ -926,6 +926,60 @@ def test_a_reaction_that_is_strong(kappa):
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("some", [False, True])
+def test_forces_take_up_what_a_flux_is_bettered_by(sign, some):
+    """No flux through a facet in contact could be better, and none changes next to cells with no c.
+
+    A force that would change its sign is 0, and y's flux there is what it was less the force.
+    """
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    at, rng, side = Points(cells), np.random.default_rng(30), cells.sides[1]
+    number, kappa = cells.number, rng.uniform(1, 2, cells.number)
+    c = np.full(number, 300.0)
+    if some:
+        c[[side.cells[2], 4]] = 0.0
+    edge = Known(side, np.zeros((2, 3)), np.full(3, 9.0), np.ones(3, dtype=bool))
+    touching = np.array([True, True, False])
+    excess, left = rng.normal(size=(3, number)), rng.normal(size=number)
+    excess[side.local[0], side.cells[0]] = 9.0 * sign
+    excess[side.local[1], side.cells[1]] = -9.0 * sign
+    gained = np.zeros(3)
+    for before in (np.array([90.0, 80.0, 0.0]), np.array([1e-3, 1e-3, 0.0])):
+        y = flux.Flux(excess.copy(), before.copy(), touching, left.copy(), None)
+        taken = flux.relax(cells, kappa, y, c, edge, side, np.full(3, sign))
+        assert np.array_equal(taken, c > 0)
+        change = y.excess - excess
+        assert np.allclose(y.left, left + change.sum(axis=0))
+        assert np.allclose(cells.over_facets(change)[~cells.exterior], 0.0)
+        assert not np.any(change[:, c == 0]) or not some
+        own = change[side.local, side.cells]
+        assert np.allclose(own[:2], sign * (y.contact - before)[:2]) and np.all(y.contact >= 0)
+        # b takes up what goes through the facet that is not in contact
+        assert np.allclose(y.shed, [0.0, 0.0, -own[2]]) and (some or abs(own[2]) > 1e-4)
+        if before[0] < 1.0:
+            assert np.allclose(y.contact, np.maximum(before + gained, 0.0))
+            assert y.contact[0] == 0.0 < y.contact[1]
+            continue
+        gained = y.contact - before
+
+        def total(step, y=y):
+            squares = at.integral((at.field(y.excess + step) ** 2).sum(axis=2)) / kappa
+            rest = (y.left + step.sum(axis=0))[c > 0]
+            lost = (y.shed - step[side.local, side.cells])[2]
+            by_b = lost**2 / (9.0 * OnFacets(cells, side).length[2])
+            return squares.sum() + np.sum(rest**2 / (300.0 * at.area[c > 0])) + by_b
+
+        least = total(np.zeros_like(excess))
+        for i in range(2 if some else 3):
+            for step in (1e-2, -1e-2):
+                moved = np.zeros_like(excess)
+                moved[side.local[i], side.cells[i]] = step
+                assert total(moved) > least
+
+
+@pytest.mark.serial
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("curved", [False, True])
 def test_how_far_v_is_off_its_bounds(sign, curved):
