@@ -19,6 +19,7 @@ from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.companion import Companion, Functional, Masses, _at_vertices
+from signorini_cr.estimate.curl import _pull
 from signorini_cr.estimate.lifting import Lift, affine, gaps
 from signorini_cr.estimate.sums import Sums, Totals
 from signorini_cr.fem.cells import BoundaryFacets, Cells
@@ -461,7 +462,7 @@ def test_a_weight_against_the_flux(monkeypatch):
 
     Half of the curl of y's bumps, 4 h (1 − 2s)/|F|, meets ω's affine part unseen.
     """
-    problem = Problem(f=-9.0, dirichlet=lambda x: x[0] / 4, obstacle=-0.3)
+    problem = Problem(f=-9.0, dirichlet=lambda x: x[0] / 4, obstacle=-0.3, coefficient=4.0)
     made = solve(problem, square(3)).certificate._made
     cells, rng = made.cells(), np.random.default_rng(28)
     condition = diffusion(made.level.data).forms.fixed[0]
@@ -487,13 +488,13 @@ def test_a_weight_against_the_flux(monkeypatch):
     monkeypatch.setattr(weights, "lift", lift)
     made = replace(made, left=rng.normal(size=cells.number), taken_up=None)
     result = found.beyond(made, cells, 3.0)
-    assert len(goals) == 2 and np.allclose(goals, 0.03)
+    assert len(goals) == 2 and np.allclose(goals, 0.03 / 2)  # κ^{1/2} = 2
     pressure = made.through(cells)[side.local, side.cells] / on.length
     cubes = on.integral(on.x[..., 0] ** 3 - 0.5)  # Simpson's rule is exact
     assert np.isclose(result.force, pressure @ cubes)
     coarse, fine = lifts
     assert np.isclose(result.unsure, np.abs(pressure) @ fine.beyond)
-    assert np.isclose(result.square, np.sum(coarse.steep**2))
+    assert np.isclose(result.square, 4 * np.sum(coarse.steep**2))
     over = coarse.area / np.sqrt(cells.volume[side.cells])
     assert np.isclose(result.left, np.abs(made.left[side.cells]) @ over)
     assert np.isclose(result.mean, over.max()) and len(np.unique(side.cells)) == n
@@ -719,6 +720,84 @@ def test_quadrature_on_pieces(more):
         assert np.allclose(found[0][row], strips[1:])
     assert np.isclose(largest, 36 if more else 9)
     assert np.allclose(found[0][0], (at.integral((field**2).sum(axis=2)) / k)[1:])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("more", [False, True])
+def test_what_pulls_at_bumps_of_the_curl(more):
+    """−∫ κ⁻¹ (y − κ∇(u_h + v)/2)·curl b_i on each cell."""
+    domain = square()
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    at, rng, number = Points(cells), np.random.default_rng(31), cells.number
+    kappa, (P, excess, rise) = rng.uniform(1, 3, number), rng.normal(size=(3, 3, number))
+    bumps, heights = rng.normal(size=(2, len(cells.exterior)))
+    rise -= rise.mean(axis=0)
+    y = SimpleNamespace(excess=P, beyond=Beyond(heights, rise) if more else None)
+    v = Companion(None, bumps, excess, None, None, None, None)
+    off = at.field(P)
+    if more:
+        curl = at.of_facets(heights)[1]
+        off = off + np.stack([curl[..., 1], -curl[..., 0]], axis=-1)
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            way = (rise[j] - rise[i])[:, None] * (at.corners[:, j] - at.corners[:, i]) / 3
+            off = off + way[:, None] * (at.hats[i] * at.hats[j])[:, None]
+    change = sums_of(at.affine(excess), at.of_facets(bumps))[1]
+    off = off - kappa[:, None, None] * change / 2
+    found = _pull(cells, kappa, y, v)
+    for i in range(3):
+        for cell in range(number):
+            unit = np.zeros(len(heights))
+            unit[cells.facets[i, cell]] = 1.0
+            curl = at.of_facets(unit)[1]
+            curl = np.stack([curl[..., 1], -curl[..., 0]], axis=-1)
+            expected = -at.integral((off * curl).sum(axis=2))[cell] / kappa[cell]
+            assert np.isclose(found[i, cell], expected)
+    # with κ a number, too
+    assert np.allclose(_pull(cells, np.array(2.0), y, v), _pull(cells, 0 * kappa + 2.0, y, v))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("plain", [False, True])
+def test_what_v_is_to_make_small(plain):
+    """κ is steady where it does not vary; b |F| and t/b − u_h on facets with a b."""
+    _, cells, kappa, edge, rng = on_sides(32)
+    n, side = len(edge.loss), edge.facets
+    loss = np.array([0.0, 0.01, 0.02, 50.0, 60.0, 0.0])
+    edge, shed = replace(edge, loss=loss, low=kappa), rng.normal(size=n) * (loss > 0)
+    varies = np.arange(cells.number) % 3 == 0
+    of_cells = SimpleNamespace(low=kappa, mean=kappa * (1 + 1e-3 * varies))
+    of_cells.high = kappa * (1 + 2e-3 * varies)
+    known = SimpleNamespace(
+        cells=cells, kappa=of_cells, segments=edge, w=0, reaction=np.array(0.0),
+        flux=SimpleNamespace(shed=shed),
+    )  # fmt: skip
+    found = certificate._functional(known, plain)
+    masses = found.masses
+    assert np.array_equal(found.steady, ~varies & plain) and masses.some == (not plain)
+    assert np.array_equal(masses.side.dofs, side.dofs[1:5])
+    assert np.allclose(masses.loss, loss[1:5] * OnFacets(cells, side).length[1:5])
+    assert np.array_equal(masses.strong, [False, False, True, True])
+    # where b takes up g − g_F, u_h + target is t/b: the quadratic nearest to that
+    on = OnFacets(cells, side)
+    g = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]
+    g += (shed / on.length - g @ on.weights)[:, None]
+    first, last, bump = masses.toward[:, :, None]
+    near = first * (1 - on.s) + last * on.s + 4 * on.s * (1 - on.s) * bump
+    powers = on.s[:, None] ** np.arange(3) * np.sqrt(on.weights)[:, None]
+    for row, i in ((2, 3), (3, 4)):
+        best = np.linalg.lstsq(powers, g[i] * np.sqrt(on.weights), rcond=None)[0]
+        fitted = on.s[:, None] ** np.arange(3) @ best / loss[i]
+        assert np.allclose(near[row], fitted, rtol=1e-4, atol=1e-6)
+    assert not near[:2].any()
+
+
+@pytest.mark.serial
+def test_what_is_left_and_not_taken_up():
+    left, none = np.array([1.0, 2.0, 3.0]), np.zeros(0)
+    y = flux.Flux(none, none, none > 0, left, none)
+    assert np.array_equal(y.loose, left)
+    y.taken_up = np.array([False, True, False])
+    assert np.array_equal(y.loose, [1.0, 0.0, 3.0])
 
 
 @pytest.mark.serial
