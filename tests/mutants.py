@@ -26,7 +26,8 @@ import numpy as np
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "signorini_cr"
 TESTS = {
-    "estimate": "estimate/test_terms.py estimate/test_pieces.py estimate/test_sharpness.py",
+    "estimate": "estimate/test_products.py estimate/test_pieces.py estimate/test_terms.py"
+    " estimate/test_sharpness.py",
     "vi": "vi fem/test_conditions.py",
     "multigrid": "multigrid",
 }

@@ -432,15 +432,14 @@ def _edge_potential(cells: Cells, kappa: Coefficient, edge: Segments, flux: Flux
     """φ with ∇φ = κ_T⁻¹ y − ∇u_h, as in `_against_potential`, at the points, shape (q, n)."""
     side, d = edge.side, cells.tdim
     P = flux.excess[:, side.cells]
-    s = sum_rows(P)
-    a, row = P - s / (d + 1), np.arange(len(s))
+    s, row = sum_rows(P), np.arange(len(side.cells))
     apex, base = corner_points(cells, side)
     if cells.stretch is not None:
         stretch = cells.stretch[side.cells]
         apex, base = (np.einsum("nij,...nj->...ni", stretch, x) for x in (apex, base))
     middle = (apex + base.sum(axis=0)) / (d + 1)
-    pull = a[side.local, row][:, None] * (apex - middle)
-    pull += np.einsum("in,ink->nk", a[cells.others[side.local].T, row], base - middle)
+    pull = P[side.local, row][:, None] * (apex - middle)
+    pull += np.einsum("in,ink->nk", P[cells.others[side.local].T, row], base - middle)
     x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
     potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
     potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)

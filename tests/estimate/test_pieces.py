@@ -95,11 +95,10 @@ def test_norms_of_liftings(obstacle, cubic):
         norms.append(height * length / (2 * k) * ((steep**2 + up**2) @ weights))
         areas.append(height * length / (2 * k + 2) * (delta**2 @ weights))
     at, place = np.argmin(norms, axis=0), np.arange(n)
-    ratios = (
-        bound.steep**2 / np.min(norms, axis=0),
-        bound.area**2 / np.array(areas)[at, place],
-        bound.beyond / (np.abs(delta) @ weights * length),
-    )
+    bounds = [bound]
+    if obstacle:  # with a bound on the other side δ is measured from v itself
+        bounds.append(lift(cells, side, found.trace, None, base, 1.0, 1e-3, True))
+        assert bounds[1].reason is None
     # With the cubic δ is smooth on pieces; without it is next to nothing, and known less well
     most = (
         (6, 8, 4)
@@ -110,8 +109,14 @@ def test_norms_of_liftings(obstacle, cubic):
         if cubic
         else (9, 9, 3)
     )
-    for ratio, limit in zip(ratios, most, strict=True):
-        assert np.all(ratio >= 1 - 1e-3) and np.all(ratio <= limit)
+    for each in bounds:
+        ratios = (
+            each.steep**2 / np.min(norms, axis=0),
+            each.area**2 / np.array(areas)[at, place],
+            each.beyond / (np.abs(delta) @ weights * length),
+        )
+        for ratio, limit in zip(ratios, most, strict=True):
+            assert np.all(ratio >= 1 - 1e-3) and np.all(ratio <= limit)
     means = wave_by_numpy(x, y) @ weights
     assert np.all(bound.least <= means + 1e-12) and np.all(bound.least >= means - 1e-4)
 
@@ -149,6 +154,9 @@ def test_an_obstacle_below_needs_no_lifting():
     base.ends[0] -= 0.01
     bound = lift(data.cells, side, found.trace, base, above, 1.0, 1e-3, True)
     assert bound.reason is None and not bound.steep.any()
+    # nor, where there is a bound on the other side as well, one that is not far below
+    bound = lift(data.cells, side, found.trace, None, above, 1.0, 1e-3, True)
+    assert not bound.steep.any() and not bound.area.any() and not bound.beyond.any()
 
 
 @pytest.mark.serial
@@ -716,6 +724,10 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     assert least < other and np.isclose(other, least + apart, rtol=1e-7)
     # A few steps, and what is left carried as a walk does, are between the two
     monkeypatch.setattr(flux, "STEPS", 10)
+    nearly = flux._diffused(cells, left, kappa)
+    assert not np.allclose(nearly.sum(axis=0), -left, atol=1e-2)
+    jumps = cells.over_facets(nearly)
+    assert np.allclose(jumps[~cells.exterior], 0.0) and np.allclose(jumps[free], 0.0)
     found = flux._carried(cells, left, kappa, 0.0, np.array(0.0))
     assert np.sqrt(least) < found < np.sqrt(other)
     assert np.isclose(flux._carried(cells, left, kappa, np.inf, np.array(0.0)), np.sqrt(other))
@@ -909,6 +921,8 @@ def test_slack_of_quadrature(few):
     pp, bb, vv, yy, *at_z = rng.uniform(1, 2, size=(8, 5))
     pb = 0.99 * (pp + bb) / 2 if few else rng.uniform(-0.5, 0.5, size=5)
     errors = rng.uniform(size=(7, 5)) * (1e-3 if few else 1.0)
+    errors[4:6] *= 1e-4 if few else 1.0  # there are few strips, too
+    by_norm = 0
     R, t, W, inverse_W, strip_low, strip_high, _ = errors
     found = gap._with_slack(np.stack([pp, bb, pb, vv, yy, *at_z]), errors, 2, 9)
     assert np.array_equal(found[:4], (pp, bb, pb, vv))
@@ -919,6 +933,8 @@ def test_slack_of_quadrature(few):
             norm = (1 + t[i]) * (square**0.5 + 2 * R[i] * steep[i] ** 0.5) ** 2 - square
             strips = 2 * 9 * (strip_low[i] * yy[i] + strip_high[i] * zz[i])
             assert np.isclose(found[row, i], min(products, norm + strips))
+            by_norm += norm + strips < products
+    assert by_norm > 3 if few else by_norm == 0
     assert np.allclose(found[6], W * at_z[0])
 
 

@@ -497,7 +497,16 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     for name, value in {"load": hidden, "boundary": np.sqrt(lift), "solver": left_over}.items():
         assert np.isclose(certificate.parts[name], value)
     reach = bound - near / 2 + loose + np.sqrt(lift) / 2
-    assert np.isclose(certificate._made.reach, reach, rtol=1e-7)
+    made = certificate._made
+    assert np.isclose(made.reach, reach, rtol=1e-7)
+    assert np.isclose(made.loose, loose + np.sqrt(lift), rtol=1e-7)
+    # the ball's radius squared is what the two products on Γ1 and the distance from κ∇u add up to
+    assert np.isclose(made.complementary, rest**2, rtol=1e-7)
+    assert np.isclose(made.above, total["contact"], rtol=1e-7)
+    assert np.isclose(made.missed, 0.0) and not made.on_contact_alone
+    assert np.isclose(
+        WORLD.allreduce(sum(made.forces.values())), WORLD.allreduce(made.contact.sum())
+    )
 
 
 def test_force():
