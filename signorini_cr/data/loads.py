@@ -185,8 +185,10 @@ class Certain:
         weights = np.empty((2, cells.number))
         np.multiply(2.0 / (np.sqrt(low) * goal), cells.volume, out=weights[0])
         # J(v) asks for the first of these, the bound for the second
-        norms = mean_to_norm(cells, low, NOTHING) * mean_to_norm(cells, low, reaction)
-        np.multiply((2.0 / goal) ** 2 * cells.volume, norms, out=weights[1])
+        by_slope = norm = mean_to_norm(cells, low, NOTHING)
+        if reacts(reaction):
+            norm = mean_to_norm(cells, low, reaction)
+        np.multiply((2.0 / goal) ** 2 * cells.volume, by_slope * norm, out=weights[1])
         try:
             found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
         except Unknown as error:

@@ -332,7 +332,7 @@ def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, 
         own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
         change = cells.apply(known.w - own, slice(0, cells.number))
         flux.excess -= cells.tdim * kappa.mean * change
-        known.w = own
+        known.w, flux.steepness = own, cells.slopes(own)
     data = diffusion(known.level.data)
     u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
     plain = data.forms.of_one is None

@@ -433,10 +433,10 @@ def _at_vertices(
         for ends, toward in zip(cells.others[masses.side.local].T, masses.toward[:-1], strict=True):
             np.add.at(weights, (ends, masses.side.cells), masses.loss)
             np.add.at(moved, (ends, masses.side.cells), masses.loss * toward)
-        v = collect(flat, (weights * w + moved).ravel())
-        v /= np.maximum(collect(flat, weights.ravel()), np.finfo(float).tiny)
+        v = cells.over_vertices(weights * w + moved)
+        v /= np.maximum(cells.over_vertices(weights), np.finfo(float).tiny)
     else:
-        v = collect(flat, w.ravel())
+        v = cells.over_vertices(w)
         v /= np.maximum(collect(flat, None), 1.0)
     at_bound, loss = flux.touching.copy(), np.zeros(floors.facets)
     loss[masses.side.dofs] = masses.loss
@@ -737,7 +737,7 @@ class _OfHeights:
         cells, side = self.functional.cells, self.functional.masses.side
         near = np.unique(np.concatenate([each.cells for each in (*bumped, side)]))
         flow, height = slope[:, near], bumps[cells.facets[:, near]]
-        change = self._times(height.copy(), near)
+        change = self._times(height, near, np.empty_like(height))
         slope[:, near] = flow - change
         energy = -4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
         lost, height = self.lost[side.dofs], bumps[side.dofs]
@@ -748,18 +748,21 @@ class _OfHeights:
         """Put the cells' matrices times heights by facet dof into an array, shape (3, cells)."""
         cells, side = self.functional.cells, self.functional.masses.side
         for part in blocks(cells.number):
-            out[:, part] = self._times(heights[cells.facets[:, part]], part)
+            self._times(heights[cells.facets[:, part]], part, out[:, part])
         np.add.at(out, self.at, self.lost[side.dofs] * heights[side.dofs])
 
-    def _times(self, height: FloatArray, part: slice | IndexArray) -> FloatArray:
-        """The matrices, but for b, times heights of local bumps, which are lost."""
-        image = _across(self.functional.cells, height, part)
-        image *= 2.0 * pick(self.functional.kappa, part)
+    def _times(self, height: FloatArray, part: slice | IndexArray, out: FloatArray) -> FloatArray:
+        """Put the matrices, but for b, times heights of local bumps into an array."""
+        cells, own = self.functional.cells, self.own[part]
+        twice, stiffness = 2.0 * pick(self.functional.kappa, part), cells.stiffness[:, part]
+        for i, (j, k) in enumerate(cells.others):
+            row = np.multiply(stiffness[i + j - 1], height[j], out=out[i])
+            row += stiffness[i + k - 1] * height[k]
+            row *= twice
+            row += own * height[i]
         if self._reacts:
-            image += self._mass(part) / 15.0 * sum_rows(height)
-        height *= self.own[part]
-        image += height
-        return image
+            out += self._mass(part) / 15.0 * sum_rows(height)
+        return out
 
     def diagonal(self) -> FloatArray:
         """The diagonal by facet dof; collective."""
@@ -811,21 +814,20 @@ def _promise(
     return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
 
 
-def _across(cells: Cells, height: FloatArray, part: slice | IndexArray) -> FloatArray:
-    """Σ_{j ≠ i} |T| ∇λ_i·∇λ_j height_j."""
-    out = np.zeros_like(height)
-    for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
-        out[i] += s * height[j]
-        out[j] += s * height[i]
-    return out
+def bend_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
+    """What ‖∇φ‖²_T of φ = Σ height_i b_i is more than that of its mean; d = 2, shape (n,).
 
-
-def bump_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
-    """‖∇ Σ height_i b_i‖²_T for d = 2, shape (cells in the part,)."""
-    out = cells.trace(part) * dot_rows(height, height)
+    The mean of ∇b_i is −4/3 ∇λ_i.
+    """
+    out = np.zeros(height.shape[1])
+    squares = 3.0 * height**2
     for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
-        out += 4.0 * s * height[i] * height[j]
-    out *= 4 / 3
+        apart = height[i] - height[j]
+        apart *= apart
+        apart += squares[3 - i - j]
+        apart *= s
+        out += apart
+    out *= -8 / 9
     return out
 
 

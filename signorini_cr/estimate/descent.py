@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from ..arrays import FloatArray
-from ..fem.cells import Cells
+from ..fem.cells import Cells, blocks
 
 
 def descend(
@@ -41,13 +43,16 @@ def descend(
         change = image(way)
         length = square / float(cells.total(way[owned] @ change[owned])[0])
         fall += length * square
-        numbers += length * way
-        change *= length
-        down -= change
-        straight = down / diagonal
+        for part in blocks(len(down)):
+            numbers[part] += length * way[part]
+            change[part] *= length
+            down[part] -= change[part]
+            np.divide(down[part], diagonal[part], out=change[part])
+        straight = change
         before, square = square, float(cells.total(down[owned] @ straight[owned])[0])
-        way *= square / before
-        way += straight
+        for part in blocks(len(down)):
+            way[part] *= square / before
+            way[part] += straight[part]
     return fall, square
 
 

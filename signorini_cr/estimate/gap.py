@@ -19,7 +19,7 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.loads import NOTHING, Segments, VolumeMoments, reacts, trace_of
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
-from .companion import Companion, bump_squares, distance, on_facet
+from .companion import Companion, bend_squares, distance, on_facet
 from .flux import Flux, field_squares
 from .shapes import local_thirds, quadrature
 from .sums import Sums
@@ -117,8 +117,8 @@ class _Gap:
         """Integrate the products of p, b and ∇v, exactly where κ and y allow for it."""
         cells, kappa, flux, v, w = self.cells, self.kappa, self.flux, self.v, self.w
         if kappa.values is None and flux.beyond is None:
-            nothing_missed = np.zeros((3, part.stop - part.start))
-            found = _Products(*_exact(cells, kappa, part, flux, v, w, height), *nothing_missed)
+            missed = np.zeros(3)
+            found = _Products(*_exact(cells, kappa, part, flux, v, w, height), *missed)
         else:
             found = _Products(*_by_quadrature(cells, kappa, part, flux, v, w))
         if kappa.tensor is None:
@@ -537,20 +537,19 @@ def _exact(
         w: u_h at the cells' vertices, shape (d + 1, cells).
         height: Heights of v's bumps, shape (3, n); None where it has none.
     """
-    d, k = cells.tdim, pick(kappa.mean, part)
-    P, c = flux.excess[:, part], v.excess[:, part]
-    s, c_sum = sum_rows(P), sum_rows(c)
-    z = c + w[:, part]
-    Sc, Sz = cells.apply(c, part), cells.apply(z, part)
-    if height is None:
-        bb, vv, on_facets = dot_rows(c, Sc), dot_rows(z, Sz), c
-    else:
-        squares, bent = bump_squares(cells, height, part), 8 / 3 * height
-        bb, vv = (dot_rows(a - bent, Sa) + squares for a, Sa in ((c, Sc), (z, Sz)))
-        c_sum -= 2.0 * sum_rows(height)
-        on_facets = c - 0.5 * bent
+    d, k, P = cells.tdim, pick(kappa.mean, part), flux.excess[:, part]
+    s, c = sum_rows(P), v.excess[:, part]
+    if height is not None:
+        c = c - 4 / 3 * height
+    # the mean of ∇(v − u_h) is Σ c_i ∇λ_i
+    slopes, means = cells.apply(c, part), sum_rows(c)
+    bb, along = dot_rows(c, slopes), dot_rows(w[:, part], slopes)
+    if height is not None:
+        bb += bend_squares(cells, height, part)
+        means -= 2 / 3 * sum_rows(height)
     # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
-    pb = (s * c_sum / (d + 1) - dot_rows(P, on_facets)) / d
+    pb = (s * means / (d + 1) - dot_rows(P, c)) / d
+    vv = flux.steepness[part] + 2.0 * along + bb
     return field_squares(cells, P, part) / k, k * bb, pb, k * vv
 
 
