@@ -14,11 +14,12 @@ from mpi4py import MPI
 from signorini_cr import Domain, InputError, Polygon, Problem, solve
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Certain, Known, Segments, VolumeMoments
+from signorini_cr.data.moments import OnParts
 from signorini_cr.data.ranges import Pieces
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
-from signorini_cr.estimate.companion import Companion, Functional, Masses, _at_vertices
+from signorini_cr.estimate.companion import Companion, Floors, Functional, Masses, _at_vertices
 from signorini_cr.estimate.curl import _pull
 from signorini_cr.estimate.lifting import Lift, affine, gaps
 from signorini_cr.estimate.sums import Sums, Totals
@@ -916,6 +917,43 @@ def test_values_at_vertices_to_begin_with(kind):
             rows.append(np.sqrt(loss[i]) * np.eye(len(found))[cells.vertices[end, cell]])
             right.append(np.sqrt(loss[i]) * (w[end, cell] + to))
     assert np.allclose(found, np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
+
+
+@pytest.mark.serial
+def test_what_bounds_ask_of_v():
+    """v is nowhere below the quadratic through α's three values, or not at the middle, and no more.
+
+    The latter is so where v is drawn to t/b.
+    """
+    problem = Problem(f=1.0, obstacle=lambda x: ufl.sin(5 * x[0]))
+    level = solve(problem, square(3)).level
+    data = diffusion(level.data)
+    cells, rng = data.cells, np.random.default_rng(33)
+    bounds = OnParts.of(data.alpha, cells)
+    side, strong = bounds.side, np.array([True, False, True])
+    masses = Masses(True, np.array(0.0), side, np.ones(3), np.zeros((3, 3)), strong)
+    floors = Floors.of(cells, bounds, masses)
+    assert np.array_equal(floors.strong, strong) and floors.facets == len(cells.exterior)
+    ((sign, limit),) = floors.at_vertices
+    x = cells.domain.mesh.geometry.x
+    nodes = cells.domain.mesh.geometry.dofmap
+    of_vertex = np.zeros(len(limit), dtype=int)
+    of_vertex[cells.vertices] = nodes[: cells.number].T
+    below = x[of_vertex, 1] < 1e-9
+    assert sign == 1 and np.allclose(limit[below], np.sin(5 * x[of_vertex, 0])[below])
+    assert np.all(np.isneginf(limit[~below])) and below.sum() == 4
+    v = np.where(below, limit, 0.0) + rng.uniform(size=len(limit))
+    low, high = floors.heights(v)
+    t = np.linspace(0, 1, 4001)
+    for i, facet in enumerate(side.dofs):
+        a, b = v[side.ends[:, i]]
+        values = a * (1 - t) + b * t + 4 * t * (1 - t) * low[facet]
+        (first, last), middle = bounds.ends[:, i], bounds.middle[i]
+        bend = middle - (first + last) / 2
+        above = values - (first * (1 - t) + last * t + 4 * t * (1 - t) * bend)
+        assert np.isclose(above[2000] if strong[i] else above.min(), 0.0, atol=1e-6)
+    others = np.delete(np.arange(floors.facets), side.dofs)
+    assert np.all(np.isposinf(high)) and np.all(np.isneginf(low[others]))
 
 
 @pytest.mark.serial
