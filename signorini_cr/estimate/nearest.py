@@ -1,5 +1,8 @@
 """The continuous function of degree 2 that is nearest to u_h, by algebraic multigrid.
 
+Where few of its values are free, the cells that know of these are made a mesh of their own, and the
+system is as small as that.
+
 A function of degree 2 is given by its values at the vertices and the heights of its bumps
 b_F = 4 λ_j λ_k over the straight line through them, on each cell relative to u_h.
 """
@@ -14,7 +17,8 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
 
-from ..arrays import BoolArray, FloatArray
+from .. import compat
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import Cells, blocks, dot_rows, pick, sum_rows
 from ..fem.space import ghosted_vector, shared_maximum
 from ..garbage import release
@@ -24,6 +28,9 @@ from ..options import COMPANION, ESTIMATE_PREFIX, solve_once
 SHARE = 1e-10
 """Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on
 any number of ranks."""
+
+LARGEST = 0.5
+"""Part of all cells up to which those that free values touch are made a mesh of their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +57,27 @@ class Slopes:
             excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
             bumps: Heights by facet dof.
         """
-        vertices, facets = np.empty_like(excess), np.empty_like(excess)
-        energies = np.empty(cells.number)
-        for part in blocks(cells.number):
+        rows = np.empty_like(excess), np.empty_like(excess)
+        slopes = cls(*rows, np.empty(cells.number))
+        slopes.renew(cells, kappa, excess, bumps, slice(None))
+        return slopes
+
+    def renew(
+        self,
+        cells: Cells,
+        kappa: FloatArray,
+        excess: FloatArray,
+        bumps: FloatArray,
+        where: slice | IndexArray,
+    ) -> None:
+        """Compute them anew on some cells, or on all with ``slice(None)``; see `of`."""
+        for part in blocks(cells.number) if isinstance(where, slice) else (where,):
             k, c, height = pick(kappa, part), excess[:, part], bumps[cells.facets[:, part]]
             rest = cells.trace(part) - 2.0 * cells.squares(part)
-            vertices[:, part] = -k * cells.apply(c - 4 / 3 * height, part)
-            facets[:, part] = 4 / 3 * k * (cells.apply(c - 2.0 * height, part) - rest * height)
-            energies[part] = -dot_rows(c, vertices[:, part]) - dot_rows(height, facets[:, part])
-        return cls(vertices, facets, energies)
+            at_vertices = -k * cells.apply(c - 4 / 3 * height, part)
+            at_facets = 4 / 3 * k * (cells.apply(c - 2.0 * height, part) - rest * height)
+            self.vertices[:, part], self.facets[:, part] = at_vertices, at_facets
+            self.energies[part] = -dot_rows(c, at_vertices) - dot_rows(height, at_facets)
 
 
 def nearest(
@@ -77,21 +96,28 @@ def nearest(
         What is to be added to v's values at the vertices and to the heights of its bumps.
     """
     mesh, d = cells.domain.mesh, cells.tdim
+    patch: slice | IndexArray = slice(None)
+    some = np.flatnonzero(loose[cells.vertices].any(axis=0) | free[cells.facets].any(axis=0))
+    few, all_ = cells.total(float(len(some)), float(cells.number))
+    if 0.0 < few <= LARGEST * all_:
+        mesh, parents = compat.submesh(mesh, d, some.astype(np.int32))
+        patch = parents.astype(np.intp)
+    vertices, facets = cells.vertices[:, patch], cells.facets[:, patch]
     V = fem.functionspace(mesh, ("Lagrange", 2))
-    dofs = V.dofmap.list[: cells.number].T
+    dofs = V.dofmap.list[: vertices.shape[1]].T
     b, x = fem.Function(V), fem.Function(V)
     held = np.zeros_like(b.x.array)
-    held[dofs[: d + 1][~loose[cells.vertices]]] = 1.0
-    held[dofs[d + 1 :][~free[cells.facets]]] = 1.0
+    held[dofs[: d + 1][~loose[vertices]]] = 1.0
+    held[dofs[d + 1 :][~free[facets]]] = 1.0
     shared_maximum(V, held)
     fixed = np.flatnonzero(held > 0.0).astype(np.int32)
     # A nodal function of a vertex is λ_i less half the bumps of the two facets it belongs to
-    at_vertices = slopes.vertices - 0.5 * (sum_rows(slopes.facets) - slopes.facets)
-    rows = np.concatenate([at_vertices, slopes.facets])
+    pull = slopes.facets[:, patch]
+    rows = np.concatenate([slopes.vertices[:, patch] - 0.5 * (sum_rows(pull) - pull), pull])
     b.x.array[:] = np.bincount(dofs.ravel(), rows.ravel(), minlength=len(held))
     b.x.scatter_reverse(InsertMode.add)
     b.x.array[fixed] = 0.0
-    k = cells.coefficient(kappa)
+    k = cells.coefficient(kappa, mesh, patch)
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
     form = compiled(mesh.comm, fem.form, ufl.inner(k * ufl.grad(u), ufl.grad(w)) * ufl.dx)
     A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
@@ -103,6 +129,6 @@ def nearest(
     nodal = x.x.array[dofs]
     corners, middles = nodal[: d + 1], nodal[d + 1 :]
     at_vertices, heights = np.zeros(len(loose)), np.zeros(len(free))
-    at_vertices[cells.vertices] = corners
-    heights[cells.facets] = middles - 0.5 * (sum_rows(corners) - corners)
+    at_vertices[vertices] = corners
+    heights[facets] = middles - 0.5 * (sum_rows(corners) - corners)
     return at_vertices, heights

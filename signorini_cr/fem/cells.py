@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 from dolfinx import fem, la
+from dolfinx.mesh import Mesh
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
@@ -174,18 +175,23 @@ class Cells:
         inverse = np.linalg.inv((x[1:] - x[0]).transpose(1, 0, 2)).transpose(2, 0, 1)
         return x, np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])
 
-    def coefficient(self, kappa: FloatArray) -> fem.Function:
+    def coefficient(
+        self, kappa: FloatArray, mesh: Mesh | None = None, where: slice | IndexArray = slice(None)
+    ) -> fem.Function:
         """κ to write in forms: by cells, and with a stretch κ stretch⁻², a tensor; collective.
 
         Args:
             kappa: Shape (cells,) or ().
+            mesh: One that some of the cells make up; this one if left out.
+            where: Which cells those are, in its order.
         """
-        mesh, d = self.domain.mesh, self.domain.mesh.geometry.dim
+        mesh = mesh or self.domain.mesh
+        d = mesh.geometry.dim
         shape: tuple[int, ...] = () if self.stretch is None else (d, d)
         function = fem.Function(fem.functionspace(mesh, ("DG", 0, shape)))
-        values = np.broadcast_to(kappa, self.number)
+        values = np.broadcast_to(kappa, self.number)[where]
         if self.stretch is not None:
-            inverse = np.linalg.inv(self.stretch)
+            inverse = np.linalg.inv(self.stretch[where])
             values = (values[:, None, None] * (inverse @ inverse)).ravel()
         function.x.array[: len(values)] = values
         function.x.scatter_forward()
@@ -285,6 +291,32 @@ class Cells:
             seen[new] = True
             found = new
         return layers
+
+    def around(self, chosen: BoolArray, layers: int) -> BoolArray:
+        """Which vertices so many layers of cells around some have; collective.
+
+        Args:
+            chosen: These, ghosts included.
+            layers: How many.
+        """
+        topology = self.domain.mesh.topology
+        topology.create_connectivity(0, self.tdim)
+        links = topology.connectivity(0, self.tdim)
+        reached = self.share(chosen.astype(np.float64), 0) > 0.0
+        found = np.flatnonzero(reached)
+        for _ in range(layers):
+            first = links.offsets[found]
+            count = links.offsets[found + 1] - first
+            shift = np.repeat(first - np.cumsum(count) + count, count)
+            near = links.array[shift + np.arange(len(shift))]
+            found = np.unique(self.vertices[:, near[near < self.number]])
+            found = found[~reached[found]]
+            if self.comm.size > 1:
+                new = np.zeros(len(reached))
+                new[found] = 1.0
+                found = np.flatnonzero((self.share(new, 0) > 0.0) & ~reached)
+            reached[found] = True
+        return reached
 
     def over_facets(self, values: FloatArray, shared: bool = True) -> FloatArray:
         """Add up local values, shape (d + 1, cells), for each facet dof.
@@ -400,7 +432,7 @@ class Cells:
             out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
         return out
 
-    def squares(self, part: slice) -> FloatArray:
+    def squares(self, part: slice | IndexArray) -> FloatArray:
         """|T| |∇λ_i|², shape (d + 1, cells in the part)."""
         out = np.zeros((self.tdim + 1, len(self.volume[part])))
         for (i, j), s in zip(self.pairs, self.stiffness[:, part], strict=True):
@@ -408,7 +440,7 @@ class Cells:
             out[j] -= s
         return out
 
-    def trace(self, part: slice) -> FloatArray:
+    def trace(self, part: slice | IndexArray) -> FloatArray:
         """|T| Σ |∇λ_i|²."""
         return -2.0 * sum_rows(self.stiffness[:, part])
 
