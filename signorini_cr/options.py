@@ -169,7 +169,7 @@ def unheard(words: Sequence[str]) -> list[str]:
         given = " ".join(w if values[w].startswith("-") else f"{w} {values[w]}" for w in own)
         warnings.append(
             f"{', '.join(own)} did not reach PETSc; set PETSC_OPTIONS='{given}' in the"
-            " environment, or call petsc4py.init(sys.argv) before signorini_cr is imported"
+            " environment, or call petsc4py.init(sys.argv) right behind import signorini_cr"
         )
     return warnings
 
