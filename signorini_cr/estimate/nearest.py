@@ -125,6 +125,8 @@ def nearest(
     load, found = (ghosted_vector(V, function.x.array) for function in (b, x))
     solve_once(A, load, found, COMPANION | {"ksp_rtol": SHARE}, ESTIMATE_PREFIX)
     release(A, load, found)
+    # aggregates of fixed and free values mix what an iteration leaves of both
+    x.x.array[fixed] = 0.0
     x.x.scatter_forward()
     nodal = x.x.array[dofs]
     corners, middles = nodal[: d + 1], nodal[d + 1 :]

@@ -14,6 +14,7 @@ import ufl
 from dolfinx import fem
 
 from ..arrays import FloatArray, Int32Array
+from ..data.admissible import place, shown
 from ..data.diffusion import diffusion
 from ..data.jets import Enclosure
 from ..data.moments import OnFacets, OnParts, Trace
@@ -202,12 +203,12 @@ def _insist_on_zero(values: fem.Function, where: FloatArray, scale: float) -> No
     V = values.function_space
     wrong = np.flatnonzero(where & (np.abs(values.x.array) > JUMP * scale))
     at = V.tabulate_dof_coordinates()[wrong, :2]
-    own = [(*map(float, x), float(w)) for x, w in zip(at, values.x.array[wrong], strict=True)]
+    own = [(place(x, V.mesh), float(w)) for x, w in zip(at, values.x.array[wrong], strict=True)]
     found = sorted(each for rank in V.mesh.comm.allgather(own) for each in rank)
     if found:
-        x, y, value = found[0]
+        at_vertex, value = found[0]
         raise InputError(
-            f"the weight is {value:.4g} at ({x:.6g}, {y:.6g}), where the part touches another one"
+            f"the weight is {value:.4g} at {shown(at_vertex)}, where the part touches another one"
             " on which u is set or bounded; it must vanish there, as what flows through is no"
             " bounded functional of the solution otherwise"
         )

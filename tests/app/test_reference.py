@@ -30,6 +30,7 @@ BASE = {
 
 
 DOCS = ROOT / "docs"
+PACKAGE = Path(signorini_cr.__file__).parent
 PAGES = runpy.run_path(str(DOCS / "reference.py"))["PAGES"]
 
 
@@ -56,7 +57,7 @@ def test_every_prefix_of_petsc_options_is_in_the_reference() -> None:
     for name, prefix in vars(options).items():
         if name.endswith("_PREFIX"):
             assert f"| `-{prefix}` |" in text, name
-    code = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "signorini_cr").rglob("*.py"))
+    code = "".join(p.read_text(encoding="utf-8") for p in PACKAGE.rglob("*.py"))
     own = set(re.findall(r"\bread_(?:word|number)\(\"(\w+)\"", code))
     assert own == {"smoother", "snes_atol"}
     assert f"`-{options.PREFIX}smoother " in text

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import create_rectangle, exterior_facet_indices, meshtags
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact, solve_levels
 from signorini_cr.compat import cell_nodes
@@ -12,6 +14,7 @@ from signorini_cr.estimate import companion, nearest
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.nearest import Slopes
 from signorini_cr.fem.cells import Cells
+from signorini_cr.mesh.domain import CONTACT, Domain
 from signorini_cr.mesh.families import structured
 
 pytestmark = pytest.mark.ranks
@@ -103,6 +106,33 @@ def test_a_small_system_has_the_same_solution(kappa, monkeypatch):
     for one, other in zip(small, whole, strict=True):
         assert np.abs(one - other).max(initial=0.0) < 1e-6 * scale
     assert not small[0][~loose].any() and not small[1][~free].any()
+
+
+def test_multigrid_of_petsc_on_thin_cells(monkeypatch):
+    """GAMG is in every PETSc: it gets to the end in time, and leaves alone what is not free."""
+    mesh = create_rectangle(WORLD, [(-1, 0), (1, 1)], [6, 90])
+    mesh.topology.create_connectivity(1, 2)
+    rim = exterior_facet_indices(mesh.topology)
+    domain = Domain(mesh, meshtags(mesh, 1, rim, np.full_like(rim, CONTACT)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    rng = np.random.default_rng(WORLD.rank)
+    excess = rng.normal(size=(3, cells.number))
+    slopes = Slopes.of(cells, np.array(1.0), excess, np.zeros(len(cells.exterior)))
+    size = cells.domain.mesh.topology.index_map(0)
+    on_rim = np.zeros(size.size_local + size.num_ghosts)
+    for side in cells.sides.values():
+        on_rim[side.ends] = 1.0
+    loose, free = cells.share(on_rim, 0) == 0.0, ~cells.exterior
+    monkeypatch.setitem(nearest.COMPANION, "pc_type", PETSc.PC.Type.GAMG)
+    values, heights = nearest.nearest(cells, np.array(1.0), slopes, loose, free)
+    assert not values[~loose].any() and not heights[~free].any()
+    after = Slopes.of(cells, np.array(1.0), excess + values[cells.vertices], heights)
+    for over, mine, before, left in (
+        (cells.over_vertices, loose, slopes.vertices, after.vertices),
+        (cells.over_facets, free, slopes.facets, after.facets),
+    ):
+        scale = max(WORLD.allgather(np.abs(before).max(initial=0.0)))
+        assert np.abs(over(left)[mine]).max(initial=0.0) < 1e-7 * scale
 
 
 def test_the_foremost_hold_what_they_are_to_hold():

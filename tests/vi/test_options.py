@@ -73,7 +73,7 @@ def test_options_without_the_prefix_are_told(tmp_path):
 @pytest.mark.serial
 def test_options_that_petsc_has_are_no_alarm(tmp_path, monkeypatch):
     """Given at its start, set by the script, or by the environment; some solver may use them."""
-    begin = "import sys, petsc4py\npetsc4py.init(sys.argv)\n"
+    begin = "import sys, signorini_cr, petsc4py\npetsc4py.init(sys.argv)\n"
     words = ["-log_view", f":{tmp_path / 'x.txt'}", "-ksp_view"]
     (tmp_path / "init.py").write_text(begin + SCRIPT)
     done = start(tmp_path / "init.py", *words)
