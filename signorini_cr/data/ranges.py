@@ -844,9 +844,11 @@ def _numbers(rows: list[Int64Array]) -> IndexArray:
         if span * width >= 1 << 62:
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             span = len(key)
-        key *= width
-        key += row
-        key -= first
+        for part in blocks(len(key)):
+            here = key[part]
+            here *= width
+            here += row[part]
+            here -= first
         span *= width
     if span > 8 * len(key) + 1000:
         return np.unique(key, return_inverse=True)[1].reshape(-1)

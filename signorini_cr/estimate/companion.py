@@ -313,10 +313,10 @@ def _started(functional: Functional, u_D: OnParts, floors: Floors, flux: Flux) -
     held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
     bumps, taken = np.zeros((2, floors.facets))
     if cells.tdim == 2:
-        ranges = floors.heights(v)
-        bumps = np.clip(0.0, *ranges)
+        low, high = (limit[contact.dofs] for limit in floors.heights(v))
+        bumps[contact.dofs] = np.clip(0.0, low, high)
         bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
-        ends = np.where(floors.signs > 0.0, *(limit[contact.dofs] for limit in ranges))
+        ends = np.where(floors.signs > 0.0, low, high)
         bumps[contact.dofs[touching]] = ends[touching]
         taken[fixed.dofs] = taken[contact.dofs[touching]] = 1.0
         # a facet's values reach the ranks that share it
@@ -347,7 +347,8 @@ def _improved(
     """
     contact, bumps = floors.side, draft.bumps
     energy, promise = _sweep(functional, excess, bumps, draft.free, (fixed, contact), sweeps)
-    bumps[contact.dofs] = np.clip(bumps, *floors.heights(draft.vertices))[contact.dofs]
+    low, high = (limit[contact.dofs] for limit in floors.heights(draft.vertices))
+    bumps[contact.dofs] = np.clip(bumps[contact.dofs], low, high)
     promise += _promise(functional.cells, functional.kappa, excess, bumps, draft.loose)
     return promise > PROMISE * energy
 
@@ -861,11 +862,11 @@ def _lift(
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""
     side, trace, ends, middle = data.side(cells), data.trace, data.ends, data.middle
-    v, bumps, thirds = (data.sign * values for values in (v, bumps, thirds))
+    v = data.sign * v[side.ends]
     if cells.tdim != 2:
-        return affine(cells, side, trace, v[side.ends], ends, boundary.scale)
-    third = cells.ways_between(*side.ends) * thirds[side.dofs]
-    companion = Cubic(v[side.ends], bumps[side.dofs], third)
+        return affine(cells, side, trace, v, ends, boundary.scale)
+    third = cells.ways_between(*side.ends) * (data.sign * thirds[side.dofs])
+    companion = Cubic(v, data.sign * bumps[side.dofs], third)
     base, lossy = None, data.condition.loss
     loss = 0.0 if lossy is None else number(lossy) or 0.0
     if obstacle and len(data.condition.bounds) == 1 and loss == 0.0:
