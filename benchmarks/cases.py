@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator
 
+from mpi4py import MPI  # first: the PETSc of the wheels finds the MPI that is loaded
+
+# isort: split
 import petsc4py
 
 petsc4py.init(["benchmark", "-options_left", "no"])  # the command line is not PETSc's
@@ -12,7 +15,6 @@ petsc4py.init(["benchmark", "-options_left", "no"])  # the command line is not P
 import numpy as np  # noqa: E402
 import ufl  # noqa: E402
 from harness import command_line, keep_memory, tabulate  # noqa: E402
-from mpi4py import MPI  # noqa: E402
 from petsc4py import PETSc  # noqa: E402
 
 from signorini_cr import (  # noqa: E402

@@ -18,8 +18,10 @@
 
 # %%
 import numpy as np
-from petsc4py import PETSc
 from study import COLOURS, Study, called, canvas, levels_wanted, name_curves
+
+# isort: split
+from petsc4py import PETSc  # behind study, which finds MPI for the wheels
 
 from signorini_cr import exact, solve, solve_adaptive, solve_levels
 from signorini_cr.rounding import at_most, interval

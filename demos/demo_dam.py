@@ -21,11 +21,13 @@
 
 # %%
 import numpy as np
-from dolfinx import fem
+from study import ENDS, Study, canvas, comm, levels_wanted
+
+# isort: split
+from dolfinx import fem  # behind study, which finds MPI for the wheels
 from scipy.integrate import quad
 from scipy.optimize import root
 from scipy.special import ellipk, ellipkm1
-from study import ENDS, Study, canvas, comm, levels_wanted
 
 from signorini_cr import (
     Contact,

@@ -22,8 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import ufl
-from dolfinx import fem
 from study import ENDS, Study, canvas, comm, levels_wanted
+
+# isort: split
+from dolfinx import fem  # behind study, which finds MPI for the wheels
 
 from signorini_cr import (
     Contact,

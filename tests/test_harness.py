@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 from helpers import ROOT
 
+import signorini_cr
+
+PACKAGE = Path(signorini_cr.__file__).parent
+
 pytestmark = pytest.mark.serial
 
 
@@ -137,14 +141,14 @@ def test_a_failing_cell_names_its_line(tmp_path):
 def test_the_picture_of_the_streets_has_their_arrows():
     """Otherwise: `./container/run python3 docs/architecture.py`, and look at it."""
     drawn = (ROOT / "docs" / "architecture.svg").read_text(encoding="utf-8")
-    arrows = load("docs/architecture.py")["read"]()
+    arrows = load("docs/architecture.py")["read"](PACKAGE)
     found = set(re.findall(r'id="([\w ]+) &gt; ([\w ]+)"', drawn))
     assert found == set(arrows)
 
 
 def test_streets_are_drawn_from_the_top_to_the_bottom():
     names = load("docs/architecture.py")
-    order = names["floors"](arrows := names["read"]())
+    order = names["floors"](arrows := names["read"](PACKAGE))
     assert order[-1] == names["GROUND"] and order[-2] == "mesh"
     assert all(order.index(here) < order.index(there) for here, there in arrows)
     assert len((ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()) <= 80

@@ -5,11 +5,14 @@ import json
 import re
 import runpy
 import tomllib
+from pathlib import Path
 
 import pytest
 from helpers import ROOT
 
 import signorini_cr
+
+PACKAGE = Path(signorini_cr.__file__).parent
 
 
 @pytest.mark.serial
@@ -188,7 +191,8 @@ def test_images_are_made_of_files_that_exist():
     assert sections[0].endswith("Bootstrap: docker\nFrom: debian:trixie-slim\n\n")
     for line in filter(None, parts["files"].partition("#")[0].splitlines()):
         source, target = line.split()
-        assert (ROOT / source).exists() and target == f"/opt/signorini_cr/{source}"
+        there = PACKAGE if source == "signorini_cr" else ROOT / source
+        assert there.exists() and target == f"/opt/signorini_cr/{source}"
     editor = json.loads((ROOT / ".devcontainer/devcontainer.json").read_text(encoding="utf-8"))
     assert (ROOT / ".devcontainer" / editor["build"]["dockerfile"]).is_file()
     assert (ROOT / ".devcontainer" / editor["build"]["context"] / "Makefile").is_file()

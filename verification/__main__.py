@@ -29,6 +29,9 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
+from mpi4py import MPI  # first: the PETSc of the wheels finds the MPI that is loaded
+
+# isort: split
 import petsc4py
 
 petsc4py.init(["verification", "-options_left", "no", *sys.argv[1:]])
@@ -37,7 +40,6 @@ import bounds  # noqa: E402
 import sharpness  # noqa: E402
 import solves  # noqa: E402
 import terms  # noqa: E402
-from mpi4py import MPI  # noqa: E402
 from report import Group, Row, write  # noqa: E402
 
 COMM = MPI.COMM_WORLD
