@@ -569,7 +569,8 @@ def test_the_gap_with_a_reaction(bent):
     bumps = rng.normal(size=len(cells.exterior)) * bent
     v = Companion(None, bumps, excess, None, None, None, None)
     taken_up, left = c > 0.0, rng.normal(size=number)
-    y = SimpleNamespace(excess=P, beyond=None, taken_up=taken_up, left=left)
+    steepness = at.integral((at.affine(w)[1] ** 2).sum(axis=2))
+    y = SimpleNamespace(excess=P, beyond=None, taken_up=taken_up, left=left, steepness=steepness)
     f = psi(at.x) * rng.uniform(1, 2, number)[:, None]
     sums = gap.integrate(cells, kappa, w, moments(at, f), y, v, c)
     jump, off = sums_of(at.affine(excess), at.of_facets(bumps))
@@ -633,7 +634,9 @@ def test_the_gap_where_a_tensor_varies(more):
     P, w, excess, rise = rng.normal(size=(4, 3, number))
     rise -= rise.mean(axis=0)
     bumps, thirds, heights = rng.normal(size=(3, len(cells.exterior)))
-    y = SimpleNamespace(excess=P, beyond=Beyond(heights, rise) if more else None)
+    steepness = at.integral((at.affine(w)[1] ** 2).sum(axis=2))
+    beyond = Beyond(heights, rise) if more else None
+    y = SimpleNamespace(excess=P, beyond=beyond, steepness=steepness)
     v = Companion(None, bumps, excess, None, None, None, None, None, thirds if more else None)
     before = rng.uniform(size=(2, number))
     vv, far, near, energy = gap._of_tensor(
