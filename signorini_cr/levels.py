@@ -253,6 +253,7 @@ def solve_level(
                 rounded=system.data_rounded,
                 loads=system.chi.x.array[system.bounded],
                 offset=system.offset,
+                windows=system.windows,
             )
             iterations = solve_vi(cycle, vectors, system.residual_scale, monitor=told, data=data)
     except NotConverged as failure:

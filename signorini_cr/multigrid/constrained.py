@@ -69,21 +69,20 @@ class ConstrainedMatrix:
         self._product = self._rows.createVecLeft()
         self._magnitudes: PETSc.Mat | None = None
         # All own rows with an entry in such a column, as the pattern is symmetric
-        near = self._marks(column)
+        near = self._named(column)
         near_numbers = numbers_of(A, np.flatnonzero(near))
         start, column, value = rows_of(A, near_numbers)
         row = np.repeat(near_numbers, np.diff(start))
         columns, place = np.unique(column, return_inverse=True)
         theirs = PETSc.IS().createGeneral(columns.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-        everything, self._at_columns = A.createVecRight(), PETSc.Vec().createSeq(len(columns))
-        self._to_columns = PETSc.Scatter().create(everything, theirs, self._at_columns, None)
-        everything.array[dofs] = 1.0
+        self._marks, self._at_columns = A.createVecRight(), PETSc.Vec().createSeq(len(columns))
+        self._to_columns = PETSc.Scatter().create(self._marks, theirs, self._at_columns, None)
         own = np.isin(row, numbers)
         self._of_own = np.searchsorted(numbers, row[own]), place[own], value[own]
-        kept = own | self._seen(everything)[place]
-        release(theirs, everything)
+        kept = own | self._seen(dofs)[place]
+        release(theirs)
         self._row, self._column, self._value = row[kept], column[kept], value[kept]
-        self._place = place[kept]
+        self._place, self._own_row = place[kept], self._row - A.getOwnershipRange()[0]
         # The pattern is not to change, or ranks would have to talk whenever values do
         A.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
 
@@ -99,12 +98,8 @@ class ConstrainedMatrix:
             Those that are constrained, ascending.
         """
         chosen = self.dofs[np.isin(self.dofs, dofs)]
-        marks = self.matrix.createVecRight()
-        marks.array[chosen] = 1.0
-        of_column = self._seen(marks)[self._place]
-        of_row = marks.array_r[self._row - self.matrix.getOwnershipRange()[0]] > 0.0
-        release(marks)
-        which = np.flatnonzero(of_row | of_column)
+        of_row: BoolArray = np.isin(self._own_row, chosen)
+        which = np.flatnonzero(of_row | self._seen(chosen)[self._place])
         if not self.matrix.getComm().tompi4py().allreduce(len(chosen)):
             yield chosen
             return
@@ -147,9 +142,10 @@ class ConstrainedMatrix:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the matrix."""
-        release(self._rows, self._magnitudes, self._product, self._at_columns, self._to_columns)
+        release(self._rows, self._magnitudes, self._product)
+        release(self._marks, self._at_columns, self._to_columns)
 
-    def _marks(self, numbers: Int32Array) -> BoolArray:
+    def _named(self, numbers: Int32Array) -> BoolArray:
         """Which owned dofs any rank names by their global numbers; collective."""
         marks = self.matrix.createVecRight()
         add = PETSc.InsertMode.ADD_VALUES
@@ -159,9 +155,16 @@ class ConstrainedMatrix:
         release(marks)
         return found
 
-    def _seen(self, marks: PETSc.Vec) -> BoolArray:
-        """The marks of the dofs whose columns this rank has entries in; collective."""
-        self._to_columns.scatter(marks, self._at_columns)
+    def _seen(self, dofs: Int32Array) -> BoolArray:
+        """Which dofs whose columns this rank has entries in are among some; collective.
+
+        Args:
+            dofs: Each rank's owned ones, local numbers.
+        """
+        # a vector that is 0 again afterwards, as a new one takes longer than all the rest
+        self._marks.array[dofs] = 1.0
+        self._to_columns.scatter(self._marks, self._at_columns)
+        self._marks.array[dofs] = 0.0
         seen: BoolArray = self._at_columns.array_r > 0.0
         return seen
 

@@ -19,7 +19,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, IndexArray
 from ..errors import InputError, NotConverged, fail_together
 from ..garbage import release
 from ..multigrid.cycle import Multigrid
@@ -91,6 +91,7 @@ class Data:
         rounded: Bound of what that may change, summed up, `System.data_rounded`.
         loads: χ in the bounded dofs, shape (n,).
         offset: `System.offset`.
+        windows: `System.windows`.
     """
 
     row_sums: Callable[[], FloatArray]
@@ -98,6 +99,7 @@ class Data:
     rounded: float
     loads: FloatArray
     offset: float
+    windows: IndexArray | None = None
 
 
 def solve_vi(
@@ -134,7 +136,8 @@ def solve_vi(
     wanted = max(read_number("snes_atol", target), 1e-30 * target)
     snes = PETSc.SNES().create(cycle.matrix.getComm())
     comm = snes.getComm().tompi4py()
-    stiffness = Stiffness(cycle.finest, None if data is None else data.row_sums)
+    known = (None, None) if data is None else (data.row_sums, data.windows)
+    stiffness = Stiffness(cycle.finest, *known)
     bounds = Bounds(*(each.array_r[cycle.operator.dofs] for each in (vectors.lower, vectors.upper)))
     linear = ReducedSolver(
         cycle,

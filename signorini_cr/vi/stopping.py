@@ -22,14 +22,12 @@ the obstacle that rounding decides whether it touches, the solver goes on to twi
 from __future__ import annotations
 
 from collections.abc import Callable
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.ndimage import maximum_filter
 
-from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..garbage import release
 from ..multigrid.cycle import Grid
@@ -94,13 +92,19 @@ class Stiffness:
 
     exact = False
 
-    def __init__(self, grid: Grid, row_sums: Callable[[], FloatArray] | None = None):
+    def __init__(
+        self,
+        grid: Grid,
+        row_sums: Callable[[], FloatArray] | None = None,
+        window: IndexArray | None = None,
+    ):
         """Sort the dofs; collective, the matrix must be whole.
 
         Args:
             grid: Matrix and dofs.
             row_sums: Returns the sums of the owned rows of A, which are 0 but where a dof on Γ0 has
                 been taken out, shape (dofs,); it is asked if there are several classes.
+            window: As `windows` has it; None for one that all are in.
         """
         self._grid, self._comm = grid, grid.matrix.getComm().tompi4py()
         diagonal = grid.matrix.getDiagonal()
@@ -117,7 +121,7 @@ class Stiffness:
         self.bounded = LEVELS * self._kind
         self.made_of: FloatArray = np.zeros(self.number)
         self.least: FloatArray = np.zeros(self.number)
-        self._window: IndexArray | None = None
+        self._window = np.zeros(len(grid.operator.dofs), np.intp) if window is None else window
         self._differences: PETSc.Mat | None = None
         self._find_row_sums = row_sums
         if row_sums is not None and self._kinds > 1:
@@ -147,10 +151,6 @@ class Stiffness:
             x: The iterate.
             b: Right-hand side.
         """
-        if self._window is None:
-            if self._grid not in _known_windows:
-                _known_windows[self._grid] = _windows(self._grid)
-            self._window = _known_windows[self._grid]
         made_of = self._grid.operator.flows(x, b)
         around: FloatArray = np.zeros(WINDOWS**3)
         np.maximum.at(around, self._window, made_of)
@@ -240,26 +240,18 @@ class Stiffness:
         release(self._differences)
 
 
-_known_windows: WeakKeyDictionary[Grid, IndexArray] = WeakKeyDictionary()
-"""Those of grids that may be solved on again."""
+def windows(comm: MPI.Comm, places: FloatArray) -> IndexArray:
+    """The number of the square, or cube, around each dof with a bound, shape (n,); collective.
 
-
-def _windows(grid: Grid) -> IndexArray:
-    """The number of the square, or cube, around each dof with a bound, shape (n,); collective."""
-    layout, comm = grid.dofs, grid.matrix.getComm().tompi4py()
-    nodes = grid.operator.dofs // layout.block
-    cell = np.zeros(layout.local // layout.block, dtype=np.intp)
-    wanted = np.zeros(len(cell), dtype=bool)
-    wanted[nodes] = True
-    found = np.flatnonzero(wanted[layout.cells])  # few of many
-    cell[layout.cells.ravel()[found]] = found // layout.cells.shape[1]
-    corners = layout.mesh.geometry.x[compat.cell_nodes(layout.mesh)[cell[nodes]]]
-    x = corners.mean(axis=1)
-    ends = np.stack([x.min(axis=0, initial=np.inf), -x.max(axis=0, initial=-np.inf)])
+    Args:
+        comm: The ranks that have such dofs.
+        places: A point by each of this rank's, shape (n, 3).
+    """
+    ends = np.stack([places.min(axis=0, initial=np.inf), -places.max(axis=0, initial=-np.inf)])
     comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
     low, size = ends[0], -(ends[0] + ends[1]).min()
-    place = np.clip((x - low) * (WINDOWS / max(size, 1e-300)), 0, WINDOWS - 1).astype(np.intp)
-    window: IndexArray = place @ WINDOWS ** np.arange(3)
+    place = np.clip((places - low) * (WINDOWS / max(size, 1e-300)), 0, WINDOWS - 1)
+    window: IndexArray = place.astype(np.intp) @ WINDOWS ** np.arange(3)
     return window
 
 

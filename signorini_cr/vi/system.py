@@ -14,7 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg.blas import dasum
 
-from ..arrays import BoolArray, FloatArray, Int32Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..errors import InputError, raise_together
 from ..fem.physics import Imposed, OnMesh
 from ..fem.space import facet_measures, ghosted_vector, shared_maximum, unknowns
@@ -25,6 +25,7 @@ from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import MATRICES, defaults
 from .bounds import Bounds
+from .stopping import windows
 
 ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
@@ -205,6 +206,24 @@ class System:
     def contact_facets(self) -> ContactFacets:
         """The facets of Γ1; found when first asked for, collectively."""
         return ContactFacets.of(self) if self._like is None else self._like.contact_facets
+
+    @cached_property
+    def windows(self) -> IndexArray:
+        """Where on Γ1 the dofs with a bound are, see `stopping.windows`; collective at first."""
+        if self._like is not None and self.bounded is self._like.bounded:
+            return self._like.windows
+        V = self.u_D.function_space
+        vertices, _ = facet_measures(V.mesh, self.bounded_facets)
+        midpoints = vertices.mean(axis=1)
+        if Layout.of_space(V).cr:  # a dof and its facet have the same owner
+            return windows(V.mesh.comm, midpoints[np.argsort(self.contact_dofs[:, 0])])
+        places: FloatArray = np.full((len(self.bounded), 3), -np.inf)
+        for axis in range(3):
+            of_dofs: FloatArray = np.full(len(self.u_D.x.array), -np.inf)
+            np.maximum.at(of_dofs, self.contact_dofs, midpoints[:, axis, None])
+            shared_maximum(V, of_dofs)
+            places[:, axis] = of_dofs[self.bounded]
+        return windows(V.mesh.comm, places)
 
     @cached_property
     def _known_trivial(self) -> list[FloatArray]:

@@ -14,6 +14,7 @@ from signorini_cr.fem.space import closure_dofs, function_space
 from signorini_cr.mesh.domain import CONTACT
 from signorini_cr.options import explained
 from signorini_cr.rounding import at_most
+from signorini_cr.vi.stopping import WINDOWS
 
 pytestmark = pytest.mark.ranks
 
@@ -329,3 +330,21 @@ def test_what_python_shows_is_a_line() -> None:
     assert repr(solution).endswith(f", error at most {at_most(certificate.bound_h1)}>")
     assert repr(certificate).startswith("<Certificate: error at most ")
     assert all(len(line) < 100 for line in (*shown, repr(solution), repr(certificate)))
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_windows_are_where_the_dofs_are(element):
+    """Squares along Γ1 by coordinates that DOLFINx gives, whichever rank has a dof's facets."""
+    size = 0.05
+    solution = solve(PROBLEM, SQUARE.mesh(size), element=element)
+    system, V = solution.level.system, solution.u.function_space
+    x = V.tabulate_dof_coordinates()[system.bounded, 0]
+    everywhere = np.concatenate(MPI.COMM_WORLD.allgather(x))
+    low, high = everywhere.min(), everywhere.max()
+    expected = WINDOWS * (x - low) / (high - low)
+    # P1 takes a point of a facet beside the vertex
+    near = 1e-9 if element == "CR" else WINDOWS * size
+    found = system.windows  # all on one line, the first of the coordinates
+    assert (found >= np.floor(expected - near).clip(0, WINDOWS - 1)).all()
+    assert (found <= np.floor(expected + near).clip(0, WINDOWS - 1)).all()
+    assert len(np.unique(np.concatenate(MPI.COMM_WORLD.allgather(found)))) == WINDOWS
