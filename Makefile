@@ -19,8 +19,8 @@ studies:
 
 # docs/verification.md: what the program claims, checked by other code; then the same on two ranks
 verify:
-	$(run) timeout --kill-after=20 3600 python3 verification --out docs/verification.md
-	$(run) timeout --kill-after=20 3600 mpirun -n 2 python3 verification
+	$(run) timeout --kill-after=20 7200 python3 verification --out docs/verification.md
+	$(run) timeout --kill-after=20 7200 mpirun -n 2 python3 verification
 
 # What the tests draw a few of, in numbers; every seed that fails is to become a test.
 fuzz:

@@ -84,6 +84,7 @@ def test_contact_all_along(part, loss):
     assert (abs(orders(found) - 2.0) < 0.2).all()
 
 
+@pytest.mark.slow
 def test_contact_that_begins_somewhere():
     """h: nothing is corrected."""
     conditions = {"floor": Contact(0.0), "top": Dirichlet(0.0), "left": Neumann()}

@@ -585,6 +585,7 @@ def check_problem(text: str) -> None:
         ENDS["bounds"] += 1
 
 
+@pytest.mark.slow
 @settings(few, max_examples=4)
 @given(problems())
 def test_random_problems_are_solved_or_refused(text: str) -> None:

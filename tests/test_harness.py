@@ -12,7 +12,7 @@ import signorini_cr
 
 PACKAGE = Path(signorini_cr.__file__).parent
 
-pytestmark = pytest.mark.serial
+pytestmark = [pytest.mark.slow, pytest.mark.serial]
 
 
 def load(name):

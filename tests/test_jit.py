@@ -51,6 +51,7 @@ def left_by_a_killed_run(cache: Path, age: float) -> None:
     COMM.Barrier()
 
 
+@pytest.mark.slow
 def test_what_is_abandoned_is_compiled_anew(cache: Path) -> None:
     left_by_a_killed_run(cache, 2 * ABANDONED)
     form = make(1.0)
@@ -60,6 +61,7 @@ def test_what_is_abandoned_is_compiled_anew(cache: Path) -> None:
     assert source.with_suffix(".c.cached").exists() and source.stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_who_is_still_at_work_is_waited_for(cache: Path, monkeypatch) -> None:
     """The file is touched by another process, until it is left alone."""
     left_by_a_killed_run(cache, 0.0)
@@ -118,6 +120,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noted", [True, False])
 @pytest.mark.parametrize("kind", [*DAMAGES, "away"])
 def test_a_damaged_library_is_made_anew(kind: str, noted: bool, cache: Path) -> None:

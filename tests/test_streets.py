@@ -3,6 +3,7 @@
 import ast
 import runpy
 import shutil
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,7 @@ LAZY = {("__init__", name) for names in FLOORS for name in names}
 IMPORTS = runpy.run_path(str(ROOT / "docs" / "architecture.py"))["imports"]
 
 
+@cache
 def graph(package: Path = PACKAGE) -> dict[tuple[str, ...], list[tuple[str, ...]]]:
     """The modules that each file imports, wherever in it, for types as well."""
     return {

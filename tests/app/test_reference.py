@@ -63,6 +63,7 @@ def test_every_prefix_of_petsc_options_is_in_the_reference() -> None:
     assert f"`-{options.PREFIX}smoother " in text
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_the_tutorial_prints_what_the_program_prints(tmp_path, capsys) -> None:
     """The statement of the problem, the head of the table and its first rows."""
@@ -101,6 +102,7 @@ def dotted(record: dict, before: str = "") -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_every_figure_is_in_the_reference(known, shared_tmp_path, capsys) -> None:
     """All that a run prints and writes, and nothing else."""

@@ -96,6 +96,7 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(mode: str, case, capf
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("mode, first, then", [("uniform", 1, 2), ("adaptive", 2, 1)])
 def test_on_another_number_of_ranks(mode: str, first: int, then: int, case) -> None:

@@ -20,6 +20,8 @@ from signorini_cr.errors import NotConverged
 from signorini_cr.output.meanings import STEP
 from signorini_cr.output.series import is_kept
 
+pytestmark = pytest.mark.slow
+
 COMM = MPI.COMM_WORLD
 CASE = """[domain]
 vertices = [[0, 0], [1, 0], [1, 1], [0, 1]]

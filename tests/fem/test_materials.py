@@ -241,6 +241,7 @@ def test_capacities_of_materials(scheme):
         next(solve_in_time(varied, domain, end=0.1, steps=3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("soil", "rock"), [(3.0, 0.0), (0.0, 1e4), (1.0, 1e8)])
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_rates_and_bounds_with_reactions_of_materials(soil, rock, adaptive):

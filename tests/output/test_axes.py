@@ -11,6 +11,8 @@ from signorini_cr import InputError, plots
 from signorini_cr.output import canvas
 from signorini_cr.output.raster import raster
 
+pytestmark = pytest.mark.slow
+
 image = pytest.importorskip("matplotlib.image")
 WORLD = MPI.COMM_WORLD
 

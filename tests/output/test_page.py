@@ -13,6 +13,8 @@ from mpi4py import MPI
 from signorini_cr.app.cli import main
 from signorini_cr.output.meanings import OF_STEPS
 
+pytestmark = pytest.mark.slow
+
 COMM = MPI.COMM_WORLD
 
 FILE = """title = "price < 5 & more"
@@ -124,7 +126,6 @@ def test_the_page_of_a_run_in_time(page):
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here; make browser has one")
 @pytest.mark.parametrize("more", ["", TIME], ids=["levels", "steps"])

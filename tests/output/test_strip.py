@@ -9,6 +9,8 @@ from signorini_cr.output import canvas
 from signorini_cr.output.plots import drawn
 from signorini_cr.output.strip import MOST, chosen, moment, plot_strip
 
+pytestmark = pytest.mark.slow
+
 image = pytest.importorskip("matplotlib.image")
 COMM = MPI.COMM_WORLD
 

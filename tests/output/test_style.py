@@ -34,6 +34,7 @@ def overhang(figure):
     return max(-box.x0, -box.y0, box.x1 - figure.get_figwidth(), box.y1 - figure.get_figheight())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vertices", "size"), [(SQUARE, 0.25), (THIN, 1.0)])
 def test_nothing_is_cut_off(vertices, size):
     solution = solved(vertices, {0, 2}, size)

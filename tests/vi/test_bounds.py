@@ -87,6 +87,7 @@ def between(x):
     return 40 * ufl.sin(np.pi * x[0]) + 2
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("nested", [True, False])

@@ -9,6 +9,8 @@ from petsc4py import PETSc
 
 from signorini_cr.options import PREFIX, take
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = """
 import sys
 import numpy as np
