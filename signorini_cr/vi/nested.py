@@ -67,8 +67,7 @@ def nested_start(
     if coarse.element == "P1":  # a dof has many cells, and no one to change its residual through
         return
     vector = ghosted_vector(level.V, start.x.array)
-    order = np.argsort(system.contact_dofs[:, 0])  # as the bounded dofs are
-    facets = system.bounded_facets[order]
+    facets = system.bounded_facets[system.facets_by_dof()]
     expected = _Expected.of(_Inherited.of(coarse, level, facets), system, vector)
     _put_on_bounds(start, system, expected)
     _make_forces(start, vector, system, facets, expected)

@@ -99,7 +99,7 @@ class Data:
     rounded: float
     loads: FloatArray
     offset: float
-    windows: IndexArray | None = None
+    windows: IndexArray
 
 
 def solve_vi(
@@ -125,7 +125,7 @@ def solve_vi(
             forces and each class of stiffness are converged for themselves, see `stopping`.
         monitor: Called after each step.
         data: What there is to know of the data; without it all equations are of one class of
-            stiffness, and what is lost in rounding stays so.
+            stiffness, all contact is one neighbourhood, and what is lost in rounding stays so.
 
     Raises:
         NotConverged: With the name PETSc gives to the reason, or what is lost in rounding.

@@ -77,7 +77,7 @@ class ContactFacets:
     def of(cls, system: System) -> ContactFacets:
         """Look at a system's mesh; collective."""
         V, dofs = system.u_D.function_space, system.contact_dofs
-        vertices, measure = facet_measures(V.mesh, system.bounded_facets)
+        vertices, measure = system.measured
         share: FloatArray = np.zeros(len(system.u_D.x.array))
         np.add.at(share, dofs, (measure / dofs.shape[1])[:, None])
         share = Layout.of_space(V).shared_sum(share)[system.bounded]
@@ -208,15 +208,23 @@ class System:
         return ContactFacets.of(self) if self._like is None else self._like.contact_facets
 
     @cached_property
+    def measured(self) -> tuple[FloatArray, FloatArray]:
+        """Vertices' coordinates and measures of the facets of Γ1, as `facet_measures` has them."""
+        return facet_measures(self.u_D.function_space.mesh, self.bounded_facets)
+
+    def facets_by_dof(self) -> IndexArray:
+        """The place in `bounded_facets` of each dof's own facet, shape (n,); CR only."""
+        return np.argsort(self.contact_dofs[:, 0])
+
+    @cached_property
     def windows(self) -> IndexArray:
         """Where on Γ1 the dofs with a bound are, see `stopping.windows`; collective at first."""
-        if self._like is not None and self.bounded is self._like.bounded:
+        if self._like is not None:
             return self._like.windows
-        V = self.u_D.function_space
-        vertices, _ = facet_measures(V.mesh, self.bounded_facets)
+        V, (vertices, _) = self.u_D.function_space, self.measured
         midpoints = vertices.mean(axis=1)
         if Layout.of_space(V).cr:  # a dof and its facet have the same owner
-            return windows(V.mesh.comm, midpoints[np.argsort(self.contact_dofs[:, 0])])
+            return windows(V.mesh.comm, midpoints[self.facets_by_dof()])
         places: FloatArray = np.full((len(self.bounded), 3), -np.inf)
         for axis in range(3):
             of_dofs: FloatArray = np.full(len(self.u_D.x.array), -np.inf)
