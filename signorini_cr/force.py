@@ -9,11 +9,10 @@ import numpy as np
 
 from .arrays import FloatArray
 from .data.diffusion import diffusion
-from .data.moments import OnParts
+from .data.loads import trace_of
 from .dual import certified
 from .errors import InputError
 from .estimate.certificate import Made
-from .estimate.flux import unbalanced
 from .estimate.force import (
     Certified,
     Interval,
@@ -24,7 +23,7 @@ from .estimate.force import (
     through,
     unsure,
 )
-from .estimate.lifting import gaps
+from .estimate.settled import Settled, in_p1, left_by
 from .fem.cells import measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin
 from .fem.problem import Problem
@@ -94,72 +93,45 @@ def _corrected(
     there is contact, φ times λ where there is none.
     """
     cells = made.cells()
-    forms = diffusion(made.level.data).forms
-    alpha = OnParts.of(diffusion(made.level.data).alpha, cells)
-    force = np.zeros(len(cells.exterior))
-    np.maximum.at(force, alpha.side.dofs, made.contact)
-    held: list[Condition] = []
-    for condition in forms.bounded:
-        dofs = cells.sides[condition.number].dofs
-        touching, number = cells.total(float((force[dofs] > 0.0).sum()), float(len(dofs)))
-        if 0 < touching < number:
-            return None
-        held += [condition] if touching else []
-    free = [condition for condition in forms.bounded if condition not in held]
+    settled = Settled.of(made, cells)
+    if settled is None:
+        return None
     bound = solution.certificate.bound_companion
     assert bound is not None
-    product, middle, reach = 0.0, 0.0, 0.0
+    middle, reach = 0.0, 0.0
     at: FloatArray = np.zeros((cells.tdim + 1, cells.number))
     flows = np.zeros_like(at)
-    if any(condition not in free for condition in conditions):
-        problem = _harmonic(forms.problem, forms.conditions, conditions, free)
+    if any(condition not in settled.free for condition in conditions):
+        forms = diffusion(made.level.data).forms
+        problem = _harmonic(forms.problem, forms.conditions, conditions, settled.free)
         dual = certified(problem, made.level)
-        of_phi = dual._made
-        if of_phi is None or dual.bound_companion is None:
+        of_phi = in_p1(dual, cells)
+        if of_phi is None:
             return None
+        assert dual.bound_companion is not None
         at, flows = of_phi.vertices[cells.vertices], of_phi.through(cells)
-        bent = cells.total(float(np.abs(of_phi.bumps).sum()))[0] > 0.0
-        if bent or of_phi.thirds is not None:
-            return None
         product = bound * dual.bound_companion
-        if held:  # z's certificate asks of e what only z does: to vanish where there is contact
-            left = of_phi.left if of_phi.taken_up is None else of_phi.left * ~of_phi.taken_up
-            around = diffusion(made.level.data).cells  # these know Γ0
-            product += bound * unbalanced(made.level, around, left, made.least, 0.0, made.reaction)
+        if settled.held:
+            product += bound * left_by(of_phi, made)
             if not np.isfinite(product):
                 return None
         work, slack = against(made, cells, at)
         own, work, energy, more = cells.total(
-            sum(through(made, cells, c) for c in conditions if c not in free),
+            sum(through(made, cells, c) for c in conditions if c not in settled.free),
             work,
             square(made, cells, at),
             unsure(made, at, slack),
         )
-        middle, reach = own + work, made.loose * np.sqrt(energy) + more
-    most, loss = 0.0, np.zeros(len(cells.exterior))
+        middle, reach = own + work, made.loose * np.sqrt(energy) + more + product
+    through_facets, off = np.zeros((2, len(cells.exterior)))
+    loss = np.zeros(len(cells.exterior))
     loss[made.segments.facets.dofs] = made.segments.loss
-    for condition in held:
-        side = cells.sides[condition.number]
-        lost = loss[side.dofs] * measures(cells, side) * float(condition in conditions)
-        flow = np.abs(flows[side.local, side.cells] + lost)
-        most = max(most, float((flow / force[side.dofs]).max(initial=0.0)))
-    held_most = max(cells.comm.allgather(most))
-    room = gaps(cells, alpha, made.vertices, made.bumps, made.thirds)
-    on_facets = np.full(len(cells.exterior), np.inf)
-    np.minimum.at(on_facets, alpha.side.dofs, room)
-    for condition in free:
-        side = cells.sides[condition.number]
-        ends = [at[i, side.cells] for i in range(cells.tdim + 1)]
-        off = np.abs(np.stack(ends) - float(condition in conditions))
-        off[side.local, np.arange(len(side.cells))] = 0.0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(
-                on_facets[side.dofs] > 0.0, off.max(axis=0) / on_facets[side.dofs], np.inf
-            )
-        most = max(most, float(np.where(off.max(axis=0) == 0.0, 0.0, ratio).max(initial=0.0)))
-    most = max(cells.comm.allgather(most))
-    reach += product + most * made.complementary
-    reach += held_most * made.above if held else 0.0
+    for condition in (*settled.held, *settled.free):
+        side, chosen = cells.sides[condition.number], float(condition in conditions)
+        lost = loss[side.dofs] * measures(cells, side) * chosen
+        through_facets[side.dofs] = np.abs(flows[side.local, side.cells] + lost)
+        off[side.dofs] = np.abs(trace_of(cells, side, at) - chosen).max(axis=0)
+    reach += settled.unknown(made, cells, through_facets, off)
     return float(middle - reach), float(middle + reach)
 
 

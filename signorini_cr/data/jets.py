@@ -166,6 +166,12 @@ def has_conditions(expression: Any) -> bool:
     )
 
 
+def differences(expression: Any) -> list[Any]:
+    """What changes its sign where conditions of a lowered expression change."""
+    nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
+    return [e.ufl_operands[0] - e.ufl_operands[1] for e in nodes if isinstance(e, _ORDERED)]
+
+
 def values(expression: Any, points: Boxes) -> FloatArray:
     """Values of a lowered expression, not enclosed, at points that are given as boxes, shape (n,).
 
@@ -202,16 +208,25 @@ class Enclosure:
     Args:
         boxes: Where.
         order: Up to which order.
-
-    Attributes:
-        strips: How many conditions were decided up to strips along the boundary, shape (n,).
+        inner: A lower bound of the barycentric coordinates of all points that matter: conditions
+            may then be decided up to slices of triangles that are too thin to hold one.
     """
 
-    def __init__(self, boxes: Boxes, order: int = ORDER):
+    def __init__(self, boxes: Boxes, order: int = ORDER, inner: float = 0.0):
         """Begin with nothing known."""
-        self.boxes, self.order = boxes, order
-        self.strips = np.zeros(boxes.low.shape[1:], dtype=np.intp)
+        self.boxes, self.order, self.inner = boxes, order, inner
+        self._strips, self._slices = np.zeros((2, *boxes.low.shape[1:]))
         self._known: dict[Any, Jet] = {}
+
+    @property
+    def left_out(self) -> FloatArray:
+        """Upper bound of the part of each simplex on which conditions may be otherwise, shape (n,).
+
+        For each condition that is decided up to a strip, or a slice, one of these.
+        """
+        if not self._strips.any():
+            return self._slices
+        return np.minimum(self._strips * self.boxes.strip_part + self._slices, 1.0)
 
     def __call__(self, e: Any) -> Jet:
         """The jet of an expression.
@@ -522,6 +537,8 @@ class Enclosure:
         if isinstance(e, classes.LT | classes.LE):
             left, right = right, left
         low, high, thin = self._difference(self(left), self(right))
+        if self.boxes.corners is not None and self.boxes.along is None and self.order >= 2:
+            low, high = self._by_slopes(low, high, left, right)
         above, below = high > 0, low < 0  # where the difference can be so
         # It can be 0 on more than a null set only where all derivatives may vanish
         zero = (low <= 0) & (high >= 0) & ~thin
@@ -545,8 +562,45 @@ class Enclosure:
         corners = self.boxes.corners
         if corners is None or self.order < 2 or max(rest.rows, default=0) > n:
             return low, high, thin
-        self.strips += unclear
+        self._strips += unclear
         return *self._at_corners(low, high, rest.on(tuple(range(1, n + 1)))[0], corners), thin
+
+    def _by_slopes(self, low: FloatArray, high: FloatArray, left: Any, right: Any) -> Range:
+        """Narrower bounds of left − right on simplices, by its value at their centroids.
+
+        On the way from there to a corner it changes by slopes that are enclosed: it lies between
+        affine functions. Where one of these has the other sign on a thin slice only, that is left
+        out.
+        """
+        box, rest = self.boxes, self(left).rest + -self(right).rest
+        low, high = (np.array(np.broadcast_to(x, box.low.shape[1:])) for x in (low, high))
+        which = np.flatnonzero((low <= 0) & (high >= 0))
+        if max(rest.rows, default=0) <= box.variables or not len(which):
+            return low, high
+        assert box.corners is not None
+        corners = box.corners[..., which]
+        point = corners.mean(axis=0)
+        cells = None if box.cells is None else box.cells[which]
+        at = Enclosure(Boxes(point, point, cells=cells, domain=box.domain), order=0)
+        a, b = at(left), at(right)
+        mid, rad = (
+            np.broadcast_to(x[: box.variables], (box.variables, len(low)))[:, which]
+            for x in rest.on(self._every)
+        )
+        offset = corners - point
+        rise = np.einsum("vn,cvn->cn", mid, offset)
+        size = np.abs(a.low) + np.abs(b.low) + np.sum(np.abs(mid * offset), axis=1).max(axis=0)
+        room = np.sum(rad * np.abs(offset).max(axis=0), axis=0) + LOOSE * size
+        for sign, row, ends in (
+            (1.0, low, a.low - b.high + rise - room),
+            (-1.0, high, b.low - a.high - rise - room),
+        ):
+            bottom, part = ends.min(axis=0), _part_below(ends)
+            thin = (bottom < 0) & (-bottom < self.inner * np.ptp(ends, axis=0)) & (part < 1.0)
+            self._slices[which] += np.where(thin, part, 0.0)
+            bottom = np.where(thin, 0.0, bottom)
+            row[which] = sign * np.fmax(sign * row[which], bottom)
+        return low, high
 
     def _at_corners(
         self, low: FloatArray, high: FloatArray, slopes: FloatArray, corners: FloatArray
@@ -577,6 +631,21 @@ class Enclosure:
         return np.where(bad, low, np.maximum(low, bottom)), np.where(
             bad, high, np.minimum(high, top)
         )
+
+
+def _part_below(ends: FloatArray) -> FloatArray:
+    """The part of a triangle on which an affine function is below 0; 1 of other simplices.
+
+    Args:
+        ends: Its values at the vertices, shape (d + 1, n).
+    """
+    if len(ends) != 3:
+        return np.ones(ends.shape[1])
+    low, middle, high = np.sort(ends, axis=0)
+    one_below = low**2 / ((middle - low) * (high - low))
+    one_above = 1.0 - high**2 / ((high - low) * (high - middle))
+    found = np.where(middle > 0, one_below, np.where(high > 0, one_above, 1.0))
+    return np.where(low >= 0, 0.0, np.clip(found * (1 + 1e-12) + 1e-15, 0.0, 1.0))
 
 
 # ---- ranges

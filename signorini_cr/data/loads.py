@@ -176,9 +176,10 @@ class Certain:
         if fine is not f:
             load = VolumeMoments.of(fine, cells)
         deviation, points = f.deviation, np.hstack([fine.rule.hats, fine.plain.hats])
+        inner = float(points.min())
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-            quadratic, cubic = deviation(Enclosure(boxes), half, hats=points)
+            quadratic, cubic = deviation(Enclosure(boxes, inner=inner), half, hats=points)
             return np.stack([cubic, quadratic**2])
 
         goal = SHARE * size
@@ -190,7 +191,15 @@ class Certain:
             norm = mean_to_norm(cells, low, reaction)
         np.multiply((2.0 / goal) ** 2 * cells.volume, by_slope * norm, out=weights[1])
         try:
-            found = cut(cells, errors, weights, deviation.local, deviation.decides, deviation.apart)
+            found = cut(
+                cells,
+                errors,
+                weights,
+                deviation.local,
+                deviation.decides,
+                deviation.apart,
+                deviation.levels(cells) if cells.tdim == 2 else None,
+            )
         except Unknown as error:
             return cls(load, reason=f"f holds an operator that has no enclosure: {error}")
         missed = 2.0 * cells.volume * found.errors[0]

@@ -318,15 +318,16 @@ class Coefficient:
             size: Of the bound, to which what quadrature misses should be small.
         """
         assert self.values is not None
+        inner = float(self.rule.hats.min())
 
         def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-            at = Enclosure(boxes)
+            at = Enclosure(boxes, inner=inner)
             (r, w), (s, x) = (self.deviation(at, half, inverse) for inverse in (False, True))
             low, high = np.zeros((2, len(r)))
-            if at.strips.any():
-                which = np.flatnonzero(at.strips)
+            if at.left_out.any():
+                which = np.flatnonzero(at.left_out)
                 jet = Enclosure(boxes.whole(which), order=0)(self.deviation.expression)
-                part = (at.strips * boxes.strip_part)[which]
+                part = at.left_out[which]
                 low[which], high[which] = part / np.maximum(jet.low, 1e-300), part * jet.high
             return np.stack([r, self._ratio(at, r, s), w, x, low, high, r**2])
 
@@ -343,6 +344,7 @@ class Coefficient:
             shares,
             self.deviation.local,
             self.deviation.decides,
+            levels=self.deviation.levels(cells) if cells.tdim == 2 else None,
             at_most=KAPPA_PIECES,
         )
         np.fmin(

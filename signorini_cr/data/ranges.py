@@ -26,6 +26,7 @@ from .jets import (
     Jet,
     Range,
     Unknown,
+    differences,
     has_conditions,
     is_local,
     lowered,
@@ -34,6 +35,11 @@ from .jets import (
 
 Errors = Callable[[Boxes, FloatArray], FloatArray]
 """What is to be known of data on boxes and simplices of given half extents; shape (rows, n)."""
+Levels = Callable[["Pieces"], FloatArray]
+"""What changes its sign where data may jump, at triangles' vertices and their edges' middles.
+
+The shape is (differences, 6, n).
+"""
 
 GROUPS = 700
 """Boxes to begin with, about."""
@@ -55,14 +61,16 @@ IN_VAIN = 3
 """How often in turn they are, with next to no gain."""
 SLABS = 4
 """What triangles are cut into across an axis."""
-QUARTERS, UNKNOWN = -1, -2
-"""Ways to cut pieces, besides across an axis."""
+QUARTERS, UNKNOWN, JUMP = -1, -2, -3
+"""Ways to cut pieces, besides across an axis; the last is along a line where data may jump."""
 ROOMY, STEEP = 10, 1.2
 """More room for pieces where errors fall faster than with this power of their number."""
 MUCH = 1.5
 """For how large a sum of errors, 1 being the goal, there is more room."""
 ACROSS = 1.15
 """How much better than by quarters errors must fall for a cut across an axis."""
+SILENT = 0.1
+"""How little errors fall, in powers of e, where half a box says nothing about how to cut."""
 DEEP = 60.0
 """How far above the threshold pieces are cut twice at once."""
 ENOUGH = 0.5
@@ -151,6 +159,28 @@ def means(variables: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
     )
 
 
+def _crossed(levels: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Whether a function that changes its sign is not affine, and its values at the vertices.
+
+    Of several functions on a triangle the first that does.
+
+    Args:
+        levels: See `Levels`.
+    """
+    levels = np.nan_to_num(levels, nan=0.0, posinf=1e300, neginf=-1e300)
+    change = (levels.min(axis=1) < 0.0) & (levels.max(axis=1) > 0.0)
+    own = levels[change.argmax(axis=0), :, np.arange(levels.shape[2])].T
+    vertices, middles = own[:3], own[3:]
+    off = np.abs(middles - 0.5 * (vertices.sum(axis=0) - vertices)).max(axis=0)
+    return off > AFFINE * np.abs(vertices).max(axis=0), vertices
+
+
+EDGES = np.array([[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]])
+"""The middles of a triangle's edges, each opposite to a vertex."""
+AFFINE = 1e-13
+"""What counts as rounding in values of an affine function, in parts of the largest."""
+
+
 class Deviation:
     """R and W of expressions; an expression's inverse may be among them."""
 
@@ -160,6 +190,7 @@ class Deviation:
         self.local = is_local(self.expression)
         self.singular = not self.local and may_be_singular(self.expression)
         self.decides = self.singular or has_conditions(self.expression)
+        self.differences = differences(self.expression)
 
     def __call__(
         self,
@@ -182,11 +213,12 @@ class Deviation:
         """
         boxes = at.boxes
         quadratic, cubic = remainders(self._jet(at, inverse), half, in_the_mean=hats is not None)
-        if at.strips.any():
+        left_out = at.left_out
+        if left_out.any():
             # What conditions left out along the boundary: there all values are possible
-            which = np.flatnonzero(at.strips)
+            which = np.flatnonzero(left_out)
             jet = self._jet(Enclosure(boxes.whole(which), order=0), inverse)
-            part, width = (at.strips * boxes.strip_part)[which], jet.high - jet.low
+            part, width = left_out[which], jet.high - jet.low
             quadratic[which] += np.sqrt(part) * width
             cubic[which] = np.minimum(cubic[which] + 2 * part * width, quadratic[which])
         if hats is not None and boxes.corners is not None and self.singular:
@@ -206,6 +238,18 @@ class Deviation:
             rest = np.setdiff1d(np.arange(len(pieces.part)), which)
             pieces = pieces[rest] + pieces[which].around(point, hats)
         return pieces
+
+    def levels(self, cells: Cells) -> Levels | None:
+        """What changes its sign where the data may jump; None where nothing does."""
+        if not self.differences:
+            return None
+        hats = np.hstack([np.eye(3), EDGES])
+
+        def at(pieces: Pieces) -> FloatArray:
+            points, shape = pieces.points(cells, hats), (hats.shape[1], len(pieces.part))
+            return np.stack([values(each, points).reshape(shape) for each in self.differences])
+
+        return at
 
     def _jet(self, enclosure: Enclosure, inverse: bool) -> Jet:
         return enclosure.inverse(self.expression) if inverse else enclosure(self.expression)
@@ -373,6 +417,57 @@ class Pieces:
                 origin.append(there)
         return sum(pieces[1:], pieces[0]), np.concatenate(origin)
 
+    def along(self, levels: Levels) -> tuple[Pieces, IndexArray]:
+        """Triangles cut along lines on which something changes its sign, nearly; from which.
+
+        That is one line where it is affine. Others are the nearer to one the smaller the triangle:
+        it is cut into quarters first. So it is where there is no line.
+        """
+        curved, level = _crossed(levels(self))
+        pieces, origin = self[~curved], np.flatnonzero(~curved)
+        level = level[:, ~curved]
+        if curved.any():
+            quarters, of = self[curved].quarters()
+            _, of_quarters = _crossed(levels(quarters))
+            pieces, level = pieces + quarters, np.hstack([level, of_quarters])
+            origin = np.concatenate([origin, np.flatnonzero(curved)[of]])
+        cut, of = pieces.capped(level)
+        return cut, origin[of]
+
+    def capped(self, level: FloatArray) -> tuple[Pieces, IndexArray]:
+        """Triangles cut along the line on which an affine function is 0; from which.
+
+        Args:
+            level: Its values at the vertices, shape (3, n).
+        """
+        at = np.arange(len(self.part))
+        order = np.argsort(level, axis=0)
+        low, middle, high = level[order, at]
+        crossed = np.flatnonzero((low < 0.0) & (high > 0.0))
+        # the vertex that is alone on its side, and the two others
+        alone = np.where(middle >= 0.0, order, order[::-1])[:, crossed]
+        a, b, c = level[alone, crossed]
+        s, t = np.clip(a / (a - b), 0.0, 1.0), np.clip(a / (a - c), 0.0, 1.0)
+        rest = np.setdiff1d(at, crossed)
+        pieces, origin = [self[rest]], [rest]
+        ends = [
+            np.stack([x[vertex, :, crossed].T for vertex in alone])
+            for x in (self.corners, self.hats)
+        ]
+        ends = [np.stack([*x, x[0] + s * (x[1] - x[0]), x[0] + t * (x[2] - x[0])]) for x in ends]
+        for vertices, share in (
+            ((0, 3, 4), s * t),
+            ((3, 1, 2), 1.0 - s),
+            ((3, 2, 4), s * (1.0 - t)),
+        ):
+            there = np.flatnonzero(share > 1e-15)
+            corners, hats = (x[list(vertices)][..., there] for x in ends)
+            of = crossed[there]
+            part = self.part[of] * share[there]
+            pieces.append(Pieces(self.parent[of], corners, hats, part, self.frame))
+            origin.append(of)
+        return pieces[0] + pieces[1] + pieces[2] + pieces[3], np.concatenate(origin)
+
     def thinner(self) -> tuple[Pieces, IndexArray]:
         """Both halves of each slab; from which."""
         start, end = self.span
@@ -418,11 +513,14 @@ class Pieces:
         scale[list(axes)] = 0.5
         return replace(self, corners=middle + scale * (self.corners - middle))
 
-    def cut(self, ways: IndexArray) -> tuple[Pieces, IndexArray, IndexArray]:
+    def cut(
+        self, ways: IndexArray, levels: Levels | None = None
+    ) -> tuple[Pieces, IndexArray, IndexArray]:
         """Cut each in its way: into four, or across an axis; also from which, and the way.
 
         Args:
-            ways: `QUARTERS`, or the number of the axis.
+            ways: `QUARTERS`, `JUMP`, or the number of the axis.
+            levels: For `JUMP`.
         """
         made, origin = [], []
         of_slab = ~self.whole
@@ -430,11 +528,16 @@ class Pieces:
         if of_slab.any():
             base = np.abs(self.corners[2] - self.corners[1])
             along = of_slab & (base.argmin(axis=0) == ways)
-        for way in range(QUARTERS, 1 if self.corners.shape[:2] != (3, 2) else 2):
+        for way in (JUMP, QUARTERS, *range(0 if self.corners.shape[:2] != (3, 2) else 2)):
             which = np.flatnonzero((ways == way) & ~along)
             if len(which):
                 triangles, of = self[which].triangles()
-                new, which_of = triangles.quarters() if way == QUARTERS else triangles.slabs(way)
+                if way == JUMP and levels is not None:
+                    new, which_of = triangles.along(levels)
+                elif way >= 0:
+                    new, which_of = triangles.slabs(way)
+                else:
+                    new, which_of = triangles.quarters()
                 made.append(new)
                 origin.append(which[of[which_of]])
         which = np.flatnonzero(along)
@@ -531,6 +634,7 @@ def cut(
     local: bool,
     decide: bool = True,
     apart: Callable[[Pieces], Pieces] | None = None,
+    levels: Levels | None = None,
     at_most: int = PIECES,
 ) -> Cut:
     """Find errors, and where they are too large cut cells into pieces; collective.
@@ -542,6 +646,7 @@ def cut(
         local: Whether the data differ from cell to cell.
         decide: Whether the corners of pieces matter, for conditions or singular points.
         apart: See `refine`.
+        levels: See `refine`.
         at_most: Pieces in all; more where there are many cells.
     """
     comm, n = cells.comm, cells.number
@@ -550,11 +655,11 @@ def cut(
     pending = np.arange(n)
     if not local:
         low, high = _extents(cells)
-        levels = int(np.log2(max(total / GROUPS, 1.0)) / 2)
+        top = int(np.log2(max(total / GROUPS, 1.0)) / 2)
         slanted = (high - low).prod(axis=0) > 2.0 * SLANTED * cells.volume
         if cells.tdim == 2 and 2 * comm.allreduce(np.count_nonzero(slanted)) > total:
-            levels = 0  # boxes that hold many such cells tell nothing of any
-        for level in range(levels, 0, -2):
+            top = 0  # boxes that hold many such cells tell nothing of any
+        for level in range(top, 0, -2):
             every = len(pending) == n
             ends = (low, high) if every else (low[:, pending], high[:, pending])
             boxes, half, place = _groups(*ends, level)
@@ -579,6 +684,7 @@ def cut(
         room,
         cells,
         apart,
+        levels,
     )
     for row, amounts in zip(found, inside, strict=True):
         row[pending] = 0.0
@@ -595,6 +701,7 @@ def refine(
     room: int,
     cells: Cells,
     apart: Callable[[Pieces], Pieces] | None = None,
+    levels: Levels | None = None,
 ) -> tuple[Pieces, FloatArray]:
     """Cut pieces smaller where the errors are large; collective.
 
@@ -605,6 +712,7 @@ def refine(
         room: Number of pieces on all ranks at which it ends.
         cells: The mesh.
         apart: How to cut pieces on which nothing is known at first.
+        levels: What changes its sign where data may jump, for triangles.
 
     Returns:
         Pieces, and the errors on them.
@@ -650,6 +758,7 @@ def refine(
             share[chosen] > DEEP * (threshold if 8 * number > usual else ENOUGH / number),
             errors,
             weights,
+            levels,
         )
         inside = np.concatenate([inside[:, ~chosen], errors_there], axis=1)
         ways = np.concatenate([ways[~chosen], ways_there])
@@ -666,6 +775,7 @@ def _split(
     deep: BoolArray,
     errors: Callable[[Pieces], FloatArray],
     weights: FloatArray,
+    levels: Levels | None,
 ) -> tuple[Pieces, FloatArray, IndexArray]:
     """Cut each piece in the way that has proved good; or find that way by smaller pieces; local.
 
@@ -677,6 +787,7 @@ def _split(
         deep: Whether to cut twice.
         errors: See `refine`.
         weights: See `refine`.
+        levels: See `refine`.
 
     Returns:
         The new pieces, their errors, and the ways to cut them.
@@ -684,10 +795,10 @@ def _split(
     if pieces.corners.shape[:2] != (3, 2):
         ways = np.full(len(ways), QUARTERS)
     known = np.flatnonzero(ways != UNKNOWN)
-    finer, origin, made = pieces[known].cut(ways[known])
+    finer, origin, made = pieces[known].cut(ways[known], levels)
     again = np.flatnonzero(deep[known[origin]])
     if len(again):
-        more, of, ways_of = finer[again].cut(made[again])
+        more, of, ways_of = finer[again].cut(made[again], levels)
         once = np.flatnonzero(~deep[known[origin]])
         finer, made = finer[once] + more, np.concatenate([made[once], ways_of])
         origin = np.concatenate([origin[once], origin[again][of]])
@@ -720,7 +831,47 @@ def _split(
     best = (rates / np.array([[2.0], [ACROSS], [ACROSS]])).argmin(axis=0) + QUARTERS
     # where nothing is known there is a singular point, of which slabs do not know
     best = np.where(np.isfinite(share[new]), best, QUARTERS)
+    # a jump through the middle is none the smaller on smaller boxes there
+    silent = (rates > -SILENT).all(axis=0)
+    if levels is not None:
+        triangles, of = some.triangles()
+        at = levels(triangles)
+        jumps = ((at.min(axis=1) < 0.0) & (at.max(axis=1) > 0.0)).any(axis=0)
+        silent[of[jumps]] = True
+    silent = np.flatnonzero(silent & np.isfinite(share[new]))
+    if len(silent):
+        best[silent] = _tried(some[silent], share[new][silent], errors, weights, levels)
     return finer + some, np.hstack([inside, errors_of[:, new]]), np.concatenate([made, best])
+
+
+def _tried(
+    pieces: Pieces,
+    share: FloatArray,
+    errors: Callable[[Pieces], FloatArray],
+    weights: FloatArray,
+    levels: Levels | None,
+) -> IndexArray:
+    """The way to cut that leaves a jump in few pieces, by trying them all; else quarters; local.
+
+    Errors fall faster than the number of pieces grows where what is left, in parts of what there
+    was, times the number of pieces that have it is below 1: about that is what quarters do.
+
+    Args:
+        pieces: Triangles or slabs.
+        share: Their weighted errors.
+        errors: See `refine`.
+        weights: See `refine`.
+        levels: See `refine`.
+    """
+    n = len(share)
+    ways = [QUARTERS, 0, 1] if levels is None else [QUARTERS, JUMP, 0, 1]
+    growth = np.ones((len(ways), n))
+    for row, way in zip(growth[1:], ways[1:], strict=True):
+        finer, origin, _ = pieces.cut(np.full(n, way), levels)
+        left = finer.part * _shares(weights[:, finer.parent], errors(finer))
+        sums, counts = (np.bincount(origin, each, minlength=n) for each in (left, left > 0.0))
+        row[:] = np.clip(sums / share, 0.0, 1e300) * counts
+    return np.array(ways)[growth.argmin(axis=0)]
 
 
 def chunks(n: int) -> list[slice]:

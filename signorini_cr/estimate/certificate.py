@@ -144,13 +144,14 @@ class Made:
     κ is given by its means, as `Coefficient` has them, and by least, a lower bound of its
     eigenvalues; whether it varies within cells is told. hats and segments are moments of f and g,
     left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are this
-    rank's shares of the contact forces in y, by the parts' numbers, missed that of what quadrature
-    may have missed of f and g. reach is the radius of the ball around the middle of p and b that
-    A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖ alone. lift has bounds of ℓ, which
-    v lacks, and bounded the facet dofs of Γ1 that its last row is about. on_contact_alone tells
-    that part of the domain is held by contact alone: (2) is then for functions that vanish there.
-    contact are y's forces off each bound, facet by facet, above bounds what they make of v + ℓ − α,
-    and complementary is a bound of what λ makes of that and they make of u − α.
+    rank's shares of the contact forces in y, by the parts' numbers, missed is what quadrature may
+    have missed of f and g in each cell, shape (cells,) or (). reach is the radius of the ball
+    around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖
+    alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last row
+    is about. on_contact_alone tells that part of the domain is held by contact alone: (2) is then
+    for functions that vanish there. contact are y's forces off each bound, facet by facet, above
+    bounds what they make of v + ℓ − α, and complementary is a bound of what λ makes of that and
+    they make of u − α.
     """
 
     level: Level
@@ -172,7 +173,7 @@ class Made:
     taken_up: BoolArray | None
     shed: FloatArray | None
     forces: dict[int, float]
-    missed: float
+    missed: FloatArray
     reach: float
     loose: float
     lift: Lifted
@@ -480,7 +481,7 @@ def _bracket(total: Totals, ball: _Ball, hidden: float, rounding: float) -> tupl
 def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
     """Keep what y and v are made of, and the ball, lift being ℓ's norm."""
     flux, certain, segments, alpha = known.flux, known.certain, known.segments, v.boundary.alpha
-    missed = 0.0 if certain.missed is None else float(certain.missed.sum())
+    some = certain.missed is not None or bool(segments.missed.any())
     return Made(
         level=known.level,
         w=known.w,
@@ -501,7 +502,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         taken_up=flux.taken_up,
         shed=flux.shed,
         forces=_forces(alpha, flux),
-        missed=float(segments.missed.sum()) + missed,
+        missed=_missed(known.cells, certain, segments) if some else np.array(0.0),
         reach=float(ball.bound - ball.near / 2 + ball.loose + lift / 2),
         loose=float(ball.loose + lift),
         lift=v.lift,

@@ -130,7 +130,7 @@ def unsure(
         beyond: ℓ.
     """
     largest = np.abs(at).max(initial=0.0) + beyond.mean
-    return float(np.sum(slack) + beyond.left + made.missed * largest)
+    return float(np.sum(slack) + beyond.left + made.missed.sum() * largest)
 
 
 def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray]:

@@ -1,0 +1,158 @@
+"""Data that jump inside cells: integrals against areas in closed form, slices against samples."""
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+from signorini_cr import Polygon, Problem, solve
+from signorini_cr.compat import cell_nodes
+from signorini_cr.data.diffusion import diffusion
+from signorini_cr.data.jets import Boxes, Enclosure, lowered
+from signorini_cr.data.loads import Certain
+
+SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
+SIZE = 0.02
+"""Of a bound, to which what is missed should be small."""
+
+
+def sector(a, b, radius):
+    """Signed area of what a triangle with a vertex at the origin has in a disc around it."""
+    d = b - a
+    cross = a[0] * b[1] - a[1] * b[0]
+    # where the way from a to b enters and leaves the disc
+    p, q = a @ d / (d @ d), (a @ a - radius**2) / (d @ d)
+    root = np.sqrt(max(p * p - q, 0.0))
+    first, last = (np.clip(t, 0.0, 1.0) for t in (-p - root, -p + root))
+    if p * p <= q or first == last:
+        first = last = 0.0
+
+    def angle(s, t):
+        u, v = a + s * d, a + t * d
+        return np.arctan2(u[0] * v[1] - u[1] * v[0], u @ v)
+
+    outside = angle(0.0, first) + angle(last, 1.0)
+    return 0.5 * (radius**2 * outside + (last - first) * cross)
+
+
+def in_disc(corners, centre, radius):
+    """Area that triangles have in a disc, shape (cells,); corners of shape (cells, 3, 2)."""
+    return np.array(
+        [abs(sum(sector(x[i - 1], x[i], radius) for i in range(3))) for x in corners - centre]
+    )
+
+
+def enclosed(f, size=0.13):
+    """Moments of f on a mesh of the unit square, and what they miss; also the cells' corners."""
+    solution = solve(Problem(f=f, obstacle=-9.0), SQUARE.mesh(size, MPI.COMM_SELF))
+    data = diffusion(solution.level.data)
+    cells = data.cells
+    found = Certain.of(data.compiled.f, data.of_f, cells, np.array(1.0), SIZE)
+    mesh = solution.domain.mesh
+    return found, cells.volume, mesh.geometry.x[cell_nodes(mesh)[: cells.number], :2]
+
+
+@pytest.mark.serial
+def test_a_triangle_and_a_disc():
+    """The reference itself: a disc in a triangle, a triangle in a disc, half a disc."""
+    corners = np.array([[[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]]])
+    assert np.isclose(in_disc(corners, np.array([0.5, 0.5]), 0.2)[0], np.pi * 0.04)
+    assert np.isclose(in_disc(corners, np.array([0.5, 0.5]), 9.0)[0], 2.0)
+    assert np.isclose(in_disc(corners, np.array([0.8, 0.0]), 0.3)[0], np.pi * 0.045)
+    assert in_disc(corners, np.array([3.0, 3.0]), 0.5)[0] == 0.0
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("seed", range(6))
+def test_a_disc_anywhere(seed):
+    """7 inside of a disc, −2 outside: the integral over each cell, and its square's."""
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.random(2), [0.02, 0.1, 0.5][seed % 3] * rng.uniform(0.5, 1.0)
+
+    def f(x):
+        inside = (x[0] - centre[0]) ** 2 + (x[1] - centre[1]) ** 2 < radius**2
+        return ufl.conditional(inside, 7.0, -2.0)
+
+    found, volume, corners = enclosed(f)
+    part = in_disc(corners, centre, radius) / volume
+    mean = 9.0 * part - 2.0
+    off = volume * np.abs(found.load.mean - mean)
+    assert (off <= found.missed + 1e-13).all()
+    # q has the moments of the rule and f the true ones: their norms differ by ‖f − q‖ at most
+    root = np.sqrt(volume)
+    norm, exact = (
+        root * np.sqrt(np.maximum(square, 0.0))
+        for square in (found.load.variance + found.load.mean**2, 45.0 * part + 4.0)
+    )
+    assert (np.abs(norm - exact) <= found.rough + 1e-12).all()
+    # and next to nothing is missed, in a load with the norm 2 at least
+    assert found.missed.sum() < 2e-4 and np.sqrt((found.rough**2).sum()) < 0.05
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("slope", [0.0, 0.3, -1.7, 1e3])
+def test_an_oblique_line_costs_a_cut(slope):
+    """What is missed of a jump along a line is rounding, on any mesh."""
+    below = lambda x: x[1] - 0.52 < slope * (x[0] - 0.47)  # noqa: E731
+    found, _, _ = enclosed(lambda x: ufl.conditional(below(x), 3.0, -8.0))
+    assert found.missed.sum() < 1e-9 and (found.rough**2).sum() < 1e-7
+
+
+@pytest.mark.serial
+def test_two_lines_that_cross():
+    """A quadrant: each piece is on one side of both in the end."""
+    inside = lambda x: ufl.And(x[0] + 0.2 * x[1] < 0.53, x[1] - 0.1 * x[0] < 0.31)  # noqa: E731
+    found, volume, _ = enclosed(lambda x: ufl.conditional(inside(x), 1.0, 0.0))
+    # (0, 0), (.53, 0), the crossing, (0, .31)
+    y = (0.31 + 0.1 * 0.53) / 1.02
+    x = 0.53 - 0.2 * y
+    area = 0.5 * (0.53 * y + x * 0.31)
+    assert abs(volume @ found.load.mean - area) <= found.missed.sum() + 1e-14
+    assert found.missed.sum() < 1e-5
+
+
+CURVES = {
+    "circle": (lambda x: x[0] ** 2 + x[1] ** 2 - 1.0, lambda x: x[0] ** 2 + x[1] ** 2 - 1.0),
+    "wave": (
+        lambda x: ufl.sin(3 * x[0]) - x[1] + 0.2 * x[0] * x[1],
+        lambda x: np.sin(3 * x[0]) - x[1] + 0.2 * x[0] * x[1],
+    ),
+    "saddle": (lambda x: x[0] * x[1] - 0.1, lambda x: x[0] * x[1] - 0.1),
+}
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", CURVES)
+def test_slices_hold_what_is_left_out(name):
+    """Where a condition is decided up to a slice, few points of a triangle see the other branch."""
+    symbolic, numeric = CURVES[name]
+    mesh = SQUARE.mesh(0.5, MPI.COMM_SELF).mesh
+    g = symbolic(ufl.SpatialCoordinate(mesh))
+    expression = lowered(ufl.conditional(ufl.gt(g, 0.0), 1.0, 0.0))
+    rng = np.random.default_rng(5)
+    n, inner = 4000, 0.02
+    corners = rng.uniform(-1.5, 1.5, (1, 2, n)) + 10.0 ** rng.uniform(-4, -0.5, n) * rng.normal(
+        size=(3, 2, n)
+    )
+    # some as they are cut: with two corners on the curve, nearly
+    for _ in range(40):
+        step = 1e-6
+        for corner in corners[:2, :, : n // 2]:
+            at = numeric(corner)
+            dx, dy = ((numeric(corner + step * np.eye(2)[k][:, None]) - at) / step for k in (0, 1))
+            corner -= 0.5 * at * np.stack([dx, dy]) / (dx**2 + dy**2 + 1e-9)
+    at = Enclosure(Boxes(corners.min(axis=0), corners.max(axis=0), corners=corners), inner=inner)
+    jet, left_out = at(expression), at.left_out
+    decided = jet.low == jet.high
+    assert np.count_nonzero(decided & (left_out > 0)) > 50
+    assert np.count_nonzero(decided[n // 2 :]) > n // 4
+    samples = 2000
+    hats = rng.dirichlet(np.ones(3), samples)
+    hats = np.vstack([hats, inner + (1 - 3 * inner) * hats, np.eye(3) * (1 - 3 * inner) + inner])
+    x = np.einsum("qc,cgn->gqn", hats, corners[..., decided])
+    other = (numeric(x) > 1e-12) != (jet.low[decided] == 1.0)
+    other &= np.abs(numeric(x)) > 1e-12
+    assert not other[samples:].any()
+    part = other[:samples].mean(axis=0)
+    spread = np.sqrt(left_out[decided] / samples)
+    assert (part <= left_out[decided] + 5 * spread + 5e-3 * (left_out[decided] > 0)).all()

@@ -1,0 +1,102 @@
+"""Integrals of u: orders of their intervals, which hold what is known in closed form."""
+
+import numpy as np
+import pytest
+import ufl
+from mpi4py import MPI
+
+from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, means, solve_levels
+
+SIDES = ("floor", "right", "top", "left")
+SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
+BESIDE = {"left": Neumann(), "right": Neumann()}
+
+
+def widths(problem, where=None, weight=None, inside=None, levels=4):
+    """Widths of the intervals on meshes each of which is twice as fine as the one before."""
+    found = []
+    for solution in solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), levels):
+        _, lower, upper = means.integral(solution, where, weight)
+        assert lower <= upper and (inside is None or lower <= inside <= upper)
+        found.append(upper - lower)
+    return np.array(found)
+
+
+def orders(found):
+    return np.log2(found[:-1] / found[1:])
+
+
+def bent(x):
+    return x[0] * (1 - x[0]) + x[1]
+
+
+def wavy(x):
+    return ufl.sin(3 * x[1])
+
+
+@pytest.mark.parametrize("where, weight", [(None, None), ("floor", None), (None, wavy)])
+def test_contact_that_never_comes_about(where, weight):
+    """λ is at most what the gap leaves over the distance: h².
+
+    −u'' + 9 u = 1, u'(0) = 0, u(1) = 1.
+    """
+    conditions = {"floor": Contact(-3.0), "top": Dirichlet(1.0)} | BESIDE
+    c = (8 / 9) / np.cosh(3)
+    exact = {
+        (None, None): 1 / 9 + c * np.sinh(3) / 3,
+        ("floor", None): 1 / 9 + c,
+        # ∫ sin 3y (1/9 + c cosh 3y)
+        (None, wavy): (1 - np.cos(3)) / 27
+        + c * (3 * np.sinh(3) * np.sin(3) - 3 * np.cosh(3) * np.cos(3) + 3) / 18,
+    }[where, weight]
+    found = widths(Problem(f=1.0, reaction=9.0, conditions=conditions), where, weight, exact)
+    assert (abs(orders(found)[1:] - 2.0) < 0.2).all()
+
+
+@pytest.mark.parametrize("loss", [0.0, 5.0])
+@pytest.mark.parametrize(
+    "where, weight, exact",
+    [
+        (None, None, -4 / 3),
+        ("floor", None, 0.0),
+        (None, bent, -4 / 18 - 3 / 4),
+        # ∫ sin 3y (5 y² − 6 y)
+        (
+            None,
+            wavy,
+            5 * (6 * np.sin(3) - 7 * np.cos(3) - 2) / 27 - 6 * (np.sin(3) - 3 * np.cos(3)) / 9,
+        ),
+    ],
+)
+def test_contact_all_along(where, weight, exact, loss):
+    """u − α is at most what the gap leaves over λ: h². u = 5 y² − 6 y and λ = 6 with f = −10."""
+    conditions = {"floor": Contact(0.0, coefficient=loss), "top": Dirichlet(-1.0)} | BESIDE
+    found = widths(Problem(f=-10.0, conditions=conditions), where, weight, exact)
+    assert (abs(orders(found) - 2.0) < 0.1).all()
+
+
+def test_one_part_held_and_one_free():
+    """Contact at the bottom, from above and out of reach on the right."""
+    conditions = {
+        "floor": Contact(0.0),
+        "right": Contact(upper=9.0),
+        "top": Dirichlet(-1.0),
+        "left": Neumann(),
+    }
+    found = widths(Problem(f=-10.0, conditions=conditions), inside=-4 / 3)
+    assert (abs(orders(found) - 2.0) < 0.1).all()
+
+
+def test_a_weight_on_a_part_in_contact():
+    """u = 0 there; what is known is of the first order."""
+    conditions = {"floor": Contact(0.0), "top": Dirichlet(-1.0)} | BESIDE
+    found = widths(Problem(f=-10.0, conditions=conditions), "floor", lambda x: x[0], 0.0, 3)
+    assert (orders(found) > 0.8).all()
+
+
+def test_contact_that_begins_somewhere():
+    """Where nothing more is known the width is of the first order."""
+    load = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), -8.0, 8.0)  # noqa: E731
+    conditions = {"floor": Contact(0.0), "top": Dirichlet(0.0)} | BESIDE
+    found = widths(Problem(f=load, conditions=conditions))
+    assert (orders(found) > 0.8).all() and (orders(found) < 1.7).all()
