@@ -12,6 +12,8 @@ from signorini_cr import Domain, NotConverged, Problem, Solution, solve_levels
 
 EXACT = 1e-6
 """Largest error of the contact forces, relative, their sum and the sum of all facets' errors."""
+NEAR = 1e-6
+"""How far transition points may be off, in parts of the facet's length."""
 NOTHING = 1e-12
 """Where nothing touches, forces of this part of what they are made of are none."""
 EPSILON = float(np.finfo(float).eps)
@@ -28,6 +30,8 @@ class Verdict:
         error: Sum of the facets' errors over the sum of the forces.
         total: The same for the total force that the program reports.
         facets: Facets in another state than in the reference, degenerate ones left out.
+        transitions: How far transition points are from the reference's, in parts of the facet's
+            length; 0 where a facet is in another state, or degenerate.
         proper: Whether contact is on a part of Γ1, not all and not none.
         degenerate: Facets left out.
         steps: CG steps on each mesh.
@@ -38,6 +42,7 @@ class Verdict:
     error: float = 0.0
     total: float = 0.0
     facets: int = 0
+    transitions: float = 0.0
     proper: bool = False
     degenerate: int = 0
     steps: tuple[int, ...] = ()
@@ -46,7 +51,8 @@ class Verdict:
     @property
     def right(self) -> bool:
         """Whether it is what the reference says."""
-        return not (self.refused or self.fault or self.facets) and self.exact
+        apart = self.transitions > NEAR
+        return not (self.refused or self.fault or self.facets or apart) and self.exact
 
     @property
     def exact(self) -> bool:
@@ -114,14 +120,20 @@ class Judge:
                 assert mine is not None and self._cells is not None
                 if self._found is None:
                     self._found = Discrete(self._cells, self.data).solve()
-                verdict = self._compare(*mine, total, steps)
+                points = solution.contact.transitions[:, :2]
+                verdict = self._compare(*mine, total, points, steps)
             except Exception as error:  # the other ranks wait for a verdict
                 verdict = Verdict(fault=f"{type(error).__name__}: {error}", steps=steps)
         answer: Verdict = comm.bcast(verdict)
         return answer
 
     def _compare(
-        self, force: FloatArray, active: FloatArray, total: float, steps: tuple[int, ...]
+        self,
+        force: FloatArray,
+        active: FloatArray,
+        total: float,
+        points: FloatArray,
+        steps: tuple[int, ...],
     ) -> Verdict:
         found = self._found
         assert found is not None and self._cells is not None
@@ -134,6 +146,7 @@ class Judge:
             error=float(abs(force - found.force).sum()) / size,
             total=abs(total - float(found.force.sum())) / size,
             facets=int(differ.sum()),
+            transitions=0.0 if (active != found.active).any() else _apart(points, found),
             proper=0 < int(found.active.sum()) < len(found.active),
             degenerate=int(found.degenerate.sum()),
             steps=steps,
@@ -151,3 +164,17 @@ class Judge:
             return NOTHING * float(found.made_of.sum()) / EXACT
         rounding = 4 * EPSILON * float(found.made_of[found.active].sum())
         return max(float(found.force.sum()), rounding / EXACT)
+
+
+def _apart(points: FloatArray, found: Found) -> float:
+    """How far points are from the reference's transition points; ∞ if their numbers differ."""
+    expected, length = found.transitions
+    if len(points) != len(expected):
+        return np.inf
+    if not len(points):
+        return 0.0
+    distance = np.linalg.norm(points[:, None] - expected[None], axis=2)
+    nearest = distance.argmin(axis=0)
+    if len(np.unique(nearest)) < len(points):
+        return np.inf
+    return float((distance.min(axis=0) / length).max())

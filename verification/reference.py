@@ -105,6 +105,8 @@ class Found:
         change: What the last refinement changed of forces and of x, relative.
         kkt: Largest violation of the discrete conditions, each relative to what it is made of.
         made_of: What the forces are made of: |A||x| + |b| on the contact facets.
+        transitions: Points between a facet in contact and one that is not, shape (m, 2), and the
+            length of the latter, shape (m,).
     """
 
     facets: IntArray
@@ -114,6 +116,7 @@ class Found:
     change: float
     kkt: float
     made_of: FloatArray
+    transitions: tuple[FloatArray, FloatArray]
 
 
 class Discrete:
@@ -146,6 +149,8 @@ class Discrete:
         self.x = np.zeros((2, count), dtype=np.longdouble)  # its sum, to twice the digits
         self.x[0, cells.parts[DIRICHLET]] = self._means(cells, DIRICHLET, data.dirichlet, data)
         self.bound = self._means(cells, CONTACT, data.obstacle, data)
+        self.cell, self.local, self.ends = self._ends(cells, CONTACT)
+        self.bound_at_ends = long(data.obstacle(self.ends[..., 0], self.ends[..., 1]))
         local = self.stiffness[:, None, None] * np.einsum("nik,njk->nij", self.slopes, self.slopes)
         rows, columns = (np.repeat(self.facets, 3, axis=1), np.tile(self.facets, (1, 3)))
         entries = local.reshape(-1, 9).astype(np.float64).ravel()
@@ -239,6 +244,32 @@ class Discrete:
     def _diagonal(self) -> FloatArray:
         return self.matrix.diagonal()[self.contact]
 
+    def _transitions(self, active: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Where u_h − α changes its sign on the half of a free facet that is next to contact.
+
+        Else it is the vertex between the two. u_h is that of the free facet's cell.
+        """
+        at: dict[tuple[float, float], list[tuple[int, int]]] = {}
+        for facet, ends in enumerate(self.ends):
+            for k, point in enumerate(ends):
+                at.setdefault((float(point[0]), float(point[1])), []).append((facet, k))
+        points, lengths = [], []
+        for vertex, there in sorted(at.items()):
+            if len(there) != 2 or active[there[0][0]] == active[there[1][0]]:
+                continue
+            facet, k = there[int(active[there[0][0]])]
+            own = (
+                self.x[0, self.facets[self.cell[facet]]] + self.x[1, self.facets[self.cell[facet]]]
+            )
+            corner = (self.local[facet] + 1 + k) % 3
+            gap = own.sum() - 2 * own[corner] - self.bound_at_ends[facet, k]
+            middle = own[self.local[facet]] - self.bound[facet]
+            centre = self.ends[facet].mean(axis=0)
+            share = float(middle / (middle - gap)) if gap < 0 < middle else 1.0
+            points.append(centre + share * (np.array(vertex) - centre))
+            lengths.append(float(np.linalg.norm(self.ends[facet, 1] - self.ends[facet, 0])))
+        return np.array(points).reshape(-1, 2), np.array(lengths)
+
     def solve(self, start: bool = False) -> Found:
         """Solve by the primal-dual active set method.
 
@@ -275,4 +306,5 @@ class Discrete:
             change=change,
             kkt=float((abs(left) / made_of[free]).max(initial=0.0)),
             made_of=made_of[self.contact],
+            transitions=self._transitions(active),
         )

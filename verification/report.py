@@ -85,14 +85,18 @@ HEAD = """# Verification
 What the program claims, checked by code that shares nothing with the part under test: discrete
 solutions against a direct solver of its own matrices, bounds and energies against solutions in
 closed form integrated on triangles that are split where the data jump. `make verify` runs all of it
-and writes this page; `verification/` has the code, and says what is independent of what.
+and writes this page; `verification/` has the code, and says what is independent of what. The
+figures are those of RANKS, each row's figure that of its worst case;
+[the counts](promises.md#counts) tell what has been run on more.
 """
 
 
 def document(groups: Sequence[Group]) -> str:
     """The whole page."""
     body = [line for group in groups for line in group.lines()]
-    return HEAD + "\n" + "\n".join(body)
+    size = MPI.COMM_WORLD.size
+    ranks = "one rank" if size == 1 else f"{size} ranks"
+    return HEAD.replace("RANKS", ranks) + "\n" + "\n".join(body)
 
 
 def write(groups: Sequence[Group], path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from formulas import Formula, numeric, symbolic
-from judgement import EXACT, NOTHING, Judge, Verdict, finest
+from judgement import EXACT, NEAR, NOTHING, Judge, Verdict, finest
 from mpi4py import MPI
 from reference import Data
 from report import Group, Row, told
@@ -81,10 +81,12 @@ def tell(case: Case, way: str, verdict: Verdict) -> str:
         return words + "refused"
     return words + (
         f"forces wrong by {verdict.error:.0e}, their sum by {verdict.total:.0e}, "
-        f"{verdict.facets} facets in the wrong state"
+        f"{verdict.facets} facets in the wrong state, "
+        f"transition points off by {verdict.transitions:.0e} of a facet"
     )
 
 
+POINTS = f"points where contact begins or ends to {NEAR:.0e} of a facet"
 WAYS = {True: "nested", False: "cold"}
 
 
@@ -105,7 +107,7 @@ def row_of(
         least_proper: So many must have contact on a part of Γ1, not on all and not on none.
     """
     refused, proper, degenerate, number, steps = 0, 0, 0, 0, 0
-    error, failures = 0.0, []
+    error, apart, failures = 0.0, 0.0, []
     for case in cases:
         verdicts = case.run()
         proper += any(verdict.proper for verdict in verdicts)
@@ -115,6 +117,7 @@ def row_of(
             degenerate += verdict.degenerate
             if not (verdict.refused or verdict.fault):
                 error = max(error, verdict.error, verdict.total)
+                apart = max(apart, verdict.transitions)
             steps = max(steps, *verdict.steps, 0)
             complaint = more(case, verdict)
             if not verdict.right and not (verdict.refused and may_refuse(case)):
@@ -123,7 +126,8 @@ def row_of(
                 failures.append(f"{case.name}, {way}: {complaint}")
     if proper < least_proper:
         failures.append(f"contact on a proper part of Γ1 in {proper} problems only")
-    worst = f"error of the forces {error:.0e}; {refused} refused"
+    worst = f"error of the forces {error:.0e}, of transition points {apart:.0e} of a facet"
+    worst += f"; {refused} refused"
     worst += f"; at most {steps} CG steps"
     worst += f"; contact on a proper part of Γ1 in {proper} of {len(cases)} problems"
     if degenerate:
@@ -305,8 +309,9 @@ def offset(seed: int, quick: bool) -> Group:
         "Forces that rounding may hide",
         "A stiff block on Γ1, held by a soft part above, α = u − 0.3 + 0.1 cos 9x, u_D = u + x/5, "
         "f = −3; and κ = 1, α = u − f/10 + f/20 cos 9x, u_D = u. "
-        f"{levels} meshes, nested and cold. Passed: the same facets in contact and forces right "
-        f"to {EXACT:.0e} of their sum, however small that is, and where so noted, or refused.",
+        f"{levels} meshes, nested and cold. Passed: the same facets in contact, forces right to "
+        f"{EXACT:.0e} of their sum, however small that is, and {POINTS}; where so noted, or "
+        "refused.",
         rows,
     )
 
@@ -329,8 +334,8 @@ def stiff(seed: int, quick: bool) -> Group:
         "Contact forces where the coefficient jumps",
         f"f = −3, α = −0.3 + 0.1 cos 9x, u_D = x/5, κ = C on a part and 1 elsewhere, {levels} "
         "meshes, each case from nested and from cold starts. Passed: the force on every facet and "
-        f"their sum right to {EXACT:.0e} (relative, the sum of all facets' errors) and the same "
-        "facets in contact; for C above 1e8 that or refused.",
+        f"their sum right to {EXACT:.0e} (relative, the sum of all facets' errors), the same "
+        f"facets in contact, and {POINTS}; for C above 1e8 that or refused.",
         rows,
     )
 
@@ -458,8 +463,8 @@ def random(seed: int, quick: bool) -> Group:
         "Random problems",
         "Random polygons, f, g, α and u_D, κ in half planes, discs, strips and fields with a "
         f"contrast up to 1e10; {levels} meshes, each case from nested and from cold starts. "
-        f"Passed: the same facets in contact and forces right to {EXACT:.0e}, or refused. A facet "
-        "is on the fence, and may be in either state, where the rounding of data in double "
+        f"Passed: the same facets in contact, forces right to {EXACT:.0e}, and {POINTS}, or "
+        "refused. A facet is on the fence, and may be in either state, where the rounding of data in double "
         f"precision decides; forces below {NOTHING:.0e} of what they are made of are none.",
         rows,
     )
@@ -566,7 +571,6 @@ def thin(seed: int, quick: bool) -> Group:
         "Thin cells",
         "Polygons squashed, triangulated before, the hexagon after, too, 3 meshes, 4 of the "
         "hexagon, nested and cold; f = −3 and a load that brings contact whatever the thickness. "
-        "Passed: solved, the same facets in contact and forces right to "
-        f"{EXACT:.0e}.",
+        f"Passed: solved, the same facets in contact, forces right to {EXACT:.0e}, and {POINTS}.",
         rows,
     )
