@@ -464,8 +464,9 @@ def random(seed: int, quick: bool) -> Group:
         "Random polygons, f, g, α and u_D, κ in half planes, discs, strips and fields with a "
         f"contrast up to 1e10; {levels} meshes, each case from nested and from cold starts. "
         f"Passed: the same facets in contact, forces right to {EXACT:.0e}, and {POINTS}, or "
-        "refused. A facet is on the fence, and may be in either state, where the rounding of data in double "
-        f"precision decides; forces below {NOTHING:.0e} of what they are made of are none.",
+        "refused. A facet is on the fence, and may be in either state, where the rounding of data "
+        f"in double precision decides; forces below {NOTHING:.0e} of what they are made of are "
+        "none.",
         rows,
     )
 
