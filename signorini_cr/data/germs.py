@@ -359,10 +359,12 @@ def first_inside(
         room = NARROW * (size + np.linalg.norm(point))
         near = np.linalg.norm(x - point[:, None], axis=0) <= room
         corner = np.linalg.norm(corners - point[:, None], axis=1).min(axis=0) <= room
-        within = near & ~corner & (hats.min(axis=0) >= 0.0)
+        # on a side of it, whichever way that was rounded
+        within = near & ~corner & (hats.min(axis=0) >= -NARROW)
         which = np.flatnonzero(within)
         if len(which):
-            return point, which, hats[:, which]
+            inside = np.maximum(hats[:, which], 0.0)
+            return point, which, inside / inside.sum(axis=0)
     return None
 
 

@@ -121,3 +121,21 @@ def test_slivers_at_a_singular_point_are_not_cut_into_slabs():
     )
     assert np.isfinite(found).all()
     assert len(pieces.part) < 20
+
+
+@pytest.mark.parametrize("off", [0.0, 3e-17, -3e-17, 4e-14, -4e-14])
+def test_a_singular_point_on_a_side(off):
+    """Whichever way that was rounded, the triangle is cut there, and what is left has bounds."""
+    x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
+    expression = lowered(ufl.sqrt(x[0] ** 2 + x[1] ** 2) ** -0.5)
+    corners = np.array([[-3e-12, off], [0.5, off], [0.2, 0.4]])[:, :, None]
+    point, which, hats = first_inside(expression, corners)
+    assert (point == 0.0).all() and which == [0]
+    assert hats.min() >= 0.0 and np.isclose(hats.sum(), 1.0)
+    deviation = Deviation(expression)
+    pieces = Pieces(np.zeros(1, dtype=int), corners, np.eye(3)[:, :, None], np.ones(1))
+    cut = deviation.apart(pieces)
+    assert first_inside(expression, cut.corners) is None
+    assert np.isclose(cut.part.sum(), 1.0, rtol=1e-12)
+    rule = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])
+    assert np.isfinite(allowance(expression, cut.corners, rule)[0]).any()
