@@ -49,6 +49,9 @@ MOST_SHOWN = 100
 TOLERANCE = 1e-9
 """What is no difference, in parts of u_D's size: formulas are written with so many digits."""
 
+SKEW = 1e-12
+"""The same for a tensor's entries, of which both are told: what is no rounding has no bound."""
+
 COORDINATES = 1e-12
 """Digits of a vertex that a mesh generator gets right, in parts of the domain's diameter."""
 
@@ -579,7 +582,7 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
     values[~usable] = np.eye(values.shape[1])
     size = np.abs(values).max(axis=(1, 2), initial=0.0)
     skew = np.abs(values - values.transpose(0, 2, 1))
-    allowed = TOLERANCE * size[:, None, None] + SAFETY * (errors + errors.transpose(0, 2, 1))
+    allowed = SKEW * size[:, None, None] + SAFETY * (errors + errors.transpose(0, 2, 1))
     crooked = np.asarray((skew > allowed).any(axis=(1, 2)))
     least = np.linalg.eigvalsh(0.5 * (values + values.transpose(0, 2, 1)))[:, 0]
     wrong = np.flatnonzero(crooked | ~(least > 0))
@@ -615,7 +618,7 @@ def check_symmetry(kappa: Tensor, domain: Domain) -> None:
     size = np.abs(values).max(axis=(2, 3), initial=0.0)
     skew = np.abs(values - values.transpose(0, 1, 3, 2)).max(axis=(2, 3), initial=0.0)
     found = []
-    for cell, point in np.argwhere(skew > TOLERANCE * size)[:MOST_SHOWN]:
+    for cell, point in np.argwhere(skew > SKEW * size)[:MOST_SHOWN]:
         corners = mesh.geometry.x[cell_nodes(mesh)[cell]]
         where = place(kappa.rule.hats[:, point] @ corners, mesh)
         said = f"is {_rows(values[cell, point])}, which is not symmetric; {WANTED}"

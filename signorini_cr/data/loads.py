@@ -12,9 +12,11 @@ from mpi4py import MPI
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
 from ..fem.space import facet_quadrature
+from .cutting import Cut, cut, refine
 from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
-from .ranges import Cut, Pieces, cut, errors_on, refine
+from .pieces import Pieces
+from .ranges import errors_on
 
 NOTHING = np.array(0.0)
 """A reaction that is none."""

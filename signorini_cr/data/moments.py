@@ -31,8 +31,10 @@ from ..fem.problem import Forms, number
 from ..fem.simplified import simplified
 from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
-from .jets import Boxes, Enclosure, values
-from .ranges import Cut, Deviation, Pieces, Range, cut, errors_on, range_of
+from .cutting import Cut, cut
+from .jets import Boxes, Enclosure, Range, values
+from .pieces import Pieces
+from .ranges import Deviation, errors_on, range_of
 
 NO_RANGE = "the coefficient has no computable upper and lower bound"
 

@@ -15,9 +15,10 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
+from ..data.cutting import refine
 from ..data.jets import Enclosure, Jet, Unknown
 from ..data.moments import OnParts, Trace
-from ..data.ranges import Pieces, refine
+from ..data.pieces import Pieces
 from ..fem.cells import BoundaryFacets, Cells, corner_points
 
 ROUGH = "{} jumps on a boundary facet, or its derivative is not known to be bounded there"

@@ -18,7 +18,7 @@ from ..data.admissible import place, shown
 from ..data.diffusion import diffusion
 from ..data.jets import Enclosure
 from ..data.moments import OnFacets, OnParts, Trace
-from ..data.ranges import Pieces
+from ..data.pieces import Pieces
 from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
 from ..fem.conditions import Condition, Data, facets_of

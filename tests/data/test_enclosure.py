@@ -13,7 +13,8 @@ from signorini_cr.app import expressions
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.balls import indices
 from signorini_cr.data.jets import Boxes, Enclosure, lowered, values
-from signorini_cr.data.ranges import Deviation, Pieces, means
+from signorini_cr.data.pieces import Pieces
+from signorini_cr.data.ranges import Deviation, means
 from signorini_cr.fem.cells import Cells
 from signorini_cr.mesh.families import structured
 

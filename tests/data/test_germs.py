@@ -6,9 +6,11 @@ import ufl
 from mpi4py import MPI
 
 from signorini_cr import exact
+from signorini_cr.data.cutting import refine
 from signorini_cr.data.germs import allowance, first_inside
 from signorini_cr.data.jets import Enclosure, lowered
-from signorini_cr.data.ranges import Deviation, Pieces, errors_on, refine
+from signorini_cr.data.pieces import Pieces
+from signorini_cr.data.ranges import Deviation, errors_on
 from signorini_cr.fem.cells import Cells
 from signorini_cr.fem.space import function_space
 from signorini_cr.mesh.domain import Polygon

@@ -218,7 +218,9 @@ def test_functions_may_not_jump_either(element, function, fits: bool):
     ("rows", "words"),
     [
         ([[1, 0.5], [0.5, 1]], None),
+        ([[1, 0.5], [0.5 + 1e-16, 1]], None),
         ([[1, 0.5], [0.4, 1]], "[[1, 0.5], [0.4, 1]], which is not symmetric"),
+        ([[1, 0.5], [0.5 + 1e-9, 1]], "[[1, 0.5], [0.500000001, 1]], which is not symmetric"),
         ([[1, 2], [2, 1]], "[[1, 2], [2, 1]], with the eigenvalue -1"),
         ([[1, 0], [0, 0]], "[[1, 0], [0, 0]], with the eigenvalue 0"),
     ],
