@@ -88,8 +88,8 @@ class Row:
 
 
 def levels_wanted(default: int) -> int:
-    """The number of meshes, limited by SIGNORINI_DEMO_LEVELS."""
-    return min(default, int(os.environ.get("SIGNORINI_DEMO_LEVELS", default)))
+    """The number of meshes, limited by SIGNORINI_DEMO_LEVELS; three for a rate at least."""
+    return min(default, max(3, int(os.environ.get("SIGNORINI_DEMO_LEVELS", default))))
 
 
 def solutions(
