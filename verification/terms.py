@@ -148,7 +148,7 @@ class Case:
         """κ for UFL."""
         return self.kappa
 
-    def mass(self, x: Any) -> Any:
+    def mass(self, x: Any, y: Any, sin: Any = np.sin) -> Any:
         """C."""
         return self.c
 
@@ -205,14 +205,21 @@ class Case:
             conditions={name: on(i) for i, name in enumerate(SIDES)},
         )
 
+    def mass_of_square(self) -> float:
+        """∫ c u²."""
+        t, weights = _gauss(np.linspace(0.0, 1.0, 9))
+        x, y = np.meshgrid(t, t)
+        return float(weights @ (self.mass(x, y) * self.u(x, y) ** 2) @ weights)
+
     def energy(self) -> float:
         """J(u), by Gauss's rules on the square and on the edges between the zeros of s."""
         t, weights = _gauss(np.linspace(0.0, 1.0, 9))
         x, y = np.meshgrid(t, t)
         a, b = self.slope(x, y)
         u = self.u(x, y)
-        inside = 0.5 * self.squares(a, b, x, y) + 0.5 * self.mass(x) * u**2 - self.f(x, y) * u
-        total = float(weights @ inside @ weights)
+        rest = self.f(x, y) - self.mass(x, y) * u  # smooth
+        total = float(weights @ (0.5 * self.squares(a, b, x, y) - rest * u) @ weights)
+        total -= 0.5 * self.mass_of_square()
         for i, side in enumerate(self.sides):
             if side.kind == "dirichlet":
                 continue
@@ -328,14 +335,14 @@ class Layered(Case):
         here = self._here(x, *self.kappas)
         return here, 0.0, here
 
-    def mass(self, x: Any) -> Any:
+    def mass(self, x: Any, y: Any, sin: Any = np.sin) -> Any:
         """C."""
         return self._here(x, *self.masses)
 
     def f(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
         """−∇·(κ∇u) + c u."""
         rows = zip(self.amplitudes, self.waves, self.phases, strict=True)
-        along, c = self._place(x), self.mass(x)
+        along, c = self._place(x), self.mass(x, y)
         across, up = self._here(x, *(self.kappa**2 / k for k in self.kappas)), self.tensor(x, y)[2]
         return sum(
             (float(p * p) * across + float(q * q) * up + c)
@@ -349,6 +356,55 @@ class Layered(Case):
         (west, east), (first, second) = self.kappas, self.masses
         materials = {"east": Material(coefficient=east, reaction=second)}
         return replace(super().problem(), coefficient=west, reaction=first, materials=materials)
+
+
+class Uneven(Case):
+    """The same with a c that varies within cells: a wave that may go down to 0, perhaps cut off.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        super().__init__(rng)
+        self.c = float(rng.choice(SIZES[1:]))
+        self.wave, self.phase = rng.uniform(-6, 6, 2), float(rng.uniform(0, 6))
+        self.swing = float(rng.uniform(0.1, 1.0))
+        self.right = self.c * float(rng.choice([1.0, 1.0, 0.0, 1e-2]))
+
+    def mass(self, x: Any, y: Any, sin: Any = np.sin) -> Any:
+        """C: waves everywhere, or a number and waves to the right of a slant line."""
+        p, q = map(float, self.wave)
+        waves = self.c * (1.0 + self.swing * sin(p * x + q * y + self.phase))
+        if self.right == self.c:
+            return waves
+        if isinstance(x, np.ndarray):
+            return np.where(x + 0.3 * y < CUT, waves, self.right)
+        return ufl.conditional(ufl.lt(x + 0.3 * y, CUT), waves, self.right)
+
+    def f(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """−κΔu + c u."""
+        more = self.mass(x, y, sin) - self.c
+        return super().f(x, y, sin) + more * self.u(x, y, sin)
+
+    def mass_of_square(self) -> float:
+        """∫ c u², on either side of the line."""
+        t, weights = _gauss(np.linspace(0.0, 1.0, 9))
+        found = 0.0
+        for y, weight in zip(t, weights, strict=True):
+            middle = CUT - 0.3 * y
+            for start, width in ((0.0, middle), (middle, 1.0 - middle)):
+                x = start + width * t
+                found += weight * width * float(weights @ (self.mass(x, y) * self.u(x, y) ** 2))
+        return found
+
+    def problem(self) -> Problem:
+        """All data, none derived from u."""
+        return replace(super().problem(), reaction=lambda x: self.mass(x[0], x[1], ufl.sin))
+
+
+CUT = 0.55
+"""Where the line that cuts c off meets y = 0."""
 
 
 class Alone(Case):
@@ -423,7 +479,7 @@ def distances(solution: Solution, case: Case) -> tuple[float, float]:
     a, b = (exact - own for exact, own in zip(case.slope(*here), slope.T[..., None], strict=True))
     off = (case.u(*here) - values @ hats) ** 2
     h1 = float(area @ ((a**2 + b**2) @ weights))
-    whole = float(area @ ((case.squares(a, b, *here) + case.mass(here[0]) * off) @ weights))
+    whole = float(area @ ((case.squares(a, b, *here) + case.mass(*here) * off) @ weights))
     t, w = 0.5 * (x + 1.0), 0.5 * w
     for i, side in enumerate(case.sides):
         if side.b == 0.0:
@@ -551,6 +607,7 @@ SETTLED = "Forces and fluxes of parts, c and b up to 1e8, contact everywhere or 
 WEIGHTED = "The same with weights of either sign, also where contact and Dirichlet parts meet"
 MEANS = "Means of parts and of the domain"
 INTEGRALS = "Integrals and means with weights, of parts, materials and the domain"
+UNEVEN = "the same with c that varies within cells: waves, down to 0 or cut off along a slant line"
 LAYERS = "the same with κ, up to 1 : 10⁴, and c, up to 1e8 or 0, of their own left and right"
 
 
@@ -749,6 +806,7 @@ def terms(seed: int, quick: bool) -> Group:
             told(_drawn(seed, 4 if quick else 500, Case, DRAWN)),
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
             told(_drawn(seed, 2 if quick else 150, Layered, LAYERS)),
+            told(_drawn(seed, 2 if quick else 150, Uneven, UNEVEN)),
             told(_drawn(seed, 2 if quick else 60, Alone, ALONE)),
             told(_drawn(seed, 2 if quick else 60, OneHolds, ONE_HOLDS)),
             *(

@@ -23,7 +23,8 @@ from ..fem.space import facet_corners, facet_entities, function_space, vertex_va
 from ..mesh.domain import Domain
 from .admissible import check_symmetry
 from .loads import NeumannMoments, VolumeMoments, chi
-from .moments import Compiled, OnFacets, Tensor, Trace
+from .moments import Compiled, OnFacets, Tensor, Trace, Volume
+from .ranges import range_of
 
 FINE = (12, 16)
 """Degrees of rules that tell a net force from none."""
@@ -79,6 +80,12 @@ class Moments:
     def load(self) -> VolumeMoments:
         """Moments of f and what it has beside."""
         return self.with_source(self.of_f)
+
+    @cached_property
+    def reaction(self) -> tuple[FloatArray, FloatArray]:
+        """Bounds of a reaction c that varies within cells, shape (cells,); infinite for none."""
+        n, found = self.cells.number, range_of(self.compiled.forms.reaction, self.cells)
+        return (np.full(n, -np.inf), np.full(n, np.inf)) if found is None else found
 
     def with_source(self, load: VolumeMoments) -> VolumeMoments:
         """Moments of f, as given, and what it has beside."""
@@ -216,9 +223,19 @@ class DiffusionOnMesh:
         return self.moments.edges
 
     @property
-    def reaction(self) -> FloatArray:
-        """The reaction c on owned cells, shape (cells,), or () where it is a number."""
-        return _by_cells(self.compiled, self.domain, self.forms.reaction)
+    def reaction(self) -> tuple[FloatArray, FloatArray]:
+        """Bounds of the reaction c on owned cells, shape (cells,), or () where it is a number."""
+        if not is_by_cells(self.forms.reaction):
+            return self.moments.reaction
+        c = _by_cells(self.compiled, self.domain, self.forms.reaction)
+        return c, c
+
+    def reacting(self, w: FloatArray) -> tuple[Volume, Volume]:
+        """Return f − c u_h and c u_h², from u_h at the cells' vertices, shape (d + 1, cells)."""
+        stand_in, *found = self.compiled.with_reaction
+        u = self.domain.instead(stand_in)
+        u.x.array[u.function_space.dofmap.list[: w.shape[1]]] = w.T
+        return found[0], found[1]
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:

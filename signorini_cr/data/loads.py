@@ -161,6 +161,7 @@ class Certain:
         low: FloatArray,
         size: float,
         reaction: FloatArray = NOTHING,
+        norms: bool = True,
     ) -> Certain:
         """Enclose f; collective.
 
@@ -171,6 +172,7 @@ class Certain:
             low: Lower bound of κ, shape (cells,) or ().
             size: Of the bound, to which what is missed should be small.
             reaction: c, shape (cells,) or ().
+            norms: Whether ‖f − q‖ is to be small, too, and not the integrals alone.
         """
         if f.number is not None:
             return cls(load)
@@ -191,7 +193,7 @@ class Certain:
         by_slope = norm = mean_to_norm(cells, low, NOTHING)
         if reacts(reaction):
             norm = mean_to_norm(cells, low, reaction)
-        np.multiply((2.0 / goal) ** 2 * cells.volume, by_slope * norm, out=weights[1])
+        np.multiply((2.0 / goal) ** 2 * cells.volume * norms, by_slope * norm, out=weights[1])
         try:
             found = cut(
                 cells,

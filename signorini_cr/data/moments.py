@@ -598,6 +598,13 @@ class Compiled:
         kappa = self.forms.kappa
         return (Tensor if ufl.shape(kappa) else Volume)(kappa, self.forms.mesh, self._rule)
 
+    @cached_property
+    def with_reaction(self) -> tuple[fem.Function, Volume, Volume]:
+        """A function w that is affine on each cell, f − c w, and c w²; collective."""
+        mesh, c = self.forms.mesh, self.forms.reaction
+        w = fem.Function(fem.functionspace(mesh, ("DG", 1)))
+        return w, *(Volume(each, mesh, self._rule) for each in (self.forms.f - c * w, c * w**2))
+
     def by_cells(self, expression: Expr) -> fem.Expression:
         """What is constant on each cell, at one point there; collective."""
         if expression not in self._by_cells:

@@ -204,6 +204,7 @@ ADRIFT = (
     "part of the domain has no way to a place where u is held: there is no Γ0, no heat loss and no"
     " reaction, and no contact whose force is larger than what is left of the equation"
 )
+UNKNOWN_REACTION = "the reaction is not known to be bounded, and 0 or more, on each cell"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
@@ -244,7 +245,9 @@ class _Known:
         level: The mesh, with those below it.
         cells: What the certificate needs to know of it.
         kappa: The coefficient.
-        reaction: c, shape (cells,) or ().
+        reaction: c, or a lower bound of it, shape (cells,) or ().
+        most: The same object, or an upper bound where c varies within cells.
+        square: Then means of c u_h², and what these miss; else None.
         certain: f − c u_h.
         segments: g − b u_h.
         flux: y.
@@ -258,6 +261,8 @@ class _Known:
     cells: Cells
     kappa: Coefficient
     reaction: FloatArray
+    most: FloatArray
+    square: Certain | None
     certain: Certain
     segments: Segments
     flux: Flux
@@ -279,24 +284,38 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     data = diffusion(level.data)
     _insist(data.forms.uncertified)
     cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
-    kappa, reaction = Coefficient(data.compiled.kappa, cells), data.reaction
+    kappa, (reaction, most) = Coefficient(data.compiled.kappa, cells), data.reaction
     _insist(kappa.reason)
+    varies = most is not reaction
+    if varies:
+        bounded = bool((reaction >= 0.0).all() and np.isfinite(most).all())
+        _insist(None if cells.comm.allreduce(bounded, op=MPI.LAND) else UNKNOWN_REACTION)
     w = vertex_rows(u, cells)
-    load, edge = data.load, Known.of(data.edges, cells, w)
-    of_u = load.less(reaction, w) if reacts(reaction) else load
+    edge = Known.of(data.edges, cells, w)
+    load, f, square = data.load, data.compiled.f, None
+    if varies:
+        f, c_u2 = data.reacting(w)
+        load = data.moments.with_source(VolumeMoments.of(f, cells))
+    of_u = load if varies or not reacts(reaction) else load.less(reaction, w)
     contact, signs = alpha.side, alpha.signs
     gap = signs * u[contact.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, of_u, edge, contact, signs, gap)
     flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, contact, signs)
     size = _size(cells, kappa, w, flux)
-    certain = Certain.of(data.compiled.f, data.of_f, cells, kappa.low, size, reaction)
+    of_f = VolumeMoments.of(f, cells) if varies else data.of_f
+    certain = Certain.of(f, of_f, cells, kappa.low, size, reaction)
     _insist(certain.reason)
+    if varies:
+        goal = size**2 / np.sqrt(kappa.smallest)  # as it is a part of J
+        of_c = VolumeMoments.of(c_u2, cells)
+        square = Certain.of(c_u2, of_c, cells, kappa.low, goal, reaction, norms=False)
+        _insist(square.reason)
     certain = replace(certain, load=data.moments.with_source(certain.load))
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
     # y is to have the means that f and g have now
     flux.left += cells.volume * (certain.load.mean - load.mean)
-    if reacts(reaction):
+    if reacts(reaction) and not varies:
         certain = replace(certain, load=certain.load.less(reaction, w))
     change = segments.through - edge.shares.sum(axis=0)
     flux.excess[edge.side.local, edge.side.cells] += change
@@ -321,7 +340,8 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
             left = np.inf
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
-    return _Known(level, cells, kappa, reaction, certain, segments, flux, w, size, left, carried)
+    c = reaction, most, square
+    return _Known(level, cells, kappa, *c, certain, segments, flux, w, size, left, carried)
 
 
 def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
@@ -340,7 +360,7 @@ def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, 
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal, highest)
-    sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction)
+    sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction, known.most)
     if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
             v = cubed(cells, kappa.mean, flux, v)
@@ -382,11 +402,17 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
     of_edge = segments.measure @ (segments.weights @ (segments.values * on_edge))
     totals.energy -= float(of_edge)
+    if known.square is not None:
+        totals.energy -= 0.5 * float(cells.volume @ known.square.load.mean)
+        own = cells.volume * np.abs(known.square.load.mean) * 1e-14
+        if known.square.missed is not None:
+            own += known.square.missed
+        totals.energy_slack += 0.5 * float(np.sum(own))
     totals.contact = float(np.sum(v.contact))
     totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
     totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
     hidden, hidden_energy = _hidden(known, v, sums)
-    rounding = _rounding(cells, kappa, known.reaction, known.w, load, known.flux)
+    rounding = _rounding(cells, kappa, known.most, known.w, load, known.flux)
     total = totals.over_ranks(cells)
 
     ball = _Ball.of(total, known.left, hidden, rounding)
@@ -490,7 +516,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,
-        varies=known.kappa.varies,
+        varies=known.kappa.varies or known.most is not known.reaction,
         excess=flux.excess,
         beyond=flux.beyond,
         vertices=v.vertices,
@@ -647,7 +673,7 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
     change = before * steep + np.sqrt(cells.volume[which]) * _mean_square(known, which) * area
     if sums.apart is not None:
-        c = pick(known.reaction, which)
+        c = pick(known.most, which)
         steep = np.hypot(steep, np.sqrt(c) * area)
         change += np.sqrt(c * sums.apart[which]) * area
     # on facets of Γ1 with a flux that is known

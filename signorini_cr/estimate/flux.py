@@ -334,7 +334,7 @@ def unbalanced(
         bound += poincare(cells.tdim) * np.sqrt(cells.comm.allreduce(part))
     if len(meshes) > 1:
         coarsest = diffusion(meshes[0].data)
-        cells, reaction = coarsest.cells, coarsest.reaction  # kept, with the walk on them
+        cells, reaction = coarsest.cells, coarsest.reaction[0]  # kept, with the walk on them
     plain = cells.unstretched()
     return min(taken_up, float(bound + _carried(plain, left, kappa_min, size, reaction)))
 

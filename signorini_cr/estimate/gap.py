@@ -36,6 +36,7 @@ def integrate(
     flux: Flux,
     v: Companion,
     reaction: FloatArray = NOTHING,
+    most: FloatArray = NOTHING,
 ) -> Sums:
     """Sum up the parts of the gap.
 
@@ -46,10 +47,11 @@ def integrate(
         load: Moments of f − c u_h.
         flux: y.
         v: v.
-        reaction: c, shape (cells,) or ().
+        reaction: c, or a lower bound of it, shape (cells,) or ().
+        most: The same object, or an upper bound: then ½∫ c u_h² is left to the caller.
     """
     sums = Sums.empty(cells.number, reacts(reaction))
-    gap = _Gap(cells, kappa, w, load, flux, v, reaction, sums)
+    gap = _Gap(cells, kappa, w, load, flux, v, reaction, most, sums)
     for part in blocks(cells.number):
         gap.add(part)
     return sums
@@ -89,7 +91,8 @@ class _Gap:
         load: Moments of f − c u_h.
         flux: y.
         v: v.
-        reaction: c, shape (cells,) or ().
+        reaction: c, or a lower bound of it, shape (cells,) or ().
+        most: The same object, or an upper bound.
         sums: What is added to.
     """
 
@@ -100,6 +103,7 @@ class _Gap:
     flux: Flux
     v: Companion
     reaction: FloatArray
+    most: FloatArray
     sums: Sums
 
     def add(self, part: slice) -> None:
@@ -230,12 +234,16 @@ class _Gap:
             return
         d = self.cells.tdim
         mass = pick(self.reaction, part) * self.cells.volume[part]
-        apart = mass * distance(c, height)
-        size = sum_rows(W) ** 2 + dot_rows(W, W)
-        own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
+        apart = pick(self.most, part) * self.cells.volume[part] * distance(c, height)
         totals.energy += 0.5 * float(np.sum(apart))
-        totals.energy -= own
-        totals.energy_slack += EPS * own
+        if self.most is self.reaction:
+            size = sum_rows(W) ** 2 + dot_rows(W, W)
+            own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
+            totals.energy -= own
+            totals.energy_slack += EPS * own
+        else:
+            less = pick(self.most - self.reaction, part) * self.cells.volume[part]
+            totals.energy_slack += 0.5 * float(np.sum(less * distance(c, height)))
         totals.companion += float(np.sum(apart))
         sums.apart[part] = apart
         sums.zeroth[part] += apart

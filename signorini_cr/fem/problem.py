@@ -357,8 +357,6 @@ class Forms:
         """Why there is no certificate, if the form, the reaction or some condition has none."""
         if self.problem.form is not None:
             return "the form is the user's own: the flux that goes with it is not known"
-        if not is_by_cells(self.reaction):
-            return "the reaction varies within cells: its part of the energy has no enclosure"
         for condition in self.conditions:
             if condition.uncertified:
                 return condition.uncertified

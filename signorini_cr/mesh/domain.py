@@ -146,6 +146,8 @@ class Domain:
             InputError: It is of another degree, or on another mesh.
         """
         V = function.function_space
+        if function in self._own:
+            return self._own[function]
         if V.mesh is self.mesh:
             return function
         above = [i for i, step in enumerate(self.descent) if step.mesh() is V.mesh]
@@ -154,13 +156,19 @@ class Domain:
                 "data given as a dolfinx Function live on one mesh only, unless they are of degree"
                 " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
             )
+        values = function.x.array[V.dofmap.list[:, 0]]
+        for step in self.descent[above[0] :]:
+            values = step.carry(values)
+        fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
+        fine.x.array[fine.function_space.dofmap.list[: len(values), 0]] = values
+        self._own[function] = fine
+        return fine
+
+    def instead(self, function: fem.Function) -> fem.Function:
+        """A function of this mesh that stands here for one of the same kind on any other."""
         if function not in self._own:
-            values = function.x.array[V.dofmap.list[:, 0]]
-            for step in self.descent[above[0] :]:
-                values = step.carry(values)
-            fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
-            fine.x.array[fine.function_space.dofmap.list[: len(values), 0]] = values
-            self._own[function] = fine
+            kind = function.function_space.ufl_element()
+            self._own[function] = fem.Function(fem.functionspace(self.mesh, kind))
         return self._own[function]
 
     @classmethod
