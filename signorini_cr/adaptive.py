@@ -22,6 +22,10 @@ from .mesh.refinement import refine_marked
 from .restart import Restart
 from .solution import Solution
 
+ALIKE = 1e-6
+"""Part by which indicators may differ that count as one: the solver leaves 1e-9 to 1e-7 of them,
+and where a problem is symmetric, cells are twins but for that."""
+
 RESOLUTION = 1e-11
 """Least diameter of a cell to be refined, in parts of the largest coordinate."""
 
@@ -112,8 +116,8 @@ def _smallest(domain: Domain, marked: BoolArray) -> float:
 def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> BoolArray:
     """Dörfler's marking: the largest indicators that make up a fraction of their sum; collective.
 
-    The ranks agree on the value that separates them by bisection; cells that share this value to
-    rounding are all marked.
+    The ranks agree on the value that separates them by bisection; cells that share this value as
+    far as the solver knows it are all marked, so that meshes don't depend on what it leaves.
 
     Args:
         indicators: Not negative, this rank's cells, shape (cells,).
@@ -131,4 +135,4 @@ def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> BoolArray:
         middle = 0.5 * (low + high)
         held = comm.allreduce(above[np.searchsorted(ordered, middle)])
         low, high = (middle, high) if held >= fraction * total else (low, middle)
-    return indicators >= low if top > 0 else np.zeros(len(indicators), dtype=bool)
+    return indicators >= (1.0 - ALIKE) * low if top > 0 else np.zeros(len(indicators), dtype=bool)

@@ -99,11 +99,15 @@ COMPANION: dict[str, object] = {
 }
 """The best companion, where it is solved for."""
 
-WEIGHT: dict[str, object] = {"ksp_type": PETSc.KSP.Type.CG, "ksp_rtol": 1e-3, "pc_type": AMG}
-"""The harmonic weight of the contact force's bounds."""
-
-MEAN: dict[str, object] = {**WEIGHT, "ksp_rtol": 1e-8}
-"""The linear problem that bounds a mean."""
+LINEAR: dict[str, object] = {
+    "ksp_type": PETSc.KSP.Type.CG,
+    # in the residual's norm as much as a thousand times more may be left
+    "ksp_norm_type": "natural",
+    # what steps have left depends on the ranks, and an interval is no better known than that
+    "ksp_rtol": 1e-10,
+    "pc_type": AMG,
+}
+"""The linear problems of bounds of means and flows: dual ones, and weights that are harmonic."""
 
 LARGE_FACTORS: dict[str, object] = {
     "pc_factor_mat_solver_type": "mumps",

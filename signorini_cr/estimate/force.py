@@ -20,7 +20,7 @@ from ..fem.conditions import Condition, Data, facets_of
 from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
 from ..jit import compiled
-from ..options import ESTIMATE_PREFIX, WEIGHT, solve_once
+from ..options import ESTIMATE_PREFIX, LINEAR, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
 from .gap import apart
@@ -255,7 +255,7 @@ def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Functio
     b.x.scatter_reverse(InsertMode.add)
     b.x.array[known] = values.x.array[known]
     load, found = (ghosted_vector(V, function.x.array) for function in (b, phi))
-    solve_once(A, load, found, WEIGHT, ESTIMATE_PREFIX)
+    solve_once(A, load, found, LINEAR, ESTIMATE_PREFIX)
     release(A, load, found)
     # Exactly so, whatever the solver did
     phi.x.array[known] = values.x.array[known]
