@@ -362,7 +362,7 @@ def test_the_residual_against_affine_functions(reaction, lossy):
     assert np.isclose(found, work, rtol=1e-5)
     assert np.allclose(left, slack)
     assert np.isclose(force.square(made, cells, phi), size)
-    made.missed = 0.25
+    made.missed = np.array([0.125, 0.125])
     beyond = weights.Beyond(force=0.0, left=0.125, mean=0.5)
     assert np.isclose(force.unsure(made, phi, left), slack.sum() + 0.25 * np.abs(phi).max())
     expected = slack.sum() + 0.125 + 0.25 * (np.abs(phi).max() + 0.5)
