@@ -36,7 +36,7 @@ def integrate(
     flux: Flux,
     v: Companion,
     reaction: FloatArray = NOTHING,
-    most: FloatArray = NOTHING,
+    most: FloatArray | None = None,
 ) -> Sums:
     """Sum up the parts of the gap.
 
@@ -48,9 +48,10 @@ def integrate(
         flux: y.
         v: v.
         reaction: c, or a lower bound of it, shape (cells,) or ().
-        most: The same object, or an upper bound: then ½∫ c u_h² is left to the caller.
+        most: An upper bound of c, if that is another one: then ½∫ c u_h² is left to the caller.
     """
     sums = Sums.empty(cells.number, reacts(reaction))
+    most = reaction if most is None else most
     gap = _Gap(cells, kappa, w, load, flux, v, reaction, most, sums)
     for part in blocks(cells.number):
         gap.add(part)
