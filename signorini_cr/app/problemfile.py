@@ -27,6 +27,7 @@ from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
 from ..levels import check_pieces, solve_levels
+from ..means import DOMAIN
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
@@ -53,7 +54,6 @@ from .readers import (
 )
 from .reference import (
     ADAPTIVE,
-    DOMAIN,
     EXPRESSIONS,
     KINDS,
     MATERIAL,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from ..adaptive import solve_adaptive
 from ..fem.conditions import Condition, Contact, Dirichlet, Neumann, Robin
+from ..means import DOMAIN
 from .formula import CONSTANTS, FUNCTIONS, VARIABLES
 from .readers import MOST_CHARACTERS, not_negative, part, whole
 
@@ -81,8 +82,6 @@ QUANTITIES_EXAMPLE = [
     'stored = { integral = "domain", weight = "where(y < 0.5, 2, 1)" }',
 ]
 """What they look like."""
-DOMAIN = "domain"
-"""All of the domain, where a quantity is of that."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
