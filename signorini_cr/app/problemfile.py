@@ -427,7 +427,7 @@ def _domain(
     # From the longest edge on, facets grow inside only; none is longer than the diameter
     if size > polygon.diameter * (1 + 1e-9):
         raise InputError(
-            f"domain.size: {size:g} is longer than the domain, whose largest extent is"
+            f"domain.size: {size:g} is longer than the domain, whose diameter is"
             f" {polygon.diameter:.6g}; the length of a facet is needed, no more than that"
         )
     return polygon, size

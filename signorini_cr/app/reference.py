@@ -93,8 +93,9 @@ KEYS = (
         "What each edge is; edge i runs from vertex i to the next. One of them is to be contact, "
         "one dirichlet; with sections [boundary.NAME], one is to be of the type contact.",
         'boundary = ["contact", "dirichlet", "neumann", "dirichlet"]'),
-    Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh, no "
-        "longer than the domain.", "size = 0.25"),
+    Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh; at "
+        "most the domain's diameter, the largest distance between two of its points.",
+        "size = 0.25"),
     Key("domain", "arcs", "a list of { edge, through }", "straight edges", "Edges that are "
         "circular arcs: the number of the edge, and a point [x, y] between its ends that the arc "
         "passes through. With an arc two vertices are enough. It is cut into equal straight "
