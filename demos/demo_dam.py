@@ -20,6 +20,8 @@
 #     mpirun -n 2 python3 demos/demo_dam.py [FOLDER]
 
 # %%
+from pathlib import Path
+
 import numpy as np
 from study import ENDS, Study, canvas, comm, levels_wanted
 
@@ -39,6 +41,7 @@ from signorini_cr import (
     solve,
     solve_levels,
 )
+from signorini_cr.app.problemfile import load
 from signorini_cr.output.units import Units
 
 study = Study("demo_dam", "A dam whose wet part nobody knows")
@@ -222,6 +225,8 @@ study.table(
     },
 )
 assert off[-1] < SMALL
+case = load(Path(__file__).parent.parent / "meshes" / "dam.toml")  # has the last one
+assert np.abs(case.domain.vertices[3:] - np.stack([x, y], axis=1)[::-1]).max() < 2 * SMALL
 
 # %% [markdown]
 # ## The discharge, certified on the last domain

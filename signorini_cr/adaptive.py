@@ -14,7 +14,7 @@ from mpi4py import MPI
 from .arrays import BoolArray, FloatArray
 from .errors import InputError, NotConverged
 from .fem.problem import Problem
-from .levels import LevelMonitor, solve_sequence
+from .levels import LevelMonitor, check_arguments, solve_sequence
 from .limits import Limits
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
@@ -67,6 +67,7 @@ def solve_adaptive(
         NotConverged: The solver stopped short on one of the meshes, or cells got too small, or the
             next level would not fit into the memory there is, or into ``max_time``.
     """
+    check_arguments(problem, domain)
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None and levels < 1:

@@ -45,6 +45,19 @@ def naming(thing: object, rule: str = "") -> Iterator[None]:
         raise InputError(f"{thing}: {error}" + (rule and f"; {rule}")) from None
 
 
+def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], needed: str) -> None:
+    """Refuse an argument of another kind: two may have changed places.
+
+    Args:
+        name: What the argument is called.
+        value: What was given for it.
+        kinds: What it may be.
+        needed: The same in words.
+    """
+    if not isinstance(value, kinds):
+        raise InputError(f"{name} is of the type {type(value).__name__}: {needed} is needed")
+
+
 def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:
     """Call `function(*args)` on rank 0 alone and give all ranks its result.
 

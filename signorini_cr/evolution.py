@@ -30,7 +30,7 @@ from .diffusion import Diffusion
 from .errors import InputError
 from .fem.conditions import Data, is_by_cells
 from .fem.problem import Problem, as_expression
-from .levels import Start, solve_level
+from .levels import Start, check_arguments, solve_level
 from .limits import Limits
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
@@ -74,6 +74,7 @@ class Solver:
         Raises:
             InputError: As for `solve_levels`.
         """
+        check_arguments(problem, domain)
         if levels < 1:
             raise InputError(f"levels is {levels}; it must be 1 or more")
         if levels > 1:
@@ -251,6 +252,7 @@ def solve_in_time(
         raise InputError(f"steps is {steps}; it must be 1 or more")
     if scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
+    check_arguments(problem, domain)
     own = _capacities(problem, capacity)
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")

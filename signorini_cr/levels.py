@@ -11,7 +11,7 @@ from dolfinx import fem
 
 from .data.admissible import NOT_DEFINITE
 from .diffusion import Diffusion
-from .errors import InputError, NotConverged
+from .errors import InputError, NotConverged, insist_on_kind
 from .fem.conditions import facets_of
 from .fem.physics import Physics
 from .fem.problem import Problem
@@ -57,6 +57,7 @@ def solve(
         NotConverged: The solver stopped short, with PETSc's name for the reason; or the contact
             forces, or the equations of a part, are lost in rounding.
     """
+    check_arguments(problem, domain)
     (solution,) = solve_sequence(problem, domain, lambda _: None, element, monitor)
     return solution
 
@@ -92,6 +93,7 @@ def solve_levels(
         NotConverged: The solver stopped short on one of the levels, or a level would not fit into
             the memory there is, or into ``max_time``.
     """
+    check_arguments(problem, domain)
     if levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
     if levels > 1:
@@ -181,6 +183,12 @@ def solve_physics(
             start, before = Start(solution, before), solution.u
         seconds = {"mesh": time.perf_counter() - began}
     hierarchy.free()
+
+
+def check_arguments(problem: object, domain: object) -> None:
+    """Insist on a problem and a domain, in this order."""
+    insist_on_kind("problem", problem, Problem, "a Problem")
+    insist_on_kind("domain", domain, Domain, "a Domain")
 
 
 def check_pieces(physics: Diffusion, domain: Domain) -> None:

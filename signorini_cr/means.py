@@ -23,6 +23,8 @@ from .fem.problem import Forms, Material, Problem
 from .fem.space import function_space, shared_sum
 from .mesh.domain import Domain
 
+DOMAIN = "domain"
+"""The place that all of Ω is, unless u has a mean on something else that is called so."""
 NO_MEAN = "u has no bounds there"
 NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral with u has bounds"
 AFLOAT = "nothing but contact holds a part of the domain, and no energy tells how high it is"
@@ -35,8 +37,8 @@ def mean(solution: Certified, where: str | None = None, weight: Data | None = No
 
     Args:
         solution: One with a certified bound.
-        where: Name of a part of the boundary on which u is not set, or else of a material; None for
-            all of the domain.
+        where: Name of a part of the boundary on which u is not set, or else of a material; None or
+            "domain" for all of the domain.
         weight: ψ, for the weighted mean ∫ ψ u / ∫ ψ; None for 1.
 
     Raises:
@@ -62,8 +64,8 @@ def integral(solution: Certified, where: str | None = None, weight: Data | None 
 
     Args:
         solution: One with a certified bound.
-        where: Name of a part of the boundary on which u is not set, or else of a material; None for
-            all of the domain.
+        where: Name of a part of the boundary on which u is not set, or else of a material; None or
+            "domain" for all of the domain.
         weight: ψ, of either sign; None for 1.
 
     Raises:
@@ -78,7 +80,7 @@ def _bounded(
     """What is known of ψ, and ∫ ψ u between two numbers; collective."""
     certificate, level = solution.certificate, solution.level
     forms = diffusion(level.data).forms
-    _insist_on_place(forms, level.domain, where)
+    where = _place(forms, level.domain, where)
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
@@ -109,16 +111,17 @@ def _bounded(
     )
 
 
-def _insist_on_place(forms: Forms, domain: Domain, where: str | None) -> None:
-    """Refuse what has no name here, and parts where u is a datum."""
-    loose = [c.part for c in forms.conditions if c.fixed is None]
-    if where is None or where in loose:
-        return
+def _place(forms: Forms, domain: Domain, where: str | None) -> str | None:
+    """A part or a material, None for all of the domain; refuse others, and where u is a datum."""
+    own = [c.part for c in forms.conditions if c.fixed is None] + list(domain.materials.numbers)
+    if where is None or where in own:
+        return where
+    if where == DOMAIN:
+        return None
     if where in domain.parts:
         raise InputError(f"{NO_MEAN}: u is set on {where!r}, where its mean is that of a datum")
-    if where not in domain.materials.numbers:
-        there = ", ".join([*loose, *domain.materials.numbers])
-        raise InputError(f"{where!r} is no part of the boundary and no material; there are {there}")
+    there = ", ".join([*own, DOMAIN])
+    raise InputError(f"{where!r} is no part of the boundary and no material; there are {there}")
 
 
 def _insist_on_extent(cells: Cells, where: str | None) -> None:

@@ -14,7 +14,7 @@ class Quantity(NamedTuple):
 
     Attributes:
         kind: "force" or "flux" for what flows through a part, "mean" or "integral" for that of u.
-        place: A part of the boundary or a material; None for all of the domain.
+        place: A part of the boundary or a material; None or "domain" for all of the domain.
         weight: What is integrated with it, and in means divided by; None for 1.
     """
 

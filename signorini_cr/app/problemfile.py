@@ -27,6 +27,7 @@ from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
 from ..levels import check_pieces, solve_levels
+from ..means import DOMAIN
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
@@ -53,7 +54,6 @@ from .readers import (
 )
 from .reference import (
     ADAPTIVE,
-    DOMAIN,
     EXPRESSIONS,
     KINDS,
     MATERIAL,
@@ -427,7 +427,7 @@ def _domain(
     # From the longest edge on, facets grow inside only; none is longer than the diameter
     if size > polygon.diameter * (1 + 1e-9):
         raise InputError(
-            f"domain.size: {size:g} is longer than the domain, whose largest extent is"
+            f"domain.size: {size:g} is longer than the domain, whose diameter is"
             f" {polygon.diameter:.6g}; the length of a facet is needed, no more than that"
         )
     return polygon, size

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from ..adaptive import solve_adaptive
 from ..fem.conditions import Condition, Contact, Dirichlet, Neumann, Robin
+from ..means import DOMAIN
 from .formula import CONSTANTS, FUNCTIONS, VARIABLES
 from .readers import MOST_CHARACTERS, not_negative, part, whole
 
@@ -81,8 +82,6 @@ QUANTITIES_EXAMPLE = [
     'stored = { integral = "domain", weight = "where(y < 0.5, 2, 1)" }',
 ]
 """What they look like."""
-DOMAIN = "domain"
-"""All of the domain, where a quantity is of that."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",
@@ -94,8 +93,9 @@ KEYS = (
         "What each edge is; edge i runs from vertex i to the next. One of them is to be contact, "
         "one dirichlet; with sections [boundary.NAME], one is to be of the type contact.",
         'boundary = ["contact", "dirichlet", "neumann", "dirichlet"]'),
-    Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh, no "
-        "longer than the domain.", "size = 0.25"),
+    Key("domain", "size", "a number above 0", "", "Length of a facet on the coarsest mesh; at "
+        "most the domain's diameter, the largest distance between two of its points.",
+        "size = 0.25"),
     Key("domain", "arcs", "a list of { edge, through }", "straight edges", "Edges that are "
         "circular arcs: the number of the edge, and a point [x, y] between its ends that the arc "
         "passes through. With an arc two vertices are enough. It is cut into equal straight "

@@ -12,6 +12,8 @@ import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +35,7 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
-from ..errors import InputError, naming, on_root, raise_together
+from ..errors import InputError, insist_on_kind, naming, on_root, raise_together
 from . import gmshmesh
 from .exchange import Exchange
 from .materials import Materials
@@ -507,6 +509,7 @@ class Polygon:
             InputError: The size is no positive number or longer than the diameter, no edge is
                 contact or none is Dirichlet, or gmsh can't make the mesh.
         """
+        insist_on_kind("size", size, Real, "a positive number")
         if not (np.isfinite(size) and size > 0):
             raise InputError(f"size is {size}: a positive number is needed")
         if size > self.diameter * (1 + 1e-9):
@@ -550,6 +553,7 @@ def read_gmsh(
     Raises:
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
+    insist_on_kind("path", path, (str, PathLike), "the path of a file")
     parts, numbers = numbered(names), numbered_materials(materials)
     needed = [name for name in parts if name not in PARTS] if names else USUAL
     what = Path(path), parts, needed, numbers
@@ -564,6 +568,7 @@ def _distribute(
     *args: object,
 ) -> Domain:
     """Make arrays on rank 0, share them out as a mesh without ghost cells, labels and materials."""
+    insist_on_kind("comm", comm, MPI.Comm, "a communicator of MPI")
     began = time.perf_counter()
     raw: gmshmesh.Triangulation | None = None
 

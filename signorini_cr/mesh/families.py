@@ -6,11 +6,13 @@ so that they are the same whatever the number of ranks.
 
 from __future__ import annotations
 
+from numbers import Real
+
 import numpy as np
 from mpi4py import MPI
 
 from ..arrays import FloatArray, Int32Array, Int64Array
-from ..errors import InputError
+from ..errors import InputError, insist_on_kind
 from .domain import Domain, Polygon, _distribute
 from .gmshmesh import Triangulation
 from .polygon import inside
@@ -47,6 +49,8 @@ def structured(
     Raises:
         InputError: The polygon doesn't consist of such squares, or a number is out of range.
     """
+    insist_on_kind("polygon", polygon, Polygon, "a Polygon")
+    insist_on_kind("n", n, Real, "a number of squares")
     if n < 1:
         raise InputError(f"n is {n}: a mesh has 1 square or more per unit length")
     if not abs(shift) < 0.5 or not 0.0 <= jitter < 0.25:

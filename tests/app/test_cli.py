@@ -8,10 +8,12 @@ import re
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
 import helpers
+import numpy as np
 import pytest
 from mpi4py import MPI
 
@@ -738,6 +740,26 @@ def test_the_deck(shared_tmp_path: Path) -> None:
     report = json.loads((out / "report.json").read_text())
     assert report["units"] == {"x": "m", "u": "°C", "flux": "W/m²", "force": "W/m"}
     assert report["names"] == {"u": "temperature", "flux": "heat"}
+
+
+def test_the_dam(shared_tmp_path: Path) -> None:
+    """Charny's discharge, and what seeps above the lower water by Polubarinova-Kochina."""
+    out, path = shared_tmp_path / "out", helpers.MESHES / "dam.toml"
+    status, text, err = run("solve", path, "--out", out, "--levels", "3")
+    assert (status, err) == (0, "")
+    if COMM.rank > 0:
+        return
+    assert "face       u ≤ y, κ∂ₙu ≤ 0, " in text
+    level = json.loads((out / "report.json").read_text())["levels"][-1]
+    assert level["contact"]["force"] == pytest.approx(-10.290, rel=0.01)
+    assert level["contact"]["active"] == level["contact"]["facets"]  # up to the surface
+    vertices = np.array(tomllib.loads(path.read_text(encoding="utf-8"))["domain"]["vertices"][3:])
+    length = np.hypot(*np.diff(vertices, axis=0).T)
+    height = length @ (vertices[1:, 1] + vertices[:-1, 1]) / 2 / length.sum()
+    for name, exact in {"discharge": (24**2 - 4**2) / 32, "surface": height}.items():
+        found = level["quantities"][name]
+        assert found["lower"] < exact < found["upper"]
+        assert found["value"] == pytest.approx(exact, rel=1e-3)
 
 
 def test_data_need_to_make_sense_only_where_they_are_used(write) -> None:

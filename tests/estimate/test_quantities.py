@@ -131,6 +131,26 @@ def test_a_solution_knows_its_quantities():
         assert Quantity(kind, places[kind]).of(solution) == expected
 
 
+def test_all_of_the_domain_has_a_name_unless_something_else_has_it():
+    """u = y on the strip, above the obstacle: 1/2 in the mean, and 1/4 where y < 1/2."""
+    sides = [Contact(-9.0, g=-1.0), Neumann(), Dirichlet(1.0), Neumann()]
+    (solution, *_) = strip(sides)
+    assert solution.mean("domain") == mean(solution, "domain") == solution.mean()
+    assert solution.integral("domain", lambda x: x[0]) == solution.integral(None, lambda x: x[0])
+    for kind, expected in {"mean": 0.5, "integral": 1.0}.items():
+        found = Quantity(kind, "domain").of(solution)
+        assert found == Quantity(kind).of(solution)
+        assert found.value == pytest.approx(expected)
+    with pytest.raises(InputError, match=r"no material; there are .*floor, right, left, domain$"):
+        solution.mean("domian")
+    below = {"domain": [[0, 0], [2, 0], [2, 0.5], [0, 0.5]]}
+    polygon = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=below)
+    problem = Problem(conditions=dict(zip(STRIP_EDGES, sides, strict=True)))
+    (solution,) = solve_levels(problem, polygon.mesh(0.2), 1)
+    assert solution.mean("domain").value == pytest.approx(0.25)
+    assert solution.mean().value == pytest.approx(0.5)
+
+
 def test_weighted_forces_have_the_sign_that_is_certain():
     """Of a force off one bound and a weight that is not below 0, in places with no force at all."""
     (solution, *_) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Neumann()], f=-1.0)

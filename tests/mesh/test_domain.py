@@ -13,9 +13,10 @@ from dolfinx import cpp, fem
 from helpers import MESHES
 from mpi4py import MPI
 
-from signorini_cr import Problem, solve
+from signorini_cr import Problem, Solver, solve, solve_adaptive, solve_in_time, solve_levels
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
+from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.partition import bisect
 
 COMM = MPI.COMM_WORLD
@@ -109,6 +110,55 @@ def test_a_size_beyond_the_domain_is_refused():
     assert counts(polygon.mesh(polygon.diameter)) == [1, 2, 1]
     message = fails_alike(polygon.mesh, 2.3)
     assert "size is 2.3, longer than the domain, whose diameter is 2.23607" in message
+
+
+@pytest.mark.parametrize(
+    "swapped, said",
+    [
+        (
+            lambda polygon: polygon.mesh(COMM, 0.25),
+            "size is of the type Intracomm: a positive number is needed",
+        ),
+        (
+            lambda polygon: polygon.mesh(0.5, 0.25),
+            "comm is of the type float: a communicator of MPI is needed",
+        ),
+        (
+            lambda polygon: structured(polygon, COMM, 4),
+            "n is of the type Intracomm: a number of squares is needed",
+        ),
+        (
+            lambda polygon: structured(4, polygon),
+            "polygon is of the type int: a Polygon is needed",
+        ),
+        (
+            lambda _: read_gmsh(COMM, MESHES / "signorini.msh"),
+            "path is of the type Intracomm: the path of a file is needed",
+        ),
+        (
+            lambda polygon: solve(polygon.mesh(1.0), Problem()),
+            "problem is of the type Domain: a Problem is needed",
+        ),
+        (
+            lambda polygon: next(solve_levels(Problem(), polygon, 2)),
+            "domain is of the type Polygon: a Domain is needed",
+        ),
+        (
+            lambda polygon: next(solve_adaptive(polygon.mesh(1.0), Problem())),
+            "problem is of the type Domain: a Problem is needed",
+        ),
+        (
+            lambda polygon: next(solve_in_time(polygon.mesh(1.0), Problem(), end=1.0, steps=1)),
+            "problem is of the type Domain: a Problem is needed",
+        ),
+        (
+            lambda polygon: Solver(polygon.mesh(1.0), Problem()),
+            "problem is of the type Domain: a Problem is needed",
+        ),
+    ],
+)
+def test_arguments_that_have_changed_places(swapped, said: str):
+    assert fails_alike(swapped, Polygon(RECTANGLE, LABELS)) == said
 
 
 def test_every_exterior_facet_has_one_part():
