@@ -166,10 +166,16 @@ def has_conditions(expression: Any) -> bool:
     )
 
 
-def differences(expression: Any) -> list[Any]:
-    """What changes its sign where conditions of a lowered expression change."""
+def differences(expression: Any, ordered: bool = True) -> list[Any]:
+    """What changes its sign where conditions of a lowered expression change; local.
+
+    Args:
+        expression: The expression.
+        ordered: Whether to leave out what is only asked whether it is 0.
+    """
+    kinds = _ORDERED if ordered else _COMPARISONS
     nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
-    return [e.ufl_operands[0] - e.ufl_operands[1] for e in nodes if isinstance(e, _ORDERED)]
+    return [e.ufl_operands[0] - e.ufl_operands[1] for e in nodes if isinstance(e, kinds)]
 
 
 def values(expression: Any, points: Boxes) -> FloatArray:

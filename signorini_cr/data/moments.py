@@ -88,7 +88,10 @@ class Volume:
         assert self._values is not None
         which = np.arange(cells.number, dtype=np.int32)
         values = compat.bound(self._values, cells.domain.own)
-        return values.eval(cells.domain.mesh, which).reshape(cells.number, len(self.rule.weights))
+        found: FloatArray = values.eval(cells.domain.mesh, which)
+        found = found.reshape(cells.number, len(self.rule.weights))
+        self.deviation.off_null_sets(found.T, Pieces.of_cells(cells), cells, self.rule.hats)
+        return found
 
     @cached_property
     def deviation(self) -> Deviation:

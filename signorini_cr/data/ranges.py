@@ -7,6 +7,7 @@ Both follow from the jets on a box around T.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import ufl
@@ -16,6 +17,7 @@ from ..fem.cells import Cells
 from .balls import indices
 from .germs import allowance, first_inside, may_be_singular
 from .jets import (
+    STRIP,
     Boxes,
     Enclosure,
     Jet,
@@ -33,6 +35,8 @@ Errors = Callable[[Boxes, FloatArray], FloatArray]
 """What is to be known of data on boxes and simplices of given half extents; shape (rows, n)."""
 CHUNK = 1 << 12
 """Boxes that are worked on at a time."""
+BESIDE = 1e-7
+"""How far from a point of a piece another one is beside it, in parts of the piece."""
 _CUBIC = {1: 1.0, 2: 0.5, 3: 0.25}
 """Distance on [−1, 1]^m of xyz, x²y and x³ from quadratics, by the largest exponent."""
 
@@ -120,6 +124,7 @@ class Deviation:
         self.singular = not self.local and may_be_singular(self.expression)
         self.decides = self.singular or has_conditions(self.expression)
         self.differences = differences(self.expression)
+        self._compared = differences(self.expression, ordered=False)
 
     def __call__(
         self,
@@ -195,7 +200,40 @@ class Deviation:
         for part in chunks(len(pieces.parent)):
             here = found[:, part]
             here[:] = values(self.expression, pieces[part].points(cells, hats)).reshape(here.shape)
+        self.off_null_sets(found, pieces, cells, hats)
         return found
+
+    def off_null_sets(
+        self, found: FloatArray, pieces: Pieces, cells: Cells, hats: FloatArray
+    ) -> None:
+        """Replace values at points where the two sides of a condition are equal, nearly.
+
+        Enclosures hold almost everywhere, and there may be null sets on which data have other
+        values: these are taken from a point beside.
+
+        Args:
+            found: Values at points of pieces, shape (q, n); changed.
+            pieces: The pieces.
+            cells: The mesh.
+            hats: Barycentric coordinates of the points in a piece, shape (d + 1, q).
+        """
+        if not self._compared:
+            return
+        mixture = np.arange(1.0, 1.0 + len(hats))
+        beside = (1.0 - BESIDE) * hats + BESIDE * (mixture / mixture.sum())[:, None]
+        for part in chunks(len(pieces.parent)):
+            some, here = pieces[part], found[:, part]
+            points = some.points(cells, hats)
+            room = STRIP * np.maximum(np.abs(points.low), np.abs(points.high))
+            at = Enclosure(replace(points, low=points.low - room, high=points.high + room), order=0)
+            even = np.zeros(here.shape, dtype=bool)
+            for jet in map(at, self._compared):
+                even |= np.broadcast_to((jet.low <= 0) & (jet.high >= 0), here.size).reshape(
+                    here.shape
+                )
+            if even.any():
+                others = values(self.expression, some.points(cells, beside))
+                here[even] = others.reshape(here.shape)[even]
 
 
 def chunks(n: int) -> list[slice]:
