@@ -40,10 +40,11 @@ from .smoothing import smoother
 from .transfer import Transfer
 from .whole import Whole
 
-PATIENCE = 40
+PATIENCE, LITTLE = 40, 15
 """CG steps on one mesh after which the chain is given up in a linear system that takes many.
 
-A factorisation takes as long as 30 steps of the cycle at 0.02 to 0.3 M dofs and 55 at 1.2 M.
+A factorisation takes as long as 30 steps of the cycle at 0.02 to 0.3 M dofs and 55 at 1.2 M. That
+of a small matrix takes next to no time, and the second number counts.
 """
 
 SLOW = 10
@@ -231,6 +232,11 @@ class Multigrid:
         """Whether there is something else to try than this chain; the same on all ranks."""
         return not self.given_up and (len(self.grids) > 1 or not is_small(self.matrix))
 
+    @property
+    def patience(self) -> int:
+        """CG steps on this mesh after which to give up, see `PATIENCE`."""
+        return LITTLE if is_small(self.matrix) else PATIENCE
+
     def give_up(self) -> None:
         """Leave the coarser spaces alone from now on, for BoomerAMG or a factorisation."""
         fine = self.finest
@@ -264,7 +270,7 @@ class Multigrid:
         assert not isinstance(bottom, TwoGrids)
         if self.given_up:
             where = " on a coarser mesh" if self._inherited else ""
-            return bottom.describe(f", as multigrid took {PATIENCE} CG steps{where}")
+            return bottom.describe(f", as multigrid took too many CG steps{where}")
         solver = bottom.describe()
         if len(self.grids) == 1:
             return solver

@@ -21,7 +21,7 @@ from petsc4py import PETSc
 
 from ..arrays import FloatArray
 from ..garbage import release
-from ..multigrid.cycle import PATIENCE, SLOW, Grid, Multigrid
+from ..multigrid.cycle import SLOW, Grid, Multigrid
 from ..options import PREFIX, REDUCED, defaults, read
 from .active import ActiveSet
 from .bounds import Bounds
@@ -48,6 +48,12 @@ DIGITS = 1e-6
 
 MOST = 100
 """CG steps of one correction; the next one goes on."""
+
+CAREFUL = 15
+"""Newton steps after which a step must lower the energy: sets of active dofs may come back else."""
+
+ENOUGH, HALVES = 0.1, 40
+"""Part of what the slope promises by which it must, and how often a step is halved for that."""
 
 Reason = PETSc.KSP.ConvergedReason
 
@@ -178,9 +184,31 @@ class ReducedSolver:
             rounding = NOISE * self._cycle.finest.rounding(self._x, self.active.dofs)
             if rounding <= next_to_nothing:
                 self.reached = max(test.reached, rounding)
+        if self._snes.getIterationNumber() >= CAREFUL:
+            self._shorten()
         self.active.take_rest(self._step.array_r, reduced.array)
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
+
+    def _shorten(self) -> None:
+        """Halve the step until it lowers ½ x·A x − b·x along the way that the bounds leave of it.
+
+        Full steps are the primal-dual active set method, which may go round in circles where A is
+        no M-matrix, as on thin cells. These end at the solution from anywhere (Bertsekas 1982).
+        """
+        x, at, share = self._x.array_r, self._cycle.operator.dofs, 1.0
+        way, image = self._x.duplicate(), self._x.duplicate()
+        for _ in range(HALVES):
+            way.array[:] = -share * self._step.array_r
+            moved = np.clip(x[at] + way.array_r[at], self.bounds.lower, self.bounds.upper)
+            way.array[at] = moved - x[at]
+            self.matrix.mult(way, image)
+            slope = self._residual.dot(way)
+            if slope + 0.5 * way.dot(image) <= ENOUGH * slope:
+                break
+            share *= 0.5
+        self._step.scale(share)
+        release(way, image)
 
     def _run(self, forces: FloatArray) -> LinearTest:
         """Run the inner solver, and return what its test has found out."""
@@ -189,7 +217,7 @@ class ReducedSolver:
         )
         test = LinearTest(system, self._is_cg, self._share, self.reduction)
         if self._uses_cycle and self._cycle.may_give_up:
-            test.patience = max(SLOW, PATIENCE - self.iterations)
+            test.patience = max(SLOW, self._cycle.patience - self.iterations)
         self.ksp.setConvergenceTest(test)
         self.ksp.solve(self._residual, self._step)
         self.iterations += self.ksp.getIterationNumber()

@@ -127,7 +127,7 @@ def test_when_a_chain_is_given_up(monkeypatch):
         b.array[8] = 0.0
         cycle.apply(None, b, x)
         if HAS_HYPRE:
-            assert "multigrid took 40 CG steps" in cycle.describe()
+            assert "multigrid took too many CG steps" in cycle.describe()
     assert cycle.given_up and not cycle.may_give_up and cycle.finest is not before
     assert cycle.operator is before.operator
     inherited = Multigrid([grid()], given_up=True)
