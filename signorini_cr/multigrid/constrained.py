@@ -97,9 +97,12 @@ class ConstrainedMatrix:
         Yields:
             Those that are constrained, ascending.
         """
-        chosen = self.dofs[np.isin(self.dofs, dofs)]
-        of_row: BoolArray = np.isin(self._own_row, chosen)
-        which = np.flatnonzero(of_row | self._seen(chosen)[self._place])
+        named = np.zeros(self.matrix.getLocalSize()[0], dtype=bool)
+        named[dofs] = True
+        chosen = self.dofs[named[self.dofs]]
+        named[:] = False
+        named[chosen] = True
+        which = np.flatnonzero(named[self._own_row] | self._seen(chosen)[self._place])
         if not self.matrix.getComm().tompi4py().allreduce(len(chosen)):
             yield chosen
             return

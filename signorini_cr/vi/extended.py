@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, FloatArray, summed
 from ..errors import NotConverged
 from ..garbage import release
 from ..multigrid.constrained import ConstrainedMatrix
@@ -226,5 +226,4 @@ class Extended:
 
     def _sums(self, values: FloatArray) -> FloatArray:
         """Sums over all ranks by class."""
-        total: FloatArray = self._comm.allreduce(self._stiffness.sums(values))
-        return total
+        return summed(self._comm, self._stiffness.sums(values))

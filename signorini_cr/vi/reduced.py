@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, summed
 from ..garbage import release
 from ..multigrid.cycle import PATIENCE, SLOW, Grid, Multigrid
 from ..options import PREFIX, REDUCED, defaults, read
@@ -178,7 +178,7 @@ class ReducedSolver:
             rounding = NOISE * self._cycle.finest.rounding(self._x, self.active.dofs)
             if rounding <= next_to_nothing:
                 self.reached = max(test.reached, rounding)
-        self.active.take_rest(self._step.array_r, reduced.array)
+        reduced.array[:] = self._step.array_r[inactive - first]
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 
@@ -306,8 +306,8 @@ class ReducedSystem:
                 sums(np.where(active, np.maximum(now, 0.0), 0.0)),
             ]
         )
-        facts = self.x.getComm().tompi4py().allreduce(facts)
-        moved, forces = np.split(facts[2:], 2)
+        summed(self.x.getComm().tompi4py(), facts)
+        moved, forces = facts[2:].reshape(2, -1)
         forces = np.maximum(forces, self.stiffness.least)
         return Outlook(float(np.sqrt(facts[0])), bool(facts[1]), moved, forces)
 

@@ -19,7 +19,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..arrays import FloatArray, IndexArray
+from ..arrays import FloatArray, IndexArray, summed
 from ..errors import InputError, NotConverged, fail_together
 from ..garbage import release
 from ..multigrid.cycle import Multigrid
@@ -377,8 +377,7 @@ class NewtonTest:
         gap = self._linear.bounds.gap(at)
         force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
         sums = self._stiffness.sums(np.where(active.mask, 0.0, force))
-        found: FloatArray = self._cycle.matrix.getComm().tompi4py().allreduce(sums)
-        return found
+        return summed(self._cycle.matrix.getComm().tompi4py(), sums)
 
     def _of_data(self, x: PETSc.Vec, active: ActiveSet) -> float:
         """What rounding of the data may add to the forces, all together; collective."""
@@ -420,8 +419,8 @@ class NewtonTest:
                 (misclassified, np.abs(forces)),
             )
         ]
-        facts = self._cycle.matrix.getComm().tompi4py().allreduce(np.array(facts))
-        squares, sums, moved, wrong = facts
+        comm = self._cycle.matrix.getComm().tompi4py()
+        squares, sums, moved, wrong = summed(comm, np.array(facts))
         sizes = np.maximum(sums, self._stiffness.least)
         return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, sizes, moved, wrong)
 

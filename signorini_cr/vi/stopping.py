@@ -26,9 +26,8 @@ from collections.abc import Callable
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.ndimage import maximum_filter
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
 from ..garbage import release
 from ..multigrid.cycle import Grid
 
@@ -156,11 +155,11 @@ class Stiffness:
         np.maximum.at(around, self._window, made_of)
         self._comm.Allreduce(MPI.IN_PLACE, around, op=MPI.MAX)
         top = float(around.max())
-        around = maximum_filter(around.reshape([WINDOWS] * 3), size=3).ravel()[self._window]
+        around = _spread(around.reshape([WINDOWS] * 3)).ravel()[self._window]
         decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
         level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
         self.bounded = LEVELS * self._kind + level
-        self.made_of = self._comm.allreduce(self.sums(made_of))
+        self.made_of = summed(self._comm, self.sums(made_of))
         self.least = PART * self.made_of
         self.least[::LEVELS] = 0.0
 
@@ -178,8 +177,7 @@ class Stiffness:
         """
         values = self._grid.operator.magnitude(x)
         sums = self.sums(values if which is None else np.where(which, values, 0.0))
-        total: FloatArray = self._comm.allreduce(sums)
-        return total
+        return summed(self._comm, sums)
 
     def residual(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> None:
         """Compute r = A x − b; collective, where the matrix must be whole for the first time."""
@@ -217,7 +215,7 @@ class Stiffness:
                 NOISE * self._diagonal * x.array_r,
             )
         ]
-        left, flow, noise = np.sqrt(self._comm.allreduce(np.array(facts)))
+        left, flow, noise = np.sqrt(summed(self._comm, np.array(facts)))
         return float(np.max(left / np.maximum(flow, 1e-300), initial=0.0, where=left > noise))
 
     def flows(self, x: PETSc.Vec) -> FloatArray:
@@ -253,6 +251,17 @@ def windows(comm: MPI.Comm, places: FloatArray) -> IndexArray:
     place = np.clip((places - low) * (WINDOWS / max(size, 1e-300)), 0, WINDOWS - 1)
     window: IndexArray = place.astype(np.intp) @ WINDOWS ** np.arange(3)
     return window
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    """The largest of each entry and those around it, diagonally, too, shape as given."""
+    for axis in range(values.ndim):
+        rows = np.moveaxis(values, axis, 0)
+        values = rows.copy()
+        np.maximum(values[1:], rows[:-1], out=values[1:])
+        np.maximum(values[:-1], rows[1:], out=values[:-1])
+        values = np.moveaxis(values, 0, axis)
+    return values
 
 
 def _differences(A: PETSc.Mat) -> tuple[PETSc.Mat, FloatArray]:
