@@ -83,6 +83,7 @@ class ConstrainedMatrix:
         release(theirs)
         self._row, self._column, self._value = row[kept], column[kept], value[kept]
         self._place, self._own_row = place[kept], self._row - A.getOwnershipRange()[0]
+        self._unit: FloatArray = (self._row == self._column).astype(np.float64)
         # The pattern is not to change, or ranks would have to talk whenever values do
         A.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
 
@@ -107,7 +108,7 @@ class ConstrainedMatrix:
             yield chosen
             return
         try:
-            self._write(which, (self._row == self._column)[which].astype(np.float64))
+            self._write(which, self._unit[which])
             yield chosen
         finally:
             self._write(which, self._value[which])

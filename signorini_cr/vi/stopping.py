@@ -155,7 +155,7 @@ class Stiffness:
         np.maximum.at(around, self._window, made_of)
         self._comm.Allreduce(MPI.IN_PLACE, around, op=MPI.MAX)
         top = float(around.max())
-        around = _spread(around.reshape([WINDOWS] * 3)).ravel()[self._window]
+        around = _spread(around)[self._window]
         decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
         level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
         self.bounded = LEVELS * self._kind + level
@@ -254,14 +254,13 @@ def windows(comm: MPI.Comm, places: FloatArray) -> IndexArray:
 
 
 def _spread(values: FloatArray) -> FloatArray:
-    """The largest of each entry and those around it, diagonally, too, shape as given."""
-    for axis in range(values.ndim):
-        rows = np.moveaxis(values, axis, 0)
+    """The largest of each square's, or cube's, value and those around it, as `windows` counts."""
+    for stride in WINDOWS ** np.arange(3):
+        rows = values.reshape(-1, WINDOWS, stride)
         values = rows.copy()
-        np.maximum(values[1:], rows[:-1], out=values[1:])
-        np.maximum(values[:-1], rows[1:], out=values[:-1])
-        values = np.moveaxis(values, 0, axis)
-    return values
+        np.maximum(values[:, 1:], rows[:, :-1], out=values[:, 1:])
+        np.maximum(values[:, :-1], rows[:, 1:], out=values[:, :-1])
+    return values.ravel()
 
 
 def _differences(A: PETSc.Mat) -> tuple[PETSc.Mat, FloatArray]:
