@@ -306,7 +306,7 @@ class ReducedSystem:
                 sums(np.where(active, np.maximum(now, 0.0), 0.0)),
             ]
         )
-        summed(self.x.getComm().tompi4py(), facts)
+        summed(self.stiffness.comm, facts)
         moved, forces = facts[2:].reshape(2, -1)
         forces = np.maximum(forces, self.stiffness.least)
         return Outlook(float(np.sqrt(facts[0])), bool(facts[1]), moved, forces)

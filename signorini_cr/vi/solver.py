@@ -376,8 +376,7 @@ class NewtonTest:
         moved = 2.0 * self._linear.moved() if moving else 0.0
         gap = self._linear.bounds.gap(at)
         force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
-        sums = self._stiffness.sums(np.where(active.mask, 0.0, force))
-        return summed(self._cycle.matrix.getComm().tompi4py(), sums)
+        return self._stiffness.totals(np.where(active.mask, 0.0, force))
 
     def _of_data(self, x: PETSc.Vec, active: ActiveSet) -> float:
         """What rounding of the data may add to the forces, all together; collective."""
@@ -385,7 +384,7 @@ class NewtonTest:
             return 0.0
         sizes = np.abs(x.array_r[active.bounded]) + self._offset
         own = float((self._cycle.operator.diagonal * sizes)[active.mask].sum())
-        total = self._cycle.matrix.getComm().tompi4py().allreduce(own)
+        total = self._stiffness.comm.allreduce(own)
         return self._data.rounded + 2.0 * DATUM * float(total)
 
     @property
@@ -419,8 +418,7 @@ class NewtonTest:
                 (misclassified, np.abs(forces)),
             )
         ]
-        comm = self._cycle.matrix.getComm().tompi4py()
-        squares, sums, moved, wrong = summed(comm, np.array(facts))
+        squares, sums, moved, wrong = summed(self._stiffness.comm, np.array(facts))
         sizes = np.maximum(sums, self._stiffness.least)
         return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, sizes, moved, wrong)
 
