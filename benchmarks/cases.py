@@ -176,7 +176,7 @@ def linear_solve(A: PETSc.Mat, b: PETSc.Vec) -> tuple[float, int]:
 def solved_once(solution: Solution) -> tuple[float, int]:
     """`linear_solve` with a solution's own matrix and right-hand side."""
     system = solution.level.system
-    b = ghosted_vector(solution.level.V, system.b.x.array)
+    b = ghosted_vector(solution.level.V, system.b)
     found = linear_solve(system.A, b)
     b.destroy()
     return found

@@ -75,7 +75,7 @@ def inequality(problem: Problem, domain: Domain) -> tuple[float, str]:
 def row(name: str, problem: Problem, domain: Domain, repeats: int) -> list[str]:
     """One line of the table."""
     level = Level((NestedMesh(Diffusion(problem, domain.mesh, "CR"), domain),))
-    b = ghosted_vector(level.V, level.system.b.x.array)
+    b = ghosted_vector(level.V, level.system.b)
     actions = {
         "theirs": lambda: linear_solve(level.system.A, b),
         "ours": lambda: two_levels(level, b),

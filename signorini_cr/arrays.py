@@ -1,12 +1,22 @@
-"""Arrays by what they hold."""
+"""Arrays by what they hold, and their sums over all ranks."""
 
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IndexArray: TypeAlias = npt.NDArray[np.intp]
 Int32Array: TypeAlias = npt.NDArray[np.int32]
 Int64Array: TypeAlias = npt.NDArray[np.int64]
+
+
+def summed(comm: MPI.Comm, values: FloatArray) -> FloatArray:
+    """Sum up, in place, what the ranks have; collective.
+
+    mpi4py's `allreduce` would pickle the array, which takes longer than many a sum.
+    """
+    comm.Allreduce(MPI.IN_PLACE, values)
+    return values

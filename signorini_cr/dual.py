@@ -56,7 +56,7 @@ def solved(dual: Problem, level: Level) -> Dual:
     level = Level(tuple(meshes))
     system = level.system
     u = system.start()
-    load, found = (ghosted_vector(level.V, each.x.array) for each in (system.b, u))
+    load, found = (ghosted_vector(level.V, each) for each in (system.b, u.x.array))
     solve_once(system.A, load, found, LINEAR, ESTIMATE_PREFIX)
     u.x.scatter_forward()
     u.x.array[:] += system.offset

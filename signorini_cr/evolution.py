@@ -220,8 +220,9 @@ def solve_in_time(
     """Solve capacity ∂u/∂t − ∇·(κ∇u) + c u = f with contact, step by step; collective.
 
     The matrix is assembled once, and anew where κ, c or b depend on the time. Every step starts
-    from the last one with its active set; its certificate is that of its own problem, in which the
-    steps before are data: it says nothing of what the step's length does to u.
+    where the line through the two before leads, where contact will have moved on with it; its
+    certificate is that of its own problem, in which the steps before are data: it says nothing of
+    what the step's length does to u.
 
     Args:
         problem: The data. What depends on the time t holds a Constant on the domain's mesh.
@@ -259,7 +260,7 @@ def solve_in_time(
     reactions = _reactions(problem, domain)
     factor, rates = 0.0, np.array(0.0)
     solver: Solver | None = None
-    last: Solution | fem.Function | None = None
+    start: fem.Function | None = None
     then: FloatArray = np.empty(0)
     before: FloatArray = then
     limits, comm = Limits(max_time), domain.mesh.comm
@@ -278,15 +279,17 @@ def solve_in_time(
                 elif restart is None:
                     then = solver.projected(initial).x.array
                 else:
-                    last, then, before = _gone_on(solver, restart, initial, step)
+                    start, then, before = _gone_on(solver, restart, initial, step)
             source = fem.Function(solver.V)
             source.x.array[:] = (4.0 * then - before) / 3.0 if second else then
             t = end * step / steps
             if time is not None:
                 time.value = t
-            last = solver.solve(source, last, rates)
-            before, then = then, last.u.x.array
-            yield t, last
+            solution = solver.solve(source, start, rates)
+            before, then = then, solution.u.x.array
+            start = fem.Function(solver.V)
+            start.x.array[:] = 2.0 * then - before
+            yield t, solution
             if step < steps:
                 limits.admit_step(comm)
     finally:

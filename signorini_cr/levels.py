@@ -259,7 +259,7 @@ def solve_level(
                 row_sums=system.row_sums,
                 rounding=system.data_rounding,
                 rounded=system.data_rounded,
-                loads=system.chi.x.array[system.bounded],
+                loads=system.chi[system.bounded],
                 offset=system.offset,
                 windows=system.windows,
             )
@@ -276,7 +276,7 @@ def solve_level(
         u.x.array[:] += system.offset
     owned = system.A.getLocalSize()[0]
     energy = level.domain.mesh.comm.allreduce(
-        0.5 * level.data.energy(u) - system.chi.x.array[:owned] @ u.x.array[:owned]
+        0.5 * level.data.energy(u) - system.chi[:owned] @ u.x.array[:owned]
     )
     seconds["estimate"] = time.perf_counter() - clock
     return Solution(level, u, residual, contact, float(energy), iterations, seconds)

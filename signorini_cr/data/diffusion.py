@@ -288,8 +288,11 @@ class DiffusionOnMesh:
 
     def chi(self) -> FloatArray:
         """χ (1.10) by dof, this rank's cells' share."""
-        if self.forms.element == "CR" and (self.forms.loaded or self.moments.source is not None):
-            found = chi(self.load, self.edges, self.cells)
+        moments = self.moments
+        if self.forms.element == "CR" and (self.forms.loaded or moments.source is not None):
+            found = chi(self.of_f, self.edges, self.cells)
+            if moments.source is not None:
+                found += moments.source * self.cells.masses(moments.rate)
         else:
             found = self._assembled(self.forms.chi)
         if self.forms.own_load is not None:

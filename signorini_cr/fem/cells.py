@@ -330,6 +330,17 @@ class Cells:
         total = _sums(self._of_facets, values)
         return self.share(total) if shared else total
 
+    def masses(self, rate: FloatArray) -> FloatArray:
+        """∫ rate ψ² for each facet dof's function ψ, this rank's cells' share; for triangles.
+
+        There the functions of Crouzeix-Raviart are orthogonal, and these all products there are.
+
+        Args:
+            rate: A number on each owned cell, shape (cells,) or ().
+        """
+        of_cells = rate * self.volume / 3.0
+        return self.over_facets(np.broadcast_to(of_cells, self.facets.shape), shared=False)
+
     def over_vertices(self, values: FloatArray) -> FloatArray:
         """Add up local values, shape (d + 1, cells), for each vertex, ghosts included."""
         return self.share(_sums(self._of_vertices, values), 0)

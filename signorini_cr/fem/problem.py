@@ -381,7 +381,7 @@ class Forms:
         for function in self.functions:
             domain.own(function)
 
-    @property
+    @cached_property
     def functions(self) -> list[fem.Function]:
         """The Functions that the data hold, each once."""
         found: dict[fem.Function, None] = {}

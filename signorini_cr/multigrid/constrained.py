@@ -83,6 +83,7 @@ class ConstrainedMatrix:
         release(theirs)
         self._row, self._column, self._value = row[kept], column[kept], value[kept]
         self._place, self._own_row = place[kept], self._row - A.getOwnershipRange()[0]
+        self._unit: FloatArray = (self._row == self._column).astype(np.float64)
         # The pattern is not to change, or ranks would have to talk whenever values do
         A.setOption(PETSc.Mat.Option.NEW_NONZERO_LOCATION_ERR, True)
 
@@ -97,14 +98,17 @@ class ConstrainedMatrix:
         Yields:
             Those that are constrained, ascending.
         """
-        chosen = self.dofs[np.isin(self.dofs, dofs)]
-        of_row: BoolArray = np.isin(self._own_row, chosen)
-        which = np.flatnonzero(of_row | self._seen(chosen)[self._place])
+        named = np.zeros(self.matrix.getLocalSize()[0], dtype=bool)
+        named[dofs] = True
+        chosen = self.dofs[named[self.dofs]]
+        named[:] = False
+        named[chosen] = True
+        which = np.flatnonzero(named[self._own_row] | self._seen(chosen)[self._place])
         if not self.matrix.getComm().tompi4py().allreduce(len(chosen)):
             yield chosen
             return
         try:
-            self._write(which, (self._row == self._column)[which].astype(np.float64))
+            self._write(which, self._unit[which])
             yield chosen
         finally:
             self._write(which, self._value[which])

@@ -77,19 +77,6 @@ class ActiveSet:
         place = np.searchsorted(inactive, numbers)
         return cls(bounded, inactive.take(place, mode="clip") != numbers)
 
-    def take_rest(self, values: FloatArray, rest: FloatArray) -> None:
-        """Copy the values of all other owned dofs, in pieces, as there are few active ones.
-
-        Args:
-            values: Values of all owned dofs.
-            rest: Those without the active ones.
-        """
-        active = self.dofs
-        starts = np.concatenate([[0], active + 1]).tolist()
-        ends = np.append(active, len(values)).tolist()
-        for gone, (start, end) in enumerate(zip(starts, ends, strict=True)):
-            rest[start - gone : end - gone] = values[start:end]
-
     @property
     def dofs(self) -> Int32Array:
         """The active dofs, local numbers, ascending."""

@@ -14,7 +14,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..arrays import BoolArray, FloatArray, Int32Array
+from ..arrays import BoolArray, FloatArray, Int32Array, summed
 from ..fem.physics import OnMesh
 from ..fem.space import ghosted_vector
 from ..garbage import release
@@ -177,7 +177,7 @@ def contact_facts(
     ends = at_dofs.gap, at_dofs.side * pressure
     least = np.array([np.min(each, initial=np.inf) for each in ends])
     comm = mesh.comm
-    force, length, number, number_active, complementarity, squares = comm.allreduce(np.array(sums))
+    force, length, number, number_active, complementarity, squares = summed(comm, np.array(sums))
     comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
     min_gap, min_pressure = least
     of_load = float(np.sqrt(squares)) / (system.residual_scale or 1.0)
@@ -230,7 +230,7 @@ class _AtDofs:
         """Compare what is there with what rounding makes of it, in parts; collective."""
         bounded = system.bounded
         vector = ghosted_vector(u.function_space, u.x.array)
-        terms = system.operator.magnitude(vector) + np.abs(system.b.x.array[bounded])
+        terms = system.operator.magnitude(vector) + np.abs(system.b[bounded])
         release(vector)
         entries = system.A.getDiagonal()
         diagonal = entries.array_r.copy()

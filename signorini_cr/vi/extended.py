@@ -84,7 +84,6 @@ class Extended:
         self._stiffness, self._vectors = stiffness, vectors
         self.active, self.residual = linear.active, vectors.residual
         self._remainder, self._work, self._nothing = (vectors.x.duplicate() for _ in range(3))
-        self._comm = vectors.x.getComm().tompi4py()
         for each in (self._remainder, self._nothing):
             each.set(0.0)
         stiffness.exact = True
@@ -106,8 +105,8 @@ class Extended:
         left = self._find_set(loose * FORCES)
         open_by_data = np.max([self._answer(*rounding(n), n) for n in range(SAMPLES)], axis=0)
         errors = 2.0 * left + open_by_data
-        forces, made_of = self._sums(self._forces()), self._stiffness.made_of
-        of_loads = self._sums(np.where(self.active.mask, np.abs(loads), 0.0)).sum()
+        forces, made_of = self._stiffness.totals(self._forces()), self._stiffness.made_of
+        of_loads = self._stiffness.totals(np.where(self.active.mask, np.abs(loads), 0.0)).sum()
         total = max(float(forces.sum()), REMAINDER * float(of_loads))
         # what drowns in its errors is no force where these are nothing against what it is made of,
         # or against all forces
@@ -133,7 +132,7 @@ class Extended:
         for _ in range(SETS):
             left = self._refine(share)
             mask = self._wanted()
-            if not self._comm.allreduce(int((mask != self.active.mask).sum())):
+            if not self._stiffness.comm.allreduce(int((mask != self.active.mask).sum())):
                 return left
             self.active = ActiveSet(self.active.bounded, mask)
         raise NotConverged(f"no active set is that of its own solution, of {SETS} tried")
@@ -153,8 +152,10 @@ class Extended:
             self._subtract(step)
             self._compute_residual()
             forces = np.abs(self.residual.array_r[self.active.bounded] - before)
-            changed = self._sums(np.where(self.active.mask, forces, self._could_touch(moved)))
-            sizes = np.maximum(self._sums(self._forces()), self._stiffness.least)
+            changed = self._stiffness.totals(
+                np.where(self.active.mask, forces, self._could_touch(moved))
+            )
+            sizes = np.maximum(self._stiffness.totals(self._forces()), self._stiffness.least)
             if (changed <= KNOWN * share * sizes).all() or changed.sum() > GAIN * last.sum():
                 break
         return changed
@@ -203,7 +204,7 @@ class Extended:
         change.set(0.0)
         change.array[self.active.dofs] = bounds[mask]
         self._stiffness.residual(change, self._nothing, answer)
-        rng = np.random.default_rng((seed, self._comm.rank, 1))
+        rng = np.random.default_rng((seed, self._stiffness.comm.rank, 1))
         flows = self._stiffness.flows(self._vectors.x)
         answer.array[:] += DATUM * flows * rng.choice([-1.0, 1.0], len(flows)) - load
         forces = answer.array_r[bounded].copy()
@@ -212,7 +213,7 @@ class Extended:
         forces -= self._work.array_r[bounded]
         moved = np.abs(step.array_r[bounded] + bounds)
         release(change, answer)
-        return self._sums(np.where(mask, np.abs(forces), self._could_touch(moved)))
+        return self._stiffness.totals(np.where(mask, np.abs(forces), self._could_touch(moved)))
 
     def _write(self, none: BoolArray) -> None:
         """Leave forces that are none out, and dofs without force off the obstacle."""
@@ -223,8 +224,3 @@ class Extended:
         side = self._bounds.side(at)
         off = np.nextafter(self._bounds.on(side), side * np.inf)
         x.array[bounded] = np.where(~mask & (self._bounds.gap(at) <= 0.0), off, at)
-
-    def _sums(self, values: FloatArray) -> FloatArray:
-        """Sums over all ranks by class."""
-        total: FloatArray = self._comm.allreduce(self._stiffness.sums(values))
-        return total

@@ -116,7 +116,7 @@ class _Expected:
         of_parent = inherited.active & ~inherited.at_front
         side = np.where(of_parent, np.sign(inherited.force), bounds.side(x))
         gap = x - bounds.on(side)
-        on_bound = operator.times(vector) - system.b.x.array[bounded] - operator.diagonal * gap
+        on_bound = operator.times(vector) - system.b[bounded] - operator.diagonal * gap
         force = side * np.where(inherited.at_front, on_bound, inherited.force)
         # with its parent off the bound a facet has no force, as the criterion sees it
         pushing = np.where(inherited.at_front | inherited.active, force, 0.0)
@@ -159,7 +159,7 @@ def _make_forces(
         facets: The contact facets, as the bounded dofs are.
         expected: The forces wanted.
     """
-    V, operator, b = start.function_space, system.operator, system.b.x.array[system.bounded]
+    V, operator, b = start.function_space, system.operator, system.b[system.bounded]
     block = V.dofmap.index_map_bs
     others = block * V.dofmap.list[facet_entities(V.mesh, facets)[:, 0]]
     others += (system.bounded % block)[:, None]

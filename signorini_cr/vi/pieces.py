@@ -77,9 +77,9 @@ class Loose:
         Raises:
             InputError: One is not.
         """
-        V = system.chi.function_space
+        V = system.u_D.function_space
         owned, comm = Layout.of_space(V).size[0], V.mesh.comm
-        piece, chi = self.piece[:owned], system.chi.x.array[:owned]
+        piece, chi = self.piece[:owned], system.chi[:owned]
         sums = [np.bincount(piece, values, self.count + 1) for values in (np.abs(chi), piece > 0)]
         finite = [np.isfinite(_floors(system, side)[system.bounded]) for side in (1.0, -1.0)]
         sums += [np.bincount(piece[system.bounded], which, self.count + 1) for which in finite]
@@ -137,7 +137,7 @@ class Loose:
         pushed = ActiveSet.of(bounded, bounds.gap(at), forces)
         active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
         entries = system.A.getDiagonal()
-        lift = np.abs(system.b.x.array[: entries.local_size]) / entries.array_r
+        lift = np.abs(system.b[: entries.local_size]) / entries.array_r
         release(entries)
         # upside down where the net force pulls
         side = np.where(self._net(system) <= 0.0, 1.0, -1.0)
@@ -161,8 +161,8 @@ class Loose:
     def _net(self, system: System) -> FloatArray:
         """The net force ∫ f + ∫ g on each piece, shape (count + 1,); collective."""
         owned = system.A.getLocalSize()[0]
-        chi = np.bincount(self.piece[:owned], system.chi.x.array[:owned], self.count + 1)
-        net: FloatArray = system.chi.function_space.mesh.comm.allreduce(chi)
+        chi = np.bincount(self.piece[:owned], system.chi[:owned], self.count + 1)
+        net: FloatArray = system.u_D.function_space.mesh.comm.allreduce(chi)
         return net
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..arrays import FloatArray, IndexArray
+from ..arrays import FloatArray, IndexArray, summed
 from ..errors import InputError, NotConverged, fail_together
 from ..garbage import release
 from ..multigrid.cycle import Multigrid
@@ -376,9 +376,7 @@ class NewtonTest:
         moved = 2.0 * self._linear.moved() if moving else 0.0
         gap = self._linear.bounds.gap(at)
         force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
-        sums = self._stiffness.sums(np.where(active.mask, 0.0, force))
-        found: FloatArray = self._cycle.matrix.getComm().tompi4py().allreduce(sums)
-        return found
+        return self._stiffness.totals(np.where(active.mask, 0.0, force))
 
     def _of_data(self, x: PETSc.Vec, active: ActiveSet) -> float:
         """What rounding of the data may add to the forces, all together; collective."""
@@ -386,7 +384,7 @@ class NewtonTest:
             return 0.0
         sizes = np.abs(x.array_r[active.bounded]) + self._offset
         own = float((self._cycle.operator.diagonal * sizes)[active.mask].sum())
-        total = self._cycle.matrix.getComm().tompi4py().allreduce(own)
+        total = self._stiffness.comm.allreduce(own)
         return self._data.rounded + 2.0 * DATUM * float(total)
 
     @property
@@ -420,8 +418,7 @@ class NewtonTest:
                 (misclassified, np.abs(forces)),
             )
         ]
-        facts = self._cycle.matrix.getComm().tompi4py().allreduce(np.array(facts))
-        squares, sums, moved, wrong = facts
+        squares, sums, moved, wrong = summed(self._stiffness.comm, np.array(facts))
         sizes = np.maximum(sums, self._stiffness.least)
         return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, sizes, moved, wrong)
 

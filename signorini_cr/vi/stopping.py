@@ -26,9 +26,8 @@ from collections.abc import Callable
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.ndimage import maximum_filter
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
 from ..garbage import release
 from ..multigrid.cycle import Grid
 
@@ -82,6 +81,7 @@ class Stiffness:
     as what dof j gets from dof i is what i gives to j.
 
     Attributes:
+        comm: The ranks.
         number: How many classes of dofs with a bound there are, over all ranks; some may be empty.
         contrast: Largest diagonal entry over the smallest.
         bounded: Class of each dof with a bound, shape (n,).
@@ -106,13 +106,13 @@ class Stiffness:
                 been taken out, shape (dofs,); it is asked if there are several classes.
             window: As `windows` has it; None for one that all are in.
         """
-        self._grid, self._comm = grid, grid.matrix.getComm().tompi4py()
+        self._grid, self.comm = grid, grid.matrix.getComm().tompi4py()
         diagonal = grid.matrix.getDiagonal()
         entries = diagonal.array
         entries[grid.dirichlet] = np.inf
-        low = self._comm.allreduce(float(entries.min(initial=np.inf)), op=MPI.MIN)
+        low = self.comm.allreduce(float(entries.min(initial=np.inf)), op=MPI.MIN)
         entries[grid.dirichlet] = 0.0
-        high = self._comm.allreduce(float(entries.max(initial=0.0)), op=MPI.MAX)
+        high = self.comm.allreduce(float(entries.max(initial=0.0)), op=MPI.MAX)
         entries[grid.dirichlet] = 1.0
         self._smallest, self.contrast = low, max(high / low, 1.0)
         self._kinds = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
@@ -154,13 +154,13 @@ class Stiffness:
         made_of = self._grid.operator.flows(x, b)
         around: FloatArray = np.zeros(WINDOWS**3)
         np.maximum.at(around, self._window, made_of)
-        self._comm.Allreduce(MPI.IN_PLACE, around, op=MPI.MAX)
+        self.comm.Allreduce(MPI.IN_PLACE, around, op=MPI.MAX)
         top = float(around.max())
-        around = maximum_filter(around.reshape([WINDOWS] * 3), size=3).ravel()[self._window]
+        around = _spread(around)[self._window]
         decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
         level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
         self.bounded = LEVELS * self._kind + level
-        self.made_of = self._comm.allreduce(self.sums(made_of))
+        self.made_of = self.totals(made_of)
         self.least = PART * self.made_of
         self.least[::LEVELS] = 0.0
 
@@ -168,6 +168,10 @@ class Stiffness:
         """Sum values of the bounded dofs over this rank's part of each class, shape (classes,)."""
         sums = np.bincount(self.bounded, values, minlength=self.number)
         return sums.astype(np.float64, copy=False)
+
+    def totals(self, values: FloatArray) -> FloatArray:
+        """The same over all ranks, shape (classes,); collective."""
+        return summed(self.comm, self.sums(values))
 
     def magnitude(self, x: PETSc.Vec, which: BoolArray | None = None) -> FloatArray:
         """Sum up |A| |x| over the bounded dofs of each class, shape (classes,); collective.
@@ -177,9 +181,7 @@ class Stiffness:
             which: The bounded dofs that count, shape (n,); None for all.
         """
         values = self._grid.operator.magnitude(x)
-        sums = self.sums(values if which is None else np.where(which, values, 0.0))
-        total: FloatArray = self._comm.allreduce(sums)
-        return total
+        return self.totals(values if which is None else np.where(which, values, 0.0))
 
     def residual(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> None:
         """Compute r = A x − b; collective, where the matrix must be whole for the first time."""
@@ -217,7 +219,7 @@ class Stiffness:
                 NOISE * self._diagonal * x.array_r,
             )
         ]
-        left, flow, noise = np.sqrt(self._comm.allreduce(np.array(facts)))
+        left, flow, noise = np.sqrt(summed(self.comm, np.array(facts)))
         return float(np.max(left / np.maximum(flow, 1e-300), initial=0.0, where=left > noise))
 
     def flows(self, x: PETSc.Vec) -> FloatArray:
@@ -253,6 +255,16 @@ def windows(comm: MPI.Comm, places: FloatArray) -> IndexArray:
     place = np.clip((places - low) * (WINDOWS / max(size, 1e-300)), 0, WINDOWS - 1)
     window: IndexArray = place.astype(np.intp) @ WINDOWS ** np.arange(3)
     return window
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    """The largest of each square's, or cube's, value and those around it, as `windows` counts."""
+    for stride in WINDOWS ** np.arange(3):
+        rows = values.reshape(-1, WINDOWS, stride)
+        values = rows.copy()
+        np.maximum(values[:, 1:], rows[:, :-1], out=values[:, 1:])
+        np.maximum(values[:, :-1], rows[:, 1:], out=values[:, :-1])
+    return values.ravel()
 
 
 def _differences(A: PETSc.Mat) -> tuple[PETSc.Mat, FloatArray]:

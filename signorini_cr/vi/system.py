@@ -14,7 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg.blas import dasum
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
 from ..errors import InputError, raise_together
 from ..fem.physics import Imposed, OnMesh
 from ..fem.space import facet_measures, ghosted_vector, shared_maximum, unknowns
@@ -96,8 +96,9 @@ class System:
         offset: What is to be added to the solution to have u; 0 in most cases.
         operator: A as the solver uses it.
         A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
-        b: Vector of χ less the Dirichlet values' share, the values themselves in their rows.
-        chi: Vector of χ alone, ghosts up to date.
+        b: χ less the Dirichlet values' share by dof, the values themselves in their rows, ghosts up
+            to date, shape (dofs,).
+        chi: χ alone, likewise.
         lower: α on Γ1, `PETSc.NINFINITY` where there is none, ghosts up to date, shape (dofs,).
         upper: β on Γ1, `PETSc.INFINITY` where there is none, likewise.
         dirichlet: Local dofs on Γ0, ghosts included.
@@ -134,15 +135,11 @@ class System:
             self.operator = ConstrainedMatrix(self.A, self.bounded)
         else:
             self.A, self.operator = like.A, like.operator
-        self.chi = fem.Function(V)
-        self.chi.x.array[:] = data.chi()
-        layout.shared_sum(self.chi.x.array)
+        self.chi = layout.shared_sum(data.chi())
         same = like if like is not None and self.u_D is like.u_D else None
-        self.b = fem.Function(V)
-        self.b.x.array[:] = self.chi.x.array
-        self.b.x.array[:] += self._lifting() if same is None else same._known_lifting
-        self.b.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
-        _require_finite(comm, "f, g or coefficient", self.b.x.array)
+        self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
+        self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
+        _require_finite(comm, "f, g or coefficient", self.b)
         self.residual_scale = self._scale(self._trivial() if same is None else same._known_trivial)
 
     def _read_boundary(self, owned: int) -> None:
@@ -263,10 +260,10 @@ class System:
         Args:
             trivial: As `_trivial` has it.
         """
-        comm, b = self._data.V.mesh.comm, self.b.x.array[: self.A.getLocalSize()[0]]
+        comm, b = self._data.V.mesh.comm, self.b[: self.A.getLocalSize()[0]]
         with np.errstate(over="ignore", invalid="ignore"):
             squares = np.array([np.sum((each - b) ** 2) for each in trivial])
-        norms = np.sqrt(comm.allreduce(squares))
+        norms = np.sqrt(summed(comm, squares))
         scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
         if not np.isfinite(norms).all():
             raise InputError("data: so large that their squares overflow; choose other units")
@@ -281,7 +278,7 @@ class System:
     def vectors(self, u: fem.Function, residual: fem.Function) -> Iterator[Vectors]:
         """Lend the complementarity problem's vectors for a block, on the functions' memory."""
         V = u.function_space
-        arrays = self.b.x.array, self.lower, self.upper, u.x.array, residual.x.array
+        arrays = self.b, self.lower, self.upper, u.x.array, residual.x.array
         vectors = Vectors(*(ghosted_vector(V, array) for array in arrays))
         try:
             yield vectors
@@ -338,7 +335,7 @@ class System:
     def data_rounded(self) -> float:
         """Bound of what rounding of u_D and of the loads may change in b, summed up; collective."""
         owned, fixed = self.A.getLocalSize()[0], self.owned_dirichlet
-        b, chi = self.b.x.array[:owned], self.chi.x.array[:owned]
+        b, chi = self.b[:owned], self.chi[:owned]
         b[fixed], values = 0.0, b[fixed]  # on Γ0 b has u_D, which is no force
         size = _sum_of_sizes(b) + 2.0 * _sum_of_sizes(chi)  # b − χ is u_D's share
         b[fixed] = values
@@ -371,7 +368,7 @@ class System:
         fem.apply_lifting(change.x.array, [self._data.a], [[self._bc(values)]])
         layout.shared_sum(change.x.array)
         owned = self.A.getLocalSize()[0]
-        of_load = change.x.array[:owned] + drawn(np.abs(self.chi.x.array[:owned]))
+        of_load = change.x.array[:owned] + drawn(np.abs(self.chi[:owned]))
         of_load[self.owned_dirichlet] = 0.0
         least = np.minimum(np.abs(self.bounds.lower), np.abs(self.bounds.upper))
         return of_load, drawn(least + abs(self.offset))
@@ -385,7 +382,7 @@ class System:
     def residual(self, u: fem.Function, r: fem.Function) -> float:
         """Compute r = A u − b, ghosts included, and its norm."""
         V = u.function_space
-        x, y, b = (ghosted_vector(V, w.x.array) for w in (u, r, self.b))
+        x, y, b = (ghosted_vector(V, each) for each in (u.x.array, r.x.array, self.b))
         self.A.mult(x, y)
         y.axpy(-1.0, b)
         norm = y.norm()

@@ -90,7 +90,7 @@ def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows():
     product.zeroRowsColumns(dirichlet + operator.matrix.getOwnershipRange()[0], 1.0)
     product.axpy(-1.0, operator.matrix)
     assert product.norm() <= 1e-12 * operator.matrix.norm()
-    ones = np.ones_like(level.system.b.x.array)
+    ones = np.ones_like(level.system.b)
     x, y = (ghosted_vector(level.V, array) for array in (ones, np.zeros_like(ones)))
     level.system.A.mult(x, y)
     assert np.allclose(level.system.row_sums(), y.array_r, atol=1e-12)

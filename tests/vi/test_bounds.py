@@ -106,7 +106,7 @@ def test_both_sides_against_a_solver_for_bounded_least_squares(element, nested):
         system = solution.level.system
         indptr, columns, values = system.A.getValuesCSR()
         n = len(indptr) - 1
-        A, b = np.zeros((n, n)), system.b.x.array.copy()
+        A, b = np.zeros((n, n)), system.b.copy()
         A[np.repeat(np.arange(n), np.diff(indptr)), columns] = values
         L = np.linalg.cholesky(A)
         low, high = (
