@@ -8,9 +8,8 @@ rows and columns of the active dofs. That is the reduced system exactly. What is
 
 It stops when its residual is a small part of what the active set's errors will leave anyway, so a
 Newton step with a wrong set ends early and one with the right set is the last; but not before it is
-certain of the contact dofs' signs, or what it left undone would decide on the next active set, but
-for those that matter little beside the ones that are wrong; and of the contact forces, which the
-residual says little about.
+certain of each contact dof's sign, or what it left undone would decide on the next active set, and
+of the contact forces, which the residual says little about.
 """
 
 from __future__ import annotations
@@ -274,9 +273,8 @@ class Outlook:
 
     Attributes:
         wrong: Norm of the part of the next residual that pulling forces and penetration will make.
-        unsettled: Whether dofs could still change sides, as their indicators are less than what
-            these changed by last, and would add to the next residual more than a small part of
-            what those on the wrong side do already.
+        unsettled: Whether any dof could still change sides: its indicator is less than what it
+            changed by last.
         moved: Change of the forces on active dofs, summed over each class of stiffness.
         forces: What these are measured against: their sums, and not less than `Stiffness.least`.
     """
@@ -329,19 +327,17 @@ class ReducedSystem:
         active, sums = self.active.mask, self.stiffness.sums
         wrong = np.where(active == (now > 0.0), 0.0, now)
         change = np.abs(now - before)
-        doubtful = np.where(np.abs(now) < SETTLED * change, change, 0.0)
         facts = np.concatenate(
             [
-                [wrong @ wrong, doubtful @ doubtful],
+                [wrong @ wrong, (np.abs(now) < SETTLED * change).any()],
                 sums(np.where(active, change, 0.0)),
                 sums(np.where(active, np.maximum(now, 0.0), 0.0)),
             ]
         )
         summed(self.stiffness.comm, facts)
-        adds, doubt = np.sqrt(facts[:2])
         moved, forces = facts[2:].reshape(2, -1)
         forces = np.maximum(forces, self.stiffness.least)
-        return Outlook(float(adds), bool(doubt > SET_SHARE * adds), moved, forces)
+        return Outlook(float(np.sqrt(facts[0])), bool(facts[1]), moved, forces)
 
     def rounding(self) -> float:
         """Norm of what rounding makes of A x, over the dofs that are solved for; collective."""
