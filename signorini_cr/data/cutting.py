@@ -26,7 +26,7 @@ PIECES = 6_000
 """Pieces that a mesh's cells are cut into at most, in all, or one for 64 cells."""
 BEHIND = 0.25
 """Part of what may be missed that is left to cells for which a large box is good enough."""
-ROUNDS = 20
+ROUNDS = 40
 """How often pieces are cut at most."""
 BISECTIONS = 6
 """Steps towards the smallest size that there is room for."""

@@ -5,11 +5,13 @@ nothing of its being 0. Here a formula becomes a sum of products of powers of at
 coordinates, of sums that are divided by or of which a root is taken, and of all that is not
 arithmetic. Numbers are fractions and exact. A sum P = … + c y² that is an atom lets y² be replaced
 by (P − …)/c everywhere, so that x² + y² is the one power r². The same formula comes out whatever
-the order of terms, and 0 where those relations make it 0.
+the order of terms, and 0 where those relations make it 0. Where it is about a point other than 0,
+as r² = (x − 2)² + y², coordinates are counted from there.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from fractions import Fraction
 from typing import Any, TypeAlias
 
@@ -43,14 +45,36 @@ def simplified(expression: Any) -> Any:
         expression: A scalar.
     """
     plain = expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
-    reader = _Reader()
-    try:
-        reader.read(plain)  # finds the sums that are atoms
-        reader.known.clear()
-        found = reader.formula(reader.read(plain))
-    except (_TooLong, OverflowError):
-        return expression
-    return found if _size(found) < _size(plain) else expression
+    found, shortest = expression, _size(plain)
+    for origin in ({}, _origin(plain)) if _origin(plain) else ({},):
+        reader = _Reader(origin)
+        try:
+            reader.read(plain)  # finds the sums that are atoms
+            reader.known.clear()
+            other = reader.formula(reader.read(plain))
+        except (_TooLong, OverflowError):
+            continue
+        if _size(other) < shortest:
+            found, shortest = other, _size(other)
+    return found
+
+
+def _origin(expression: Any) -> dict[Any, Fraction]:
+    """The number that each coordinate is compared with most often, for those that are with one."""
+    found: dict[Any, Counter[float]] = {}
+    for e in unique_pre_traversal(expression):
+        if isinstance(e, classes.Sum):
+            a, b = e.ufl_operands
+            a, b = (b, a) if isinstance(a, classes.ScalarValue) else (a, b)
+            if _is_coordinate(a) and isinstance(b, classes.ScalarValue):
+                found.setdefault(a, Counter())[-float(b)] += 1
+    return {a: _fraction(counts.most_common(1)[0][0]) for a, counts in found.items()}
+
+
+def _is_coordinate(e: Any) -> bool:
+    return isinstance(e, classes.Indexed) and isinstance(
+        e.ufl_operands[0], classes.SpatialCoordinate
+    )
 
 
 def _size(expression: Any) -> int:
@@ -67,16 +91,21 @@ def _fraction(value: float) -> Fraction:
 class _Reader:
     """Formulas as polynomials in atoms, which are numbered as they come.
 
+    Args:
+        origin: Where coordinates are counted from, if not from 0.
+
     Attributes:
         known: What has been read.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, origin: dict[Any, Fraction]) -> None:
+        self._origin = origin
         self.known: dict[Any, Polynomial] = {}
         self._atoms: list[Any] = []
         self._places: dict[Any, int] = {}
         self._squares: dict[int, Polynomial] = {}  # by atom
         self._positive: set[int] = set()
+        self._coordinates: set[int] = set()
 
     def read(self, e: Any) -> Polynomial:
         """The normal form."""
@@ -91,6 +120,8 @@ class _Reader:
             return {}
         if isinstance(e, classes.ScalarValue):
             return {(): _fraction(float(e))}
+        if _is_coordinate(e):
+            return self._coordinate(e)
         operands: Any = getattr(e, "ufl_operands", ())
         if isinstance(e, classes.Sum):
             return _sum(*(self.read(operand) for operand in operands))
@@ -103,6 +134,13 @@ class _Reader:
         if isinstance(e, classes.Power) and isinstance(operands[1], classes.ScalarValue):
             return self._power(operands[0], _fraction(float(operands[1])))
         return self._atom(self._key(e, operands), e)
+
+    def _coordinate(self, e: Any) -> Polynomial:
+        """The distance from the origin, and where that is."""
+        at = self._origin.get(e, Fraction(0))
+        found = self._atom(e, e - float(at) if at else e)
+        self._coordinates.add(self._places[e])
+        return _sum(found, {(): at}) if at else found
 
     def _key(self, e: Any, operands: Any) -> Any:
         """Make a key that is the same for the same functions of normal forms."""
@@ -149,7 +187,7 @@ class _Reader:
             for monomial in terms
             if len(monomial) == 1
             and monomial[0][1] == 2
-            and isinstance(self._atoms[monomial[0][0]], classes.Indexed)
+            and monomial[0][0] in self._coordinates
             and not any(
                 monomial[0][0] == i for other in terms if other != monomial for i, _ in other
             )

@@ -30,6 +30,9 @@ from .stopping import windows
 ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
 
+TINY = 1e-130
+"""What is not 0 must not be smaller: its square is multiplied with small numbers, and is lost."""
+
 FAR = 16.0
 """Values so many times as far from 0 as from one another are told from their middle."""
 
@@ -267,6 +270,9 @@ class System:
         scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
         if not np.isfinite(norms).all():
             raise InputError("data: so large that their squares overflow; choose other units")
+        largest = max(float(np.abs(each - b).max(initial=0.0)) for each in trivial)
+        if 0.0 < max(comm.allgather(largest)) < TINY:
+            raise InputError("data: so small that their squares are lost; choose other units")
         return scale
 
     @property

@@ -61,6 +61,14 @@ SAME = {
 }
 
 
+@pytest.mark.parametrize("origin", [(2, 0), (0.1, 0.2), (3.7, -2.1)])
+def test_harmonic_about_another_point(origin):
+    """r^{3/2} cos(3θ/2), with r and θ seen from there."""
+    a, b = x - origin[0], y - origin[1]
+    u = ufl.sqrt(a**2 + b**2) ** 1.5 * ufl.cos(1.5 * ufl.atan2(b, a))
+    assert number(simplified(minus_laplace(u))) == 0.0
+
+
 @pytest.mark.parametrize("name", SAME)
 def test_values_stay_the_same(name):
     values, bounds = evaluate(SAME[name], POINTS)
@@ -69,7 +77,7 @@ def test_values_stay_the_same(name):
 
 
 def test_what_gets_longer_is_left_alone():
-    for f in (minus_laplace((1 + x + y + x * y) ** 8 * ufl.sin(x)), exact.I.problem.exact(X)):
+    for f in (minus_laplace((x**2 + y + 3 * x * y) ** 8 * ufl.sin(x)), exact.I.problem.exact(X)):
         assert simplified(f) is f
 
 
