@@ -64,7 +64,7 @@ NEWTON: dict[str, object] = {
     "snes_vi_zero_tolerance": 0.0,
     # relative to the start, and a warm start needs the absolute one
     "snes_rtol": 0.0,
-    "snes_max_it": 100,
+    "snes_max_it": 300,
 }
 """The active set method. SNES hands its linear systems to a solver in Python."""
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..arrays import FloatArray, summed
@@ -132,6 +133,7 @@ class ReducedSolver:
         self._stiffness, self._share = stiffness, loose * FORCES
         self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(bounds.lower), dtype=bool))
         self.reached, self.reduction, self.iterations = np.inf, SET_SHARE, 0
+        self._cut, self._comm = True, snes.getComm().tompi4py()
         self.force_errors: FloatArray = np.full(stiffness.number, np.inf)
         self._step = self._x.duplicate()
         self.ksp = ksp = PETSc.KSP().create(self.matrix.getComm())
@@ -169,6 +171,9 @@ class ReducedSolver:
         self._stiffness.sort(self._x, self._b)
         inactive, first = self._snes.getVIInactiveSet().array, self.matrix.getOwnershipRange()[0]
         self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, first)
+        careful = self._snes.getIterationNumber() >= CAREFUL
+        if careful:
+            self._hold()
         forces = self._residual.array_r[self.active.bounded].copy()
         self._residual.array[self.active.dofs] = 0.0
         with self._cycle.constrained(self.active.dofs, deep=self._uses_cycle):
@@ -184,18 +189,28 @@ class ReducedSolver:
             rounding = NOISE * self._cycle.finest.rounding(self._x, self.active.dofs)
             if rounding <= next_to_nothing:
                 self.reached = max(test.reached, rounding)
-        if self._snes.getIterationNumber() >= CAREFUL:
+        if careful:
             self._shorten()
         reduced.array[:] = self._step.array_r[inactive - first]
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 
-    def _shorten(self) -> None:
-        """Halve the step until it lowers ½ x·A x − b·x along the way that the bounds leave of it.
+    def _hold(self) -> None:
+        """Keep all dofs on their bounds there, but for one where the last step was not cut short.
 
-        Full steps are the primal-dual active set method, which may go round in circles where A is
-        no M-matrix, as on thin cells. These end at the solution from anywhere (Bertsekas 1982).
+        The primal-dual method, which frees all that pull, may go round in circles where A is no
+        M-matrix, as on thin cells. This is the primal one, in which no energy comes back.
         """
+        bounded = self.active.bounded
+        forces, gap = self.forces(), self.bounds.gap(self._x.array_r[bounded])
+        pull = np.where(gap <= 0.0, -forces, 0.0)
+        most, held = float(pull.max(initial=0.0)), gap <= 0.0
+        if most == max(self._comm.allgather(most)) > 0.0 and not self._cut:
+            held[pull.argmax()] = False
+        self.active = ActiveSet(bounded, held)
+
+    def _shorten(self) -> None:
+        """Halve the step until ½ x·A x − b·x falls along the way that the bounds leave of it."""
         x, at, share = self._x.array_r, self._cycle.operator.dofs, 1.0
         way, image = self._x.duplicate(), self._x.duplicate()
         for _ in range(HALVES):
@@ -207,6 +222,8 @@ class ReducedSolver:
             if slope + 0.5 * way.dot(image) <= ENOUGH * slope:
                 break
             share *= 0.5
+        clipped = bool((moved != x[at] - share * self._step.array_r[at]).any())
+        self._cut = self._comm.allreduce(clipped, op=MPI.LOR) or share < 1.0
         self._step.scale(share)
         release(way, image)
 

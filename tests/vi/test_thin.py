@@ -227,3 +227,42 @@ def test_cells_that_are_not_thin_keep_multigrid():
         assert solution.iterations.linear <= 9 * solution.iterations.newton
     words = "multigrid on 4 meshes with a direct solver on the coarsest"
     assert solution.iterations.preconditioner == words
+
+
+CIRCLES = (
+    ([[0, 0], [1, 0], [1.3, 1], [-0.5, 0.7]], "cdcd", 1e-4, 0.3, -3e4, 0.05, 0.03),
+    ([[0.98, -0.5], [0.05, 0.71], [-0.19, -0.99]], "cdc", 1e-3, 0.2, -3.0, 0.6, 0.5),
+    (
+        [[0.79, 0.1], [0.73, 0.69], [-0.32, 0.57], [-0.51, 0.19], [-0.72, -0.79], [0.25, -0.76]],
+        "cndccd",
+        1e-3,
+        0.2,
+        -94868.0,
+        0.6,
+        0.03,
+    ),
+)
+"""Corners, kinds of edges, by how much it is squashed, size, load, depth and waves of α."""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("case", CIRCLES)
+def test_the_active_set_does_not_go_round_in_circles(case):
+    """Full steps do, here; the discrete conditions hold in extended precision."""
+    corners, kinds, squash, size, f, depth, waves = case
+    names = {"c": "contact", "d": "dirichlet", "n": "neumann"}
+    polygon = Polygon([(x, y * squash) for x, y in corners], [names[kind] for kind in kinds])
+    problem = Problem(f=f, obstacle=lambda x: -depth + waves * ufl.cos(9 * x[0]))
+    for solution in solve_levels(problem, polygon.mesh(size, MPI.COMM_SELF), 4):
+        assert solution.iterations.newton < 40
+        system = solution.level.system
+        A = system.A.convert("dense").getDenseArray().astype(np.longdouble)
+        x = solution.u.x.array.astype(np.longdouble)
+        residual, made_of = A @ x - system.b, np.abs(A) @ np.abs(x) + np.abs(system.b)
+        bounded, free = system.bounded, np.ones(len(x), dtype=bool)
+        free[system.dirichlet] = free[bounded] = False
+        assert (np.abs(residual[free]) <= 1e-9 * made_of[free]).all()
+        force, gap = residual[bounded], x[bounded] - system.lower[bounded]
+        large = 1e-7 * float(np.maximum(force, 0.0).sum())
+        assert gap.min() >= -1e-12 and force.min() >= -large
+        assert np.abs(force[gap > 1e-9]).max(initial=0.0) <= large
