@@ -40,7 +40,7 @@ from .smoothing import smoother
 from .transfer import Transfer
 from .whole import Whole
 
-PATIENCE, LITTLE = 40, 15
+PATIENCE, LITTLE = 40, 20
 """CG steps on one mesh after which the chain is given up in a linear system that takes many.
 
 A factorisation takes as long as 30 steps of the cycle at 0.02 to 0.3 M dofs and 55 at 1.2 M. That
