@@ -167,15 +167,17 @@ def has_conditions(expression: Any) -> bool:
 
 
 def differences(expression: Any, ordered: bool = True) -> list[Any]:
-    """What changes its sign where conditions of a lowered expression change; local.
+    """What changes its sign where a lowered expression jumps or has a kink; local.
 
     Args:
         expression: The expression.
-        ordered: Whether to leave out what is only asked whether it is 0.
+        ordered: Whether to leave out what is only asked whether it is 0; else kinks are.
     """
-    kinds = _ORDERED if ordered else _COMPARISONS
-    nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
-    return [e.ufl_operands[0] - e.ufl_operands[1] for e in nodes if isinstance(e, kinds)]
+    kinds = (*_ORDERED, classes.MaxValue, classes.MinValue) if ordered else _COMPARISONS
+    nodes = list(ufl.corealg.traversal.unique_pre_traversal(expression))
+    found = [e.ufl_operands[0] - e.ufl_operands[1] for e in nodes if isinstance(e, kinds)]
+    kinks = [e.ufl_operands[0] for e in nodes if isinstance(e, classes.Abs)]
+    return found + kinks if ordered else found
 
 
 def values(expression: Any, points: Boxes) -> FloatArray:
@@ -268,6 +270,8 @@ class Enclosure:
         if isinstance(e, classes.Atan2):
             return self._atan2(*(self(operand) for operand in e.ufl_operands))
         operands: Any = getattr(e, "ufl_operands", ())
+        if isinstance(e, classes.Abs) and self.boxes.corners is not None:
+            return self._size(operands[0])
         for kind, series in SERIES.items():
             if isinstance(e, kind):
                 return self._compose(self(operands[0]), series)
@@ -505,13 +509,28 @@ class Enclosure:
         """All coefficients from the first order on."""
         return tuple(range(1, len(indices(self.boxes.variables, self.order))))
 
+    def _size(self, e: Any) -> Jet:
+        """|e| on simplices, where e may have one sign though it has both on the box."""
+        a = self(e)
+        low, high, _ = self._difference(a, self._constant(0.0))
+        if self.boxes.along is None and self.order >= 2:
+            low, high = self._by_slopes(low, high, e, classes.Zero())
+        above, below = low >= 0, high <= 0
+        jet = self._choose(above, ~(above | below), a, Jet(-a.high, -a.low, -a.rest), 1)
+        return replace(jet, low=np.maximum(jet.low, 0.0))
+
+    def _order(self, a: Jet, b: Jet) -> tuple[BoolArray, BoolArray]:
+        """Where a is not below b, and where b is not below a; on simplices, if they are meant."""
+        low, high, _ = self._difference(a, b)
+        return low >= 0, high <= 0
+
     def _maximum(self, a: Jet, b: Jet) -> Jet:
-        above, below = a.low >= b.high, b.low >= a.high
+        above, below = self._order(a, b)
         jet = self._choose(above, ~(above | below), a, b, 1)
         return replace(jet, low=np.maximum(a.low, b.low), high=np.maximum(a.high, b.high))
 
     def _minimum(self, a: Jet, b: Jet) -> Jet:
-        above, below = a.low >= b.high, b.low >= a.high
+        above, below = self._order(a, b)
         jet = self._choose(below, ~(above | below), a, b, 1)
         return replace(jet, low=np.minimum(a.low, b.low), high=np.minimum(a.high, b.high))
 
