@@ -167,17 +167,23 @@ def has_conditions(expression: Any) -> bool:
 
 
 def differences(expression: Any, ordered: bool = True) -> list[Any]:
-    """What changes its sign where a lowered expression jumps or has a kink; local.
+    """What changes its sign where conditions of a lowered expression change; local.
 
     Args:
         expression: The expression.
-        ordered: Whether to leave out what is only asked whether it is 0; else kinks are.
+        ordered: Whether to leave out what is only asked whether it is 0; else what conditions take
+            the size of is among it, as s in |s| < w.
     """
-    kinds = (*_ORDERED, classes.MaxValue, classes.MinValue) if ordered else _COMPARISONS
-    nodes = list(ufl.corealg.traversal.unique_pre_traversal(expression))
-    found = [e.ufl_operands[0] - e.ufl_operands[1] for e in nodes if isinstance(e, kinds)]
-    kinks = [e.ufl_operands[0] for e in nodes if isinstance(e, classes.Abs)]
-    return found + kinks if ordered else found
+
+    def within(e: Any, kinds: Any) -> list[Any]:
+        nodes = ufl.corealg.traversal.unique_pre_traversal(e)
+        return [each for each in nodes if isinstance(each, kinds)]
+
+    conditions = within(expression, _ORDERED if ordered else _COMPARISONS)
+    found = [e.ufl_operands[0] - e.ufl_operands[1] for e in conditions]
+    if ordered:
+        found += [size.ufl_operands[0] for e in conditions for size in within(e, classes.Abs)]
+    return list(dict.fromkeys(found))
 
 
 def values(expression: Any, points: Boxes) -> FloatArray:

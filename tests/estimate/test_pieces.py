@@ -544,6 +544,7 @@ def test_what_a_lifting_changes(known, reaction):
         kappa=kappa,
         certain=certain,
         reaction=np.array(reaction),
+        most=np.array(reaction),
         w=0,
         segments=SimpleNamespace(at_facets=lambda *_: rows),
     )
