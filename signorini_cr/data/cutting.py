@@ -42,8 +42,6 @@ MUCH = 1.5
 """For how large a sum of errors, 1 being the goal, there is more room."""
 ACROSS = 1.15
 """How much better than by quarters errors must fall for a cut across an axis."""
-SILENT = 0.1
-"""How little errors fall, in powers of e, where half a box says nothing about how to cut."""
 DEEP = 60.0
 """How far above the threshold pieces are cut twice at once."""
 ENOUGH = 0.5
@@ -328,29 +326,28 @@ def _directed(front: _Front, wanted: _Wanted) -> _Front:
     # where nothing is known there is a singular point, of which slabs do not know
     best = np.where(known, best, QUARTERS)
     # a jump through the middle is none the smaller on smaller boxes there
-    silent = np.asarray((rates > -SILENT).all(axis=0))
     if wanted.levels is not None:
         triangles, of = pieces.triangles()
         level = wanted.levels(triangles)
-        jumps = ((level.min(axis=1) < 0.0) & (level.max(axis=1) > 0.0)).any(axis=0)
-        silent[of[jumps]] = True
-    silent &= known
-    if silent.any():
-        best[silent] = _tried(front[silent], wanted)
+        jumps = np.zeros(n, dtype=bool)
+        jumps[of[((level.min(axis=1) < 0.0) & (level.max(axis=1) > 0.0)).any(axis=0)]] = True
+        jumps &= known
+        if jumps.any():
+            best[jumps] = _tried(front[jumps], wanted, wanted.levels)
     return replace(front, ways=best)
 
 
-def _tried(front: _Front, wanted: _Wanted) -> IndexArray:
+def _tried(front: _Front, wanted: _Wanted, levels: Levels) -> IndexArray:
     """The way to cut that leaves a jump in few pieces, by trying them all; else quarters; local.
 
     Errors fall faster than the number of pieces grows where what is left, in parts of what there
     was, times the number of pieces that have it is below 1: about that is what quarters do.
     """
     n = len(front.share)
-    ways = [QUARTERS, 0, 1] if wanted.levels is None else [QUARTERS, JUMP, 0, 1]
+    ways = [QUARTERS, JUMP, 0, 1]
     growth = np.ones((len(ways), n))
     for row, way in zip(growth[1:], ways[1:], strict=True):
-        finer, origin, _ = front.pieces.cut(np.full(n, way), wanted.levels)
+        finer, origin, _ = front.pieces.cut(np.full(n, way), levels)
         left = wanted.shares(finer, wanted.errors(finer))
         sums, counts = (np.bincount(origin, each, minlength=n) for each in (left, left > 0.0))
         row[:] = np.clip(sums / front.share, 0.0, 1e300) * counts
