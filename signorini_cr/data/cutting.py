@@ -50,8 +50,6 @@ FALL = 4.0
 """By how much errors fall where pieces are cut, at least, as a rule."""
 IDLE = 0.25
 """Exponent of the number of pieces by which a cut lowers the error that does little."""
-_CUBIC = {1: 1.0, 2: 0.5, 3: 0.25}
-"""Distance on [−1, 1]^m of xyz, x²y and x³ from quadratics, by the largest exponent."""
 _FEW = 1e-9
 
 

@@ -46,7 +46,8 @@ def simplified(expression: Any) -> Any:
     """
     plain = expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
     found, shortest = expression, _size(plain)
-    for origin in ({}, _origin(plain)) if _origin(plain) else ({},):
+    elsewhere = _origin(plain)
+    for origin in ({}, elsewhere) if elsewhere else ({},):
         reader = _Reader(origin)
         try:
             reader.read(plain)  # finds the sums that are atoms
