@@ -22,7 +22,7 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import diffusion
 from ..data.loads import NOTHING, Certain, Known, Segments, VolumeMoments, mean_to_norm, reacts
 from ..data.moments import Coefficient, OnParts
-from ..fem.cells import Cells, blocks, measures, pick, sum_rows, vertex_rows
+from ..fem.cells import BoundaryFacets, Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from ..rounding import at_most, interval
 from .beyond import Beyond
@@ -32,6 +32,7 @@ from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
+from .reaction import Reaction
 from .sums import Sums, Totals
 
 if TYPE_CHECKING:
@@ -204,7 +205,6 @@ ADRIFT = (
     "part of the domain has no way to a place where u is held: there is no Γ0, no heat loss and no"
     " reaction, and no contact whose force is larger than what is left of the equation"
 )
-UNKNOWN_REACTION = "the reaction is not known to be bounded, and 0 or more, on each cell"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
@@ -245,9 +245,8 @@ class _Known:
         level: The mesh, with those below it.
         cells: What the certificate needs to know of it.
         kappa: The coefficient.
-        reaction: c, or a lower bound of it, shape (cells,) or ().
-        most: The same object, or an upper bound where c varies within cells.
-        square: Then means of c u_h², and what these miss; else None.
+        c: The reaction.
+        square: Means of c u_h², and what these miss, where c varies within cells; else None.
         certain: f − c u_h.
         segments: g − b u_h.
         flux: y.
@@ -260,8 +259,7 @@ class _Known:
     level: Level
     cells: Cells
     kappa: Coefficient
-    reaction: FloatArray
-    most: FloatArray
+    c: Reaction
     square: Certain | None
     certain: Certain
     segments: Segments
@@ -284,83 +282,97 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     data = diffusion(level.data)
     _insist(data.forms.uncertified)
     cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
-    kappa, (reaction, most) = Coefficient(data.compiled.kappa, cells), data.reaction
-    _insist(kappa.reason)
-    varies = most is not reaction
-    if varies:
-        bounded = bool((reaction >= 0.0).all() and np.isfinite(most).all())
-        _insist(None if cells.comm.allreduce(bounded, op=MPI.LAND) else UNKNOWN_REACTION)
+    kappa, c = Coefficient(data.compiled.kappa, cells), Reaction.of(data)
+    _insist(kappa.reason or c.reason)
     w = vertex_rows(u, cells)
-    edge = Known.of(data.edges, cells, w)
-    load, f, square = data.load, data.compiled.f, None
-    if varies:
-        f, c_u2 = data.reacting(w)
-        load = data.moments.with_source(VolumeMoments.of(f, cells))
-    of_u = load if varies or not reacts(reaction) else load.less(reaction, w)
+    edge, rest = Known.of(data.edges, cells, w), c.rest(w)
     contact, signs = alpha.side, alpha.signs
     gap = signs * u[contact.dofs] - alpha.means
-    flux = equilibrate(cells, kappa.mean, w, of_u, edge, contact, signs, gap)
-    flux.taken_up = relax(cells, kappa.mean, flux, reaction, edge, contact, signs)
+    flux = equilibrate(cells, kappa.mean, w, rest, edge, contact, signs, gap)
+    flux.taken_up = relax(cells, kappa.mean, flux, c.low, edge, contact, signs)
+    if solution.element != "CR":
+        w = _seen_from(solution, cells, kappa, flux, w)
     size = _size(cells, kappa, w, flux)
-    of_f = VolumeMoments.of(f, cells) if varies else data.of_f
-    certain = Certain.of(f, of_f, cells, kappa.low, size, reaction)
-    _insist(certain.reason)
-    if varies:
-        goal = size**2 / np.sqrt(kappa.smallest)  # as it is a part of J
-        of_c = VolumeMoments.of(c_u2, cells)
-        square = Certain.of(c_u2, of_c, cells, kappa.low, goal, reaction, norms=False)
-        _insist(square.reason)
-    certain = replace(certain, load=data.moments.with_source(certain.load))
+    certain, square = c.certain(w, kappa, size)
+    _insist(certain.reason or (None if square is None else square.reason))
     segments = Segments.joined(data.edges, cells, w, kappa.low, size)
     _insist(segments.reason)
-    # y is to have the means that f and g have now
-    flux.left += cells.volume * (certain.load.mean - load.mean)
-    if reacts(reaction) and not varies:
-        certain = replace(certain, load=certain.load.less(reaction, w))
+    # y is to have the means that f − c u_h and g − b u_h have now
+    flux.left += cells.volume * (certain.load.mean - rest.mean)
     change = segments.through - edge.shares.sum(axis=0)
     flux.excess[edge.side.local, edge.side.cells] += change
     np.add.at(flux.left, edge.side.cells, change)
-    left = carried = 0.0
-    if flux.taken_up is None or reaction.ndim:
-        left = unbalanced(level, cells, flux.loose, kappa.least, size, reaction)
-        carried = balance(cells, flux, kappa.low, size, left)
-        if carried:
-            left = unbalanced(level, cells, flux.loose, kappa.least, size, reaction)
+    left, carried = _closed(level, cells, kappa, c.low, flux, size)
     if np.isposinf(left):
-        left, flux.carried = 0.0, np.zeros_like(flux.contact)
         missed = _missed(cells, certain, segments)
-        for amounts, signed in ((flux.loose, True), (missed, False)):
-            norm, change = carried_to_contact(
-                cells, flux, amounts, kappa.least, contact, reaction, signed
-            )
-            left += norm
-            flux.carried += change
-        enough = bool((flux.carried <= flux.contact).all())
-        if not cells.comm.allreduce(enough, op=MPI.LAND):
-            left = np.inf
+        left = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
-    c = reaction, most, square
-    return _Known(level, cells, kappa, *c, certain, segments, flux, w, size, left, carried)
+    return _Known(level, cells, kappa, c, square, certain, segments, flux, w, size, left, carried)
+
+
+def _closed(
+    level: Level, cells: Cells, kappa: Coefficient, c: FloatArray, flux: Flux, size: float
+) -> tuple[float, float]:
+    """Balance y where no reaction takes up what is left of the equation; collective.
+
+    Returns:
+        `_Known.left`, infinite where nothing holds u, and `_Known.carried`.
+    """
+    if flux.taken_up is not None and not c.ndim:
+        return 0.0, 0.0
+    left = unbalanced(level, cells, flux.loose, kappa.least, size, c)
+    carried = balance(cells, flux, kappa.low, size, left)
+    if carried:
+        left = unbalanced(level, cells, flux.loose, kappa.least, size, c)
+    return left, carried
+
+
+def _carried_to_contact(
+    cells: Cells,
+    kappa: Coefficient,
+    c: FloatArray,
+    flux: Flux,
+    contact: BoundaryFacets,
+    missed: FloatArray,
+) -> float:
+    """Let the contact force, which alone holds u, take what is left and what is missed; collective.
+
+    Returns:
+        What that adds to the bound, infinite where the force is too small.
+    """
+    left, flux.carried = 0.0, np.zeros_like(flux.contact)
+    for amounts, signed in ((flux.loose, True), (missed, False)):
+        norm, change = carried_to_contact(cells, flux, amounts, kappa.least, contact, c, signed)
+        left += norm
+        flux.carried += change
+    enough = bool((flux.carried <= flux.contact).all())
+    return left if cells.comm.allreduce(enough, op=MPI.LAND) else float(np.inf)
+
+
+def _seen_from(
+    solution: Found, cells: Cells, kappa: Coefficient, flux: Flux, w: FloatArray
+) -> FloatArray:
+    """See y from a conforming u_h instead of w, and return that at the cells' vertices."""
+    dofs = solution.u.function_space.dofmap.list[: cells.number]
+    own: FloatArray = np.ascontiguousarray(solution.u.x.array[dofs].T)
+    flux.excess -= cells.tdim * kappa.mean * cells.apply(w - own, slice(0, cells.number))
+    flux.steepness = cells.slopes(own)
+    return own
 
 
 def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
     """Make v, improve y where that promises much, and integrate the gap; collective."""
     cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     if solution.element != "CR":
-        # v comes from the conforming solution itself, and p is seen from its gradient
-        conforming = solution.u.function_space.dofmap.list[: cells.number]
-        own, sweeps = np.ascontiguousarray(solution.u.x.array[conforming].T), 0
-        change = cells.apply(known.w - own, slice(0, cells.number))
-        flux.excess -= cells.tdim * kappa.mean * change
-        known.w, flux.steepness = own, cells.slopes(own)
+        sweeps = 0  # v is the solution itself
     data = diffusion(known.level.data)
     u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
     plain = data.forms.of_one is None
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal, highest)
-    sums = integrate(cells, kappa, known.w, load, flux, v, known.reaction, known.most)
+    sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
     if plain and promising(cells, kappa.mean, flux, sums):
         if kappa.values is None and v.cusps is None:
             v = cubed(cells, kappa.mean, flux, v)
@@ -382,7 +394,7 @@ def _functional(known: _Known, plain: bool) -> Functional:
     side = segments.facets.picked(lossy)
     loss = segments.loss[lossy] * measures(cells, side)
     toward, strong = segments.target(known.flux.shed)[:, lossy], segments.given[lossy]
-    masses = Masses(not plain, known.reaction, side, loss, toward, strong)
+    masses = Masses(not plain, known.c.low, side, loss, toward, strong)
     return Functional(cells, known.w, kappa.mean, steady, masses)
 
 
@@ -395,7 +407,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     cells, kappa, segments = known.cells, known.kappa, known.segments
     totals, load = sums.totals, known.certain.load
     totals.loose = integrate_edge(
-        cells, kappa, known.w, load, segments, known.flux, v, sums, known.reaction
+        cells, kappa, known.w, load, segments, known.flux, v, sums, known.c.low
     )
     totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
     totals.energy_slack += more_energy
@@ -412,7 +424,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
     totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
     hidden, hidden_energy = _hidden(known, v, sums)
-    rounding = _rounding(cells, kappa, known.most, known.w, load, known.flux)
+    rounding = _rounding(cells, kappa, known.c.high, known.w, load, known.flux)
     total = totals.over_ranks(cells)
 
     ball = _Ball.of(total, known.left, hidden, rounding)
@@ -516,14 +528,14 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,
-        varies=known.kappa.varies or known.most is not known.reaction,
+        varies=known.kappa.varies or known.c.varies,
         excess=flux.excess,
         beyond=flux.beyond,
         vertices=v.vertices,
         bumps=v.bumps,
         thirds=v.thirds,
         cusps=v.cusps,
-        reaction=known.reaction,
+        reaction=known.c.low,
         left=flux.left,
         taken_up=flux.taken_up,
         shed=flux.shed,
@@ -629,8 +641,8 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         missed = certain.missed
         for part in blocks(cells.number):
             by_slope = rough = mean_to_norm(cells, kappa.low, NOTHING, part) * certain.rough[part]
-            if reacts(known.reaction):
-                rough = mean_to_norm(cells, kappa.low, known.reaction, part) * certain.rough[part]
+            if reacts(known.c.low):
+                rough = mean_to_norm(cells, kappa.low, known.c.low, part) * certain.rough[part]
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
             if cells.tdim == 2:
                 means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3
@@ -646,7 +658,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     loose = np.sqrt(square) + np.sqrt(on_edge)
     if known.flux.carried is None:
         missed = _missed(cells, certain, segments)
-        loose += unbalanced(level, cells, missed, kappa.least, size, known.reaction)
+        loose += unbalanced(level, cells, missed, kappa.least, size, known.c.low)
     return float(loose), float(change)
 
 
@@ -673,7 +685,7 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
     change = before * steep + np.sqrt(cells.volume[which]) * _mean_square(known, which) * area
     if sums.apart is not None:
-        c = pick(known.most, which)
+        c = pick(known.c.high, which)
         steep = np.hypot(steep, np.sqrt(c) * area)
         change += np.sqrt(c * sums.apart[which]) * area
     # on facets of Γ1 with a flux that is known

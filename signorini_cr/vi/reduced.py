@@ -236,7 +236,12 @@ class ReducedSolver:
         if self._uses_cycle and self._cycle.may_give_up:
             test.patience = max(SLOW, self._cycle.patience - self.iterations)
         self.ksp.setConvergenceTest(test)
-        self.ksp.solve(self._residual, self._step)
+        try:
+            self.ksp.solve(self._residual, self._step)
+        except PETSc.Error:
+            # PETSc crashes when it frees a KSP for whose vectors there was not memory enough
+            self.ksp.incRef()
+            raise
         self.iterations += self.ksp.getIterationNumber()
         return test
 

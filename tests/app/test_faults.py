@@ -56,36 +56,40 @@ def test_a_run_that_is_ended_leaves_whole_files_of_one_run(
 LIMITED = """
 import resource, sys
 from pathlib import Path
+from mpi4py import MPI
 from signorini_cr import limits
 from signorini_cr.app import cli
+from signorini_cr.vi.level import Level
 limits.shortage = lambda *_: None  # no estimate beforehand
-line, rows = cli.Screen.line, []
+made = Level.__post_init__
 
-def limited(self, text):
-    line(self, text)
-    rows.append(text)
-    if len(rows) == 4 and (LONE_RANK is None or self.root == (LONE_RANK == 0)):
+def limited(self):
+    made(self)
+    if self.number == 6 and MPI.COMM_WORLD.rank in LIMITED_RANKS:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         most = pages * resource.getpagesize() + 20_000_000
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
-cli.Screen.line = limited
+Level.__post_init__ = limited
 sys.exit(cli.main())
 """
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("ranks, lone", [(1, None), (2, 1)])
-def test_where_memory_ends_the_levels_before_are_kept(ranks, lone, tmp_path: Path) -> None:
-    """The limit comes after level 2, and bites when the arrays have become large enough."""
+@pytest.mark.parametrize("limited", [(0,), (1,)])
+def test_where_memory_ends_the_levels_before_are_kept(limited, tmp_path: Path) -> None:
+    """The limit comes when level 6 has its mesh, and bites when the arrays are large enough.
+
+    Not while a mesh is made: DOLFINx 0.11 does that in threads, whose errors end the process.
+    """
     (tmp_path / "case.toml").write_text(kills.CASE)
-    (tmp_path / "run.py").write_text(LIMITED.replace("LONE_RANK", repr(lone)))
+    (tmp_path / "run.py").write_text(LIMITED.replace("LIMITED_RANKS", repr(limited)))
     argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.start(tmp_path / "run.py", *argv, ranks=ranks)
+    done = helpers.start(tmp_path / "run.py", *argv, ranks=limited[-1] + 1)
     assert done.returncode == cli.NOT_CONVERGED, done.stderr
     words = " ".join(done.stderr.split())
     level = int(words.split("stopped on level ")[1].split(":")[0])
-    assert level >= 3
+    assert level >= 6
     assert f"stopped on level {level}: out of memory, of which this process has had 0." in words
     assert f"levels 0 to {level - 1} are finished and kept in" in words
     assert "Traceback" not in done.stderr

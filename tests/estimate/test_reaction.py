@@ -17,6 +17,7 @@ from signorini_cr import (
     solve,
     solve_levels,
 )
+from signorini_cr.estimate.certificate import certify
 
 pytestmark = pytest.mark.slow
 
@@ -45,6 +46,20 @@ def integral(domain, integrand):
     return domain.mesh.comm.allreduce(fem.assemble_scalar(form))
 
 
+def energy_of_the_solution(domain, c, b):
+    """J(u), from u itself."""
+    x = ufl.SpatialCoordinate(domain.mesh)
+    n, slope = ufl.FacetNormal(domain.mesh), ufl.grad(u(x))
+    f = -1.5 * ufl.div(slope) + c * u(x)
+    inside = 0.75 * ufl.inner(slope, slope) + 0.5 * c * u(x) ** 2 - f * u(x)
+    ds = ufl.ds(domain.mesh, subdomain_data=domain.tags, metadata={"quadrature_degree": 10})
+    right, left = (ds(domain.parts[part]) for part in ("right", "left"))
+    known = 1.5 * ufl.inner(slope, n)
+    edge = (0.5 * b * u(x) ** 2 - (known + b * u(x)) * u(x)) * right - known * u(x) * left
+    on_edge = domain.mesh.comm.allreduce(fem.assemble_scalar(fem.form(edge)))
+    return integral(domain, inside) + on_edge
+
+
 REACTIONS = {
     "affine": lambda x: 1 + x[0],
     "down to 0": lambda x: 30 * x[0] ** 2,
@@ -66,18 +81,7 @@ def test_bound_and_bracket(name):
         assert certificate.bound_energy_norm >= np.sqrt(with_c)
         ratios.append(certificate.bound_energy_norm / np.sqrt(with_c))
         low, high = certificate.energy
-        slope = ufl.grad(u(x))
-        f = -1.5 * ufl.div(slope) + c(x) * u(x)
-        energy = integral(
-            solution.domain, 0.75 * ufl.inner(slope, slope) + 0.5 * c(x) * u(x) ** 2 - f * u(x)
-        )
-        n, tags = ufl.FacetNormal(mesh), solution.domain.tags
-        ds = ufl.ds(mesh, subdomain_data=tags, metadata={"quadrature_degree": 10})
-        right, left = (ds(solution.domain.parts[part]) for part in ("right", "left"))
-        known = 1.5 * ufl.inner(slope, n)
-        edge = (u(x) ** 2 - (known + 2 * u(x)) * u(x)) * right - known * u(x) * left
-        energy += mesh.comm.allreduce(fem.assemble_scalar(fem.form(edge)))
-        assert low <= energy <= high
+        assert low <= energy_of_the_solution(solution.domain, c(x), 2.0) <= high
     assert max(ratios) < 1.3 and (name == "large" or ratios[-1] < 1.1)
 
 
@@ -123,3 +127,27 @@ def test_forces_are_refused():
     solution = solve(problem(REACTIONS["affine"]), SQUARE.mesh(0.3, MPI.COMM_WORLD))
     with pytest.raises(InputError, match="the coefficient or the reaction varies within cells"):
         solution.flux("floor")
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.05, 1.5])
+@pytest.mark.parametrize("b", [2.0, 1e3])
+@pytest.mark.parametrize("c", [0.0, 100.0, 1e4, REACTIONS["wave"]])
+def test_a_conforming_function_with_the_flux_of_the_other_element(c, b, scale):
+    """Its own values are in c u_h and b u_h, be it the P1 solution or far from it."""
+    conditions = problem(0.0).conditions | {"right": Robin(coefficient=b)}
+    posed = Problem(exact=u, coefficient=1.5, reaction=c, conditions=conditions)
+    domain = SQUARE.mesh(0.25, MPI.COMM_WORLD)
+    conforming = solve(posed, domain, "P1")
+    conforming.u.x.array[:] *= scale
+    certificate = certify(conforming, flux_from=solve(posed, domain))
+    x = ufl.SpatialCoordinate(domain.mesh)
+    e, at = u(x) - conforming.u, c(x) if callable(c) else c
+    ds = ufl.ds(domain.mesh, subdomain_data=domain.tags, metadata={"quadrature_degree": 10})
+    square = integral(domain, 1.5 * ufl.inner(ufl.grad(e), ufl.grad(e)) + at * e**2)
+    right = fem.form(b * e**2 * ds(domain.parts["right"]))
+    square += domain.mesh.comm.allreduce(fem.assemble_scalar(right))
+    assert certificate.bound_energy_norm >= np.sqrt(square)
+    if scale == 1.0:
+        assert certificate.bound_energy_norm <= 2.0 * np.sqrt(square)
+    low, high = certificate.energy
+    assert low <= energy_of_the_solution(domain, at, b) <= high
