@@ -543,8 +543,7 @@ def test_what_a_lifting_changes(known, reaction):
         cells=cells,
         kappa=kappa,
         certain=certain,
-        reaction=np.array(reaction),
-        most=np.array(reaction),
+        c=SimpleNamespace(low=np.array(reaction), high=np.array(reaction)),
         w=0,
         segments=SimpleNamespace(at_facets=lambda *_: rows),
     )
@@ -667,7 +666,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
         size=0.0,
         certain=certain,
         segments=segments,
-        reaction=np.array(reaction),
+        c=SimpleNamespace(low=np.array(reaction), high=np.array(reaction)),
     )
     loose, change = certificate._hidden(known, v, sums)
     poincare = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702

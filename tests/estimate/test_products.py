@@ -772,7 +772,7 @@ def test_what_v_is_to_make_small(plain):
     of_cells = SimpleNamespace(low=kappa, mean=kappa * (1 + 1e-3 * varies))
     of_cells.high = kappa * (1 + 2e-3 * varies)
     known = SimpleNamespace(
-        cells=cells, kappa=of_cells, segments=edge, w=0, reaction=np.array(0.0),
+        cells=cells, kappa=of_cells, segments=edge, w=0, c=SimpleNamespace(low=np.array(0.0)),
         flux=SimpleNamespace(shed=shed),
     )  # fmt: skip
     found = certificate._functional(known, plain)
