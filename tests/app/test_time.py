@@ -17,6 +17,7 @@ from signorini_cr import evolution, limits, memory
 from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
+from signorini_cr.output import plots
 from signorini_cr.output.meanings import STEP
 from signorini_cr.output.series import is_kept
 
@@ -246,9 +247,14 @@ def assert_same(one, other):
 def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
     scheme, after, case, whole, shared_tmp_path, monkeypatch, capfd
 ):
-    """Ended in the midst of a step; what was finished before is there, and nothing is lost."""
-    path, whole = case(in_scheme(scheme)), whole(scheme)
+    """Ended in the midst of a step; what was finished before is there, and nothing is lost.
+
+    One of the three draws, which takes most of the time that all this takes.
+    """
+    path, whole, draws = case(in_scheme(scheme)), whole(scheme), after == 2
     out = shared_tmp_path / "out"
+    if not draws:
+        monkeypatch.setattr(plots, "can_draw", lambda comm: False)
     with monkeypatch.context() as patch:
         original = evolution.Solver.solve
         calls = []
@@ -268,9 +274,13 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
         assert len(report_in(out)["times"]) == after and not report_in(out)["complete"]
     assert solved(path, out, "--resume") == 0
     assert_same(out, whole)
-    assert {each.name for each in out.iterdir()} == {each.name for each in whole.iterdir()}
-    strips = [(each / "strip.png").read_bytes() for each in (out, whole)]
-    assert len(strips[0]) == pytest.approx(len(strips[1]), rel=0.01)
+    names = [{each.name for each in folder.iterdir()} for folder in (out, whole)]
+    if draws:
+        strips = [(each / "strip.png").read_bytes() for each in (out, whole)]
+        assert len(strips[0]) == pytest.approx(len(strips[1]), rel=0.01)
+    else:
+        names[1] = {name for name in names[1] if not name.endswith(".png")}
+    assert names[0] == names[1]
     assert solved(path, out, "--resume") == 0  # nothing is left to do
     assert_same(out, whole)
 
