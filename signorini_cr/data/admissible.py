@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +72,9 @@ mean of both sides."""
 SHORTEST = 1e3
 """Length of the shortest intervals, in units of the points' rounding."""
 
+
+LOOKS = 16
+"""Into how many parts a facet's edge is cut by the points at which two bounds are compared."""
 
 FACTORISED = 100_000
 """Largest matrix of a form of the user's own that is looked at for eigenvalues below 0."""
@@ -550,10 +554,13 @@ def _crossed(
     contact: _Facets,
     label: str,
 ) -> list[Complaint]:
-    """Find where α is above β, at vertices and midpoints; β comes with the other sign."""
+    """Find where α is above β, at some points of each facet; β comes with the other sign."""
     room = _Values(upper + lower, domain)
     complaints = []
-    for x in (contact.x.mean(axis=1), *np.moveaxis(contact.x, 1, 0)):
+    d = contact.x.shape[1]
+    steps = [i for i in product(range(LOOKS + 1), repeat=d) if sum(i) == LOOKS]
+    for hats in np.array(steps) / LOOKS:
+        x = np.einsum("d,ndk->nk", hats, contact.x)
         found = room.at(x, contact.cells, room.precision.vertices)
         if found is None:
             return []

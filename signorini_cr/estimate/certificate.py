@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..data.diffusion import diffusion
+from ..data.diffusion import DiffusionOnMesh, diffusion
 from ..data.loads import NOTHING, Certain, Known, Segments, VolumeMoments, mean_to_norm, reacts
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, measures, pick, sum_rows, vertex_rows
@@ -32,6 +32,7 @@ from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
+from .lifting import below
 from .reaction import Reaction
 from .sums import Sums, Totals
 
@@ -205,6 +206,7 @@ ADRIFT = (
     "part of the domain has no way to a place where u is held: there is no Γ0, no heat loss and no"
     " reaction, and no contact whose force is larger than what is left of the equation"
 )
+CROSSED = "{} is not shown to be nowhere above the upper bound of the part"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
@@ -283,7 +285,7 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     _insist(data.forms.uncertified)
     cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
     kappa, c = Coefficient(data.compiled.kappa, cells), Reaction.of(data)
-    _insist(kappa.reason or c.reason)
+    _insist(kappa.reason or c.reason or _crossed(data))
     w = vertex_rows(u, cells)
     edge, rest = Known.of(data.edges, cells, w), c.rest(w)
     contact, signs = alpha.side, alpha.signs
@@ -348,6 +350,25 @@ def _carried_to_contact(
         flux.carried += change
     enough = bool((flux.carried <= flux.contact).all())
     return left if cells.comm.allreduce(enough, op=MPI.LAND) else float(np.inf)
+
+
+def _crossed(data: DiffusionOnMesh) -> str | None:
+    """Say where α is not shown to be nowhere above β; without that there may be no u; collective.
+
+    On tetrahedra both are affine on facets, or `affine` refuses, and their vertices are looked at
+    before anything is solved.
+    """
+    cells = data.cells
+    for condition in data.forms.bounded if cells.tdim == 2 else ():
+        if len(condition.bounds) < 2:
+            continue
+        (_, lower), (_, upper) = condition.bounds  # β with the other sign
+        off = data.compiled.trace(lower + upper)
+        size = max(float(np.abs(each.ends).max(initial=0.0)) for each in data.alpha)
+        size = cells.comm.allreduce(size, op=MPI.MAX)
+        if off.constant is None and not below(cells, cells.sides[condition.number], off, size):
+            return CROSSED.format(condition.label)
+    return None
 
 
 def _seen_from(

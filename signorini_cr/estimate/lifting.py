@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
@@ -27,6 +28,8 @@ CURVED = "u_D or α is not affine on the facets: their lifting is known for d = 
 
 QUARTERS = 2
 """How often facets are halved to begin with."""
+HALVINGS = 30
+"""How often those are halved on which data are not shown to be below others."""
 POWERS = 0.5, 1e6
 """Between which k is."""
 END = 1e-9
@@ -316,6 +319,32 @@ def gaps(
         found.append(np.full(len(side.cells), np.inf))
         np.minimum.at(found[-1], pieces.parent, -above)
     return np.concatenate(found)
+
+
+def below(cells: Cells, side: BoundaryFacets, trace: Trace, scale: float) -> bool:
+    """Tell whether data are shown to be 0 or less on all of a part of the boundary; collective.
+
+    Args:
+        cells: The mesh, of triangles.
+        side: The facets.
+        trace: The data.
+        scale: Size of what they are the difference of, by which rounding is told.
+    """
+    none = np.zeros(len(side.cells))
+    length, zero = _Triangles.of(cells, side).length, Cubic(np.stack([none, none]), none, none)
+    pieces, room = Pieces.of_facets(cells, side), 8 * len(none) + 1000
+    shown = False
+    try:
+        for _ in range(HALVINGS):
+            most = _bounds(trace, pieces, zero, cells, length, scale, signed=True)[0]
+            open_ = ~(most <= JUMP * scale)
+            shown = not open_.any()
+            if shown or np.count_nonzero(open_) > room:
+                break
+            pieces = pieces[open_].halves()
+    except Unknown:
+        shown = False
+    return bool(cells.comm.allreduce(shown, op=MPI.LAND))
 
 
 def _bounds(

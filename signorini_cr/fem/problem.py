@@ -23,7 +23,9 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 from ufl.algorithms import compute_form_data
 from ufl.algorithms.check_arities import ArityMismatch
+from ufl.constantvalue import ComplexValue
 from ufl.core.expr import Expr
+from ufl.corealg.traversal import unique_pre_traversal
 
 from ..arrays import FloatArray, Int32Array
 from ..errors import InputError
@@ -141,7 +143,10 @@ def as_expression(data: Data, x: Expr) -> Expr:
         InputError: That is not possible.
     """
     try:
-        return ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+        found = ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+        if any(isinstance(each, ComplexValue) for each in unique_pre_traversal(found)):
+            raise ValueError("it holds a complex number")
+        return found
     except (TypeError, ValueError) as error:
         raise InputError(
             f"data: {data!r} does not give a number or a UFL expression ({error}); functions of x "

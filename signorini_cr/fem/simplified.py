@@ -53,7 +53,7 @@ def simplified(expression: Any) -> Any:
             reader.read(plain)  # finds the sums that are atoms
             reader.known.clear()
             other = reader.formula(reader.read(plain))
-        except (_TooLong, OverflowError):
+        except (_TooLong, OverflowError, RecursionError):
             continue
         if _size(other) < shortest:
             found, shortest = other, _size(other)

@@ -36,6 +36,9 @@ TINY = 1e-130
 FAR = 16.0
 """Values so many times as far from 0 as from one another are told from their middle."""
 
+APART = 1e-15
+"""Distance of two bounds that are the same, in parts of the largest."""
+
 DATUM = 2.0 * 2.0**-53
 """Rounding of a mean of data over a facet, or of a load, in parts of it."""
 
@@ -163,8 +166,18 @@ class System:
         self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
         self._take_offset()
+        self._part_bounds()
         self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
         self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
+
+    def _part_bounds(self) -> None:
+        """Lift β by a little where it is α: the side that u is on tells which of them holds it."""
+        apart = self.upper > self.lower
+        both = np.concatenate([self.lower, self.upper])
+        size = float(np.abs(both[np.abs(both) < PETSc.INFINITY]).max(initial=0.0))
+        size = self.u_D.function_space.mesh.comm.allreduce(size, op=MPI.MAX)
+        least = max(APART * size, 1e-290)
+        self.upper = np.where(apart, self.upper, self.lower + least)
 
     def _take_offset(self) -> None:
         """Choose the offset, and take it off u_D and the bounds; collective."""

@@ -76,6 +76,14 @@ def test_values_stay_the_same(name):
     assert np.all(np.abs(found[0] - values) <= 100 * (bounds + found[1]) + 1e-14)
 
 
+def test_numbers_for_which_squares_come_back_again_and_again():
+    """(x − 1000.7)² + y², divided by 1000.7² and with its square root written out in digits."""
+    square = 9.98601468629199e-7 * y**2 + (0.00099930048965724 * x - 1) ** 2
+    load = minus_laplace(31.6 * square**1.25 * ufl.cos(2.5 * ufl.atan2(y, x - 1000.7)))
+    one, other = (evaluate(each, POINTS) for each in (load, simplified(load)))
+    assert np.all(np.abs(one[0] - other[0]) <= 100 * (one[1] + other[1]) + 1e-14)
+
+
 def test_what_gets_longer_is_left_alone():
     for f in (minus_laplace((x**2 + y + 3 * x * y) ** 8 * ufl.sin(x)), exact.I.problem.exact(X)):
         assert simplified(f) is f

@@ -87,12 +87,31 @@ def between(x):
     return 40 * ufl.sin(np.pi * x[0]) + 2
 
 
+def dense(system):
+    """The matrix, the right-hand side, and the bounds of all dofs."""
+    indptr, columns, values = system.A.getValuesCSR()
+    n = len(indptr) - 1
+    A = np.zeros((n, n))
+    A[np.repeat(np.arange(n), np.diff(indptr)), columns] = values
+    low, high = (
+        np.where(np.abs(v) < 1e15, v, np.copysign(np.inf, v)) for v in (system.lower, system.upper)
+    )
+    return A, system.b.copy(), low, high
+
+
+def in_a_box(A, b, low, high):
+    """min ½ xᵀA x − bᵀx in a box is min |Lᵀx − L⁻¹b|, A = L Lᵀ: SciPy's, on a dense matrix."""
+    L = np.linalg.cholesky(A)
+    found = lsq_linear(L.T, np.linalg.solve(L, b), (low, high), method="bvls", tol=1e-15)
+    assert found.success
+    return found.x
+
+
 @pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("nested", [True, False])
 def test_both_sides_against_a_solver_for_bounded_least_squares(element, nested):
-    """min ½ xᵀA x − bᵀx in a box is min |Lᵀx − L⁻¹b|, A = L Lᵀ: SciPy's, on a dense matrix."""
     conditions = {
         "floor": Contact(lambda x: -0.1 + 0.02 * x[0], upper=0.15, g=-1.0),
         "right": Contact(upper=lambda x: 0.4 * x[1] - 0.05),
@@ -104,28 +123,84 @@ def test_both_sides_against_a_solver_for_bounded_least_squares(element, nested):
     sides = set()
     for solution in solve_levels(problem, meshes, 3, element=element, nested=nested):
         system = solution.level.system
-        indptr, columns, values = system.A.getValuesCSR()
-        n = len(indptr) - 1
-        A, b = np.zeros((n, n)), system.b.copy()
-        A[np.repeat(np.arange(n), np.diff(indptr)), columns] = values
-        L = np.linalg.cholesky(A)
-        low, high = (
-            np.where(np.abs(v) < 1e15, v, np.sign(v) * np.inf) for v in (system.lower, system.upper)
-        )
-        found = lsq_linear(L.T, np.linalg.solve(L, b), (low, high), method="bvls", tol=1e-15)
-        assert found.success
-        assert np.allclose(solution.u.x.array, found.x, rtol=0, atol=1e-7 * np.abs(found.x).max())
-        residual = A @ found.x - b
-        force = residual[system.bounded]
-        at = (found.x <= low)[system.bounded] & (force > 0) | (found.x >= high)[system.bounded] & (
-            force < 0
-        )
+        A, b, low, high = dense(system)
+        x = in_a_box(A, b, low, high)
+        assert np.allclose(solution.u.x.array, x, rtol=0, atol=1e-7 * np.abs(x).max())
+        force = (A @ x - b)[system.bounded]
+        at = (x <= low)[system.bounded] & (force > 0) | (x >= high)[system.bounded] & (force < 0)
         assert np.array_equal(solution.contact.active_set.mask, at)
         assert solution.contact.force == pytest.approx(force[at].sum(), rel=1e-6)
         assert solution.contact.kkt.min_gap >= 0.0
         assert solution.contact.kkt.min_pressure >= 0.0
         sides |= set(np.sign(solution.contact.pressure[solution.contact.active]))
     assert sides >= {1.0, -1.0}
+
+
+WALLS = {"right": Neumann(), "top": Dirichlet(0.0), "left": Neumann()}
+BUMP = lambda x: ufl.max_value(x[0] - 0.3, 0.0)  # noqa: E731
+WAVE = lambda x: 0.1 * ufl.sin(7 * x[0])  # noqa: E731
+ALIKE = {
+    "all": (WAVE, WAVE),
+    "zero": (0.0, 0.0),
+    "from below": (lambda x: WAVE(x) - BUMP(x), WAVE),
+    "from above": (0.0, BUMP),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+@pytest.mark.parametrize("f", [-1.0, 1.0, between])
+@pytest.mark.parametrize("name", ALIKE)
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_bounds_that_are_the_same_hold_u_from_both_sides(element, name, f):
+    """Where α = β u is given, as on Γ0, and the force has either sign."""
+    obstacle, upper = ALIKE[name]
+    conditions = WALLS | {"floor": Contact(obstacle, upper=upper)}
+    meshes = families.structured(Polygon(RECTANGLE, EDGES, names=EDGES), 3, WORLD)
+    pinned = 0
+    for solution in solve_levels(Problem(f=f, conditions=conditions), meshes, 2, element=element):
+        system = solution.level.system
+        A, b, low, high = dense(system)
+        held = high - low < 1e-12
+        pinned += np.count_nonzero(held)
+        x, rest = np.where(held, low, 0.0), ~held
+        b -= A @ x
+        x[rest] = in_a_box(A[np.ix_(rest, rest)], b[rest], low[rest], high[rest])
+        assert np.allclose(solution.u.x.array, x, rtol=0, atol=1e-7 * np.abs(x).max())
+        force = (A @ (x * rest) - b)[system.bounded]
+        at, sides = np.abs(force) > 1e-9 * np.abs(force).max(), held[system.bounded]
+        on_bound = sides | (x <= low)[system.bounded] | (x >= high)[system.bounded]
+        assert np.array_equal(solution.contact.active_set.mask, at & on_bound)
+        assert solution.contact.force == pytest.approx(force[at & on_bound].sum(), rel=1e-6)
+        if element == "CR":
+            assert solution.certificate.bound_h1 is not None
+    assert pinned
+
+
+@pytest.mark.parametrize("steep", [1e5, 1e8])
+def test_without_a_function_between_the_bounds_there_is_no_certificate(steep):
+    """A bump of α that no point of a facet shows: K is empty, and u is not."""
+
+    def bump(x):
+        return -0.1 + 0.3 * ufl.exp(-steep * (x[0] - 0.011) ** 2)
+
+    conditions = WALLS | {"floor": Contact(bump, upper=0.1)}
+    mesh = families.structured(Polygon(RECTANGLE, EDGES, names=EDGES), 2, WORLD)
+    certificate = solve(Problem(f=-1.0, conditions=conditions), mesh).certificate
+    assert certificate.bound_h1 is None and "nowhere above the upper bound" in certificate.reason
+
+
+def test_bounds_that_touch_have_a_certificate():
+    """In one point: a square in other words, two squares, sin x and x."""
+    for below, above in (
+        (lambda x: 0.0 * x[0], lambda x: x[0] ** 2 - 0.74 * x[0] + 0.1369),
+        (lambda x: -(x[0] ** 2), lambda x: x[0] ** 2),
+        (lambda x: ufl.sin(x[0] + 1.0), lambda x: x[0] + 1.0),
+    ):
+        conditions = WALLS | {"floor": Contact(below, upper=above)}
+        mesh = families.structured(Polygon(RECTANGLE, EDGES, names=EDGES), 2, WORLD)
+        certificate = solve(Problem(f=-1.0, conditions=conditions), mesh).certificate
+        assert certificate.bound_h1 is not None, certificate.reason
 
 
 def test_rates_between_two_obstacles():

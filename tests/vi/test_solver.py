@@ -179,6 +179,8 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
     [
         ({"f": "x"}, "'x' does not give a number or a UFL expression"),
         ({"obstacle": None}, "None does not give a number"),
+        ({"f": 1j}, "1j does not give a number or a UFL expression .it holds a complex number"),
+        ({"obstacle": lambda x: 2j * x[0]}, "it holds a complex number"),
         ({"f": lambda x: np.sin(x[0])}, r"as in ufl.sin\(x\[0\]\)"),
         ({"f": lambda x: x}, r"f has the shape \(2,\); a scalar"),
         ({"g": lambda x: ufl.as_vector([x[0], 1.0])}, "g has the shape"),
