@@ -213,9 +213,10 @@ class Floors:
             limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
         strong = np.zeros(len(cells.exterior), dtype=bool)
         strong[masses.side.dofs] = masses.strong
-        return cls(
-            side, signs, ends, bounds.middle, tuple(limits), strong[side.dofs], len(cells.exterior)
-        )
+        # to a bound that is a number no lifting brings v
+        curved = [np.full(len(p.middle), p.trace.constant is None) for p in bounds.parts]
+        strong = strong[side.dofs] & np.concatenate([np.empty(0, dtype=bool), *curved])
+        return cls(side, signs, ends, bounds.middle, tuple(limits), strong, len(cells.exterior))
 
     def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The least and the largest heights of bumps that they allow for, by facet dof.
