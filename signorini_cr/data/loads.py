@@ -615,15 +615,22 @@ class Segments:
         """‖q − g_F‖²_F, shape (facets,)."""
         return self._over_facets(self.measure * (self.weights @ self.rest**2))
 
-    @cached_property
-    def taken(self) -> FloatArray:
-        """‖b^{-1/2}(q − g_F)‖²_F, or more, where b takes that up, shape (facets,); 0 elsewhere."""
+    def taken(self, shed: FloatArray | None) -> FloatArray:
+        """‖b^{-1/2}τ‖²_F, or more, of what b takes up, shape (facets,).
+
+        Args:
+            shed: As in `target`.
+        """
+        area = self._over_facets(self.measure)
         if self.between is None:
-            by_loss = self.squares / np.maximum(self.loss, 1e-300)
-        else:
-            least = np.maximum(self.between[0], 1e-300)
-            by_loss = self._over_facets(self.measure * (self.weights @ self.rest**2) / least)
-        return np.where(self.given, by_loss, 0.0)
+            loss = np.maximum(self.loss, 1e-300)
+            found = np.where(self.given, self.squares / loss, 0.0)
+            return found if shed is None else found + shed**2 / (loss * area)
+        tau = np.where(self.given[self.place], self.rest, 0.0)
+        if shed is not None:
+            tau = tau + (shed / area)[self.place]
+        least = np.maximum(self.between[0], 1e-300)
+        return self._over_facets(self.measure * (self.weights @ tau**2) / least)
 
     @cached_property
     def bend(self) -> FloatArray:

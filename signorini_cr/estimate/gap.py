@@ -490,11 +490,10 @@ def _add_loss(
     sums.totals.energy_slack += EPS * size
     sums.totals.energy_slack += 0.5 * float(np.sum((most - least) * squares))
     sums.totals.companion += float(np.sum(apart))
-    given = edge.taken
+    given = edge.taken(flux.shed)
     if flux.shed is not None:
         n = len(edge.loss)
         area = np.bincount(edge.place, edge.measure, minlength=n)
-        given = given + flux.shed**2 / (np.maximum(edge.loss, 1e-300) * area)
         means = np.bincount(edge.place, edge.measure * (edge.weights @ jump), minlength=n) / area
         sums.totals.load_companion += float(flux.shed @ means)
     sums.totals.load += float(np.sum(given))

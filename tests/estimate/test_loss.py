@@ -123,8 +123,11 @@ def test_bound_and_bracket(name, floor):
     assert max(ratios[1:]) < 1.3
 
 
-def test_with_a_reaction_that_varies():
-    loss, c = LOSSES["wave"], lambda x: 50 * (1 + x[0] * x[1])
+@pytest.mark.parametrize("size", [50.0, 1e5])
+@pytest.mark.parametrize("name", ["wave", "large"])
+def test_with_a_reaction_that_varies(name, size):
+    """With a large c y gives b more than what g has beyond its mean."""
+    loss, c = LOSSES[name], lambda x: size * (1 + x[0] * x[1])
     posed = problem(loss, "both", c)
     for solution in solve_levels(posed, SQUARE.mesh(0.2, MPI.COMM_WORLD), 3):
         certificate, known = solution.certificate, Reference(solution.domain, loss, "both", c)
