@@ -369,6 +369,10 @@ def integrate_edge(
     if edge.most.any():
         _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
     if cells.tdim != 2:
+        # σ is known by its norm alone; what b takes up has a product with v − u_h all the same
+        taken = edge.measure * edge.weights[:, None] * edge.rest * edge.given[edge.place]
+        jump = apart(cells, w, edge, v.vertices, v.bumps)
+        sums.totals.load_companion += float(np.sum(taken * jump))
         return sums.totals.neumann
     if flux.beyond is not None:
         sums.totals.load += sums.totals.neumann
