@@ -205,8 +205,8 @@ LIFT_SHARE = 1e-2
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
 ADRIFT = (
     "part of the domain has no way to a place where u is held: there is no Γ0, no part that loses"
-    " heat everywhere and no reaction, and no contact whose force is larger than what is left of the"
-    " equation"
+    " heat everywhere and no reaction, and no contact whose force is larger than what is left of"
+    " the equation"
 )
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
