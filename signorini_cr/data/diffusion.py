@@ -22,7 +22,7 @@ from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
 from ..mesh.domain import Domain
 from .admissible import check_symmetry
-from .loads import NeumannMoments, VolumeMoments, chi
+from .loads import NeumannMoments, VolumeMoments, bounds_on_facets, chi
 from .moments import Compiled, OnFacets, Tensor, Trace, Volume
 from .ranges import range_of
 
@@ -67,7 +67,9 @@ class Moments:
         forms, kappa = self.compiled.forms, self.compiled.kappa
         fixed = [condition.number for condition in forms.fixed]
         stretch = kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
-        return Cells(self.domain, self.V, fixed, self._sinks(), stretch)
+        cells = Cells(self.domain, self.V, fixed, stretch=stretch)
+        cells.drain(self._sinks(cells))
+        return cells
 
     @cached_property
     def of_f(self) -> VolumeMoments:
@@ -104,36 +106,39 @@ class Moments:
             OnFacets.of(each, self.compiled.trace(each.flux), self.domain) for each in natural
         )
         return tuple(
-            NeumannMoments(on_facets, self.cells, self._loss(on_facets.condition))
+            NeumannMoments(on_facets, self.cells, *self._loss(on_facets.condition, self.cells))
             for on_facets in sampled
         )
 
-    def _sinks(self) -> dict[int, FloatArray]:
-        """The parts whose b is above 0, and that on their facets; collective."""
+    def _sinks(self, cells: Cells) -> dict[int, FloatArray]:
+        """The parts whose b is above 0, and a lower bound on their facets; collective."""
         conditions = self.compiled.forms.conditions
-        found = {c.number: self._loss(c) for c in conditions if c.loss is not None}
+        found = {c.number: self._loss(c, cells)[0] for c in conditions if c.loss is not None}
         return {
             part: loss
             for part, loss in found.items()
             if self.domain.mesh.comm.allreduce(bool((loss > 0.0).all()), op=MPI.LAND)
         }
 
-    def _loss(self, condition: Condition) -> FloatArray:
-        """The loss b on facets of owned cells, in the order of `Cells.sides`, shape (n,) or ()."""
-        b = _by_cells(self.compiled, self.domain, ufl.as_ufl(condition.loss or 0.0))
-        if not b.ndim:
-            return b
-        facets = self.domain.all_facets[condition.number]
-        cells = facet_entities(self.domain.mesh, facets)[:, 0]
-        return b[cells[cells < len(b)]]
+    def _loss(self, condition: Condition, cells: Cells) -> tuple[FloatArray, FloatArray]:
+        """Bounds of b on facets of owned cells, in the order of `Cells.sides`, shape (n,) or ().
+
+        They are one object where b is constant on each facet, and infinite where nothing is known.
+        """
+        datum = ufl.as_ufl(condition.loss or 0.0)
+        if not is_by_cells(datum):
+            return bounds_on_facets(datum, cells, cells.sides[condition.number])
+        b = _by_cells(self.compiled, self.domain, datum)
+        if b.ndim:
+            facets = self.domain.all_facets[condition.number]
+            at = facet_entities(self.domain.mesh, facets)[:, 0]
+            b = b[at[at < len(b)]]
+        return b, b
 
 
 def _by_cells(compiled: Compiled, domain: Domain, datum: Expr) -> FloatArray:
-    """Values on owned cells of what is constant there, shape (cells,), or () for a number.
-
-    What varies within cells counts as 0: nothing is certified then.
-    """
-    known = number(datum) if is_by_cells(datum) else 0.0
+    """Values on owned cells of what is constant there, shape (cells,), or () for a number."""
+    known = number(datum)
     if known is not None:
         return np.array(known)
     expression, mesh = compiled.by_cells(datum), domain.mesh
@@ -232,10 +237,34 @@ class DiffusionOnMesh:
 
     def reacting(self, w: FloatArray) -> tuple[Volume, Volume]:
         """Return f − c u_h and c u_h², from u_h at the cells' vertices, shape (d + 1, cells)."""
-        stand_in, *found = self.compiled.with_reaction
-        u = self.domain.instead(stand_in)
+        self._put(w)
+        return self.compiled.with_reaction
+
+    def losing(
+        self, w: FloatArray
+    ) -> tuple[tuple[NeumannMoments, ...], tuple[NeumannMoments, ...]]:
+        """Return `edges`, with g − b u_h for g where b varies within facets, and b u_h² there.
+
+        Args:
+            w: u_h at the cells' vertices, shape (d + 1, cells).
+        """
+        found, squares = list(self.edges), []
+        for i, edge in enumerate(self.edges):
+            if edge.varies:
+                self._put(w)
+                condition = self.forms.natural[i]
+                g, b_u2 = (
+                    OnFacets.of(condition, trace, self.domain)
+                    for trace in self.compiled.with_loss(condition)
+                )
+                found[i] = NeumannMoments(g, self.cells, edge.loss, edge.most)
+                squares.append(NeumannMoments(b_u2, self.cells, np.array(0.0)))
+        return tuple(found), tuple(squares)
+
+    def _put(self, w: FloatArray) -> None:
+        """Let the stand-in be u_h."""
+        u = self.domain.instead(self.compiled.stand_in)
         u.x.array[u.function_space.dofmap.list[: w.shape[1]]] = w.T
-        return found[0], found[1]
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
+from ufl.core.expr import Expr
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
@@ -16,7 +17,7 @@ from .cutting import Cut, cut, refine
 from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
 from .pieces import Pieces
-from .ranges import errors_on
+from .ranges import errors_on, range_on
 
 NOTHING = np.array(0.0)
 """A reaction that is none."""
@@ -251,18 +252,43 @@ class NeumannMoments:
         measure: |F|, shape (n,).
         shares: ∫_F g λ_j for the facet's ends j, shape (d, n).
         loss: b, where g − b u_h is what is meant in the end; 0 where there is none, shape (n,).
+            Where b varies within facets a lower bound of it.
+        most: The same object, or an upper bound; then g may be g − b u_h already.
+        datum: B as a formula.
         bounded: Whether u is bounded there.
     """
 
-    def __init__(self, sampled: OnFacets, cells: Cells, loss: FloatArray):
-        """Take g's values, and integrate them; b has the shape (n,) or ()."""
+    def __init__(
+        self, sampled: OnFacets, cells: Cells, loss: FloatArray, most: FloatArray | None = None
+    ):
+        """Take g's values, and integrate them; bounds of b have the shape (n,) or ()."""
         g = self.g = sampled.trace
         self.side, self._cells = sampled.side(cells), cells
         self.measure = measures(cells, self.side)
         inside = sampled.seen_from(cells).inside
         self.shares = self.measure * (g.hats.T * g.weights @ inside)
-        self.loss = np.broadcast_to(loss, self.measure.shape)
-        self.bounded = bool(sampled.condition.bounds)
+        self.loss = self.most = np.broadcast_to(loss, self.measure.shape)
+        if most is not None and most is not loss:
+            self.most = np.broadcast_to(most, self.measure.shape)
+        self.bounded, self.datum = bool(sampled.condition.bounds), sampled.condition.loss
+
+    @property
+    def varies(self) -> bool:
+        """Whether b may vary within facets."""
+        return self.most is not self.loss
+
+    def between(self, pieces: Pieces, cells: Cells) -> FloatArray:
+        """Bounds of a b that varies, on pieces of the facets, shape (2, n)."""
+        outer = np.stack([self.loss[pieces.parent], self.most[pieces.parent]])
+        found = range_on(self.datum, pieces, cells)
+        if found is None:
+            return outer
+        return np.stack([np.maximum(outer[0], found[0]), np.minimum(outer[1], found[1])])
+
+    @property
+    def steady(self) -> FloatArray:
+        """The b whose product with u_h is still to be taken off g, shape (n,)."""
+        return np.zeros_like(self.loss) if self.varies else self.loss
 
     def to_cells(self) -> FloatArray:
         """∫_F g ψ_i for the Crouzeix-Raviart functions of the facet's cell, shape (d + 1, n).
@@ -270,6 +296,24 @@ class NeumannMoments:
         ψ_i = 1 − d λ_i; on the facet itself λ_i = 0.
         """
         return to_cells(self._cells, self.side, self.shares)
+
+
+def bounds_on_facets(b: Expr, cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, FloatArray]:
+    """Enclose b on facets, shapes (n,); infinite for no bounds, 0 for below 0 by rounding."""
+    pieces, n = Pieces.of_facets(cells, side).finer(ROUNDS), len(side.cells)
+    low, high = np.full(n, np.inf), np.full(n, -np.inf)
+    found = range_on(b, pieces, cells)
+    if found is None:
+        return -low, -high
+    np.minimum.at(low, pieces.parent, found[0])
+    np.maximum.at(high, pieces.parent, found[1])
+    return np.where((low < 0.0) & (low >= -ROUNDED * high), 0.0, low), high
+
+
+ROUNDS = 3
+"""How often facets are halved on which b varies."""
+ROUNDED = 1e-13
+"""Part of b on a facet by which it may seem to be below 0."""
 
 
 def to_cells(cells: Cells, side: BoundaryFacets, shares: FloatArray) -> FloatArray:
@@ -289,7 +333,7 @@ class Known:
     Attributes:
         side: The facets.
         shares: ∫_F (g − b u_h) λ_j for the facet's ends j, shape (d, n).
-        loss: b, shape (n,).
+        loss: b, or a lower bound of it, shape (n,).
         bounded: Whether u is bounded there, shape (n,).
     """
 
@@ -303,7 +347,7 @@ class Known:
         """Put all parts together.
 
         Args:
-            edges: g on them.
+            edges: g on them, g − b u_h where b varies within facets.
             cells: The mesh.
             w: u_h at the cells' vertices, shape (d + 1, cells).
         """
@@ -312,10 +356,11 @@ class Known:
         loss = np.concatenate([e.loss for e in edges] or [np.empty(0)])
         bounded = [np.full(len(edge.measure), edge.bounded) for edge in edges]
         shares = np.concatenate([np.empty((d, 0)), *(edge.shares for edge in edges)], axis=1)
-        if loss.any():
+        steady = np.concatenate([e.steady for e in edges] or [np.empty(0)])
+        if steady.any():
             ends = trace_of(cells, side, w)
             measure = np.concatenate([edge.measure for edge in edges])
-            shares -= loss * measure * (ends + ends.sum(axis=0)) / (d * (d + 1))
+            shares -= steady * measure * (ends + ends.sum(axis=0)) / (d * (d + 1))
         return cls(side, shares, loss, np.concatenate([np.empty(0, dtype=bool), *bounded]))
 
 
@@ -342,10 +387,12 @@ class Segments:
         through: ∫_F g, shape (facets,).
         missed: Shape (facets,).
         rough: Shape (facets,).
-        loss: b, shape (facets,).
+        loss: b, or a lower bound of it, shape (facets,).
         bounded: Whether u is bounded there, shape (facets,).
         low: Lower bound of κ, shape (cells,) or ().
         reason: Why there are none, if there are none.
+        between: Bounds of b on the pieces, shape (2, n); None where it is constant on each facet.
+        varies: On which facets it may not be, shape (facets,); or None.
     """
 
     cells: Cells
@@ -363,6 +410,8 @@ class Segments:
     bounded: BoolArray
     low: FloatArray
     reason: str | None = None
+    between: FloatArray | None = None
+    varies: BoolArray | None = None
 
     @classmethod
     def joined(
@@ -376,7 +425,8 @@ class Segments:
         """Enclose g on several parts, and take b u_h off; collective.
 
         Args:
-            edges: g on them by the scheme's own rule, on one part or more.
+            edges: g on them by the scheme's own rule, on one part or more; g − b u_h where b varies
+                within facets.
             cells: The mesh.
             w: u_h at the cells' vertices, shape (d + 1, cells).
             low: Lower bound of κ, shape (cells,) or ().
@@ -390,12 +440,14 @@ class Segments:
 
         facets = BoundaryFacets.joined([each.facets for each in found], cells.tdim)
         loss, hats = rows(lambda each: each.loss), rows(lambda each: each.hats)
+        varying = any(edge.varies for edge in edges)
+        steady = np.concatenate([edge.steady for edge in edges])
         values, through = rows(lambda each: each.values), rows(lambda each: each.through)
         place = np.concatenate([e.place + k for e, k in zip(found, first[:-1], strict=True)])
         measure = rows(lambda each: each.measure)
-        if loss.any():
+        if steady.any():
             ends = trace_of(cells, facets, w)
-            lost = loss[place] * np.einsum("qdn,dn->qn", hats, ends[:, place])
+            lost = steady[place] * np.einsum("qdn,dn->qn", hats, ends[:, place])
             values = values - lost
             through = through - np.bincount(
                 place, measure * (found[0].weights @ lost), minlength=len(through)
@@ -416,10 +468,19 @@ class Segments:
             np.concatenate([each.bounded for each in found]),
             low,
             next((each.reason for each in found if each.reason), None),
+            rows(lambda each: each.of_loss) if varying else None,
+            np.repeat([edge.varies for edge in edges], np.diff(first)) if varying else None,
         )
 
     @classmethod
-    def of(cls, edge: NeumannMoments, cells: Cells, low: FloatArray, size: float) -> Segments:
+    def of(
+        cls,
+        edge: NeumannMoments,
+        cells: Cells,
+        low: FloatArray,
+        size: float,
+        norms: bool = True,
+    ) -> Segments:
         """Enclose g alone; collective.
 
         Args:
@@ -427,10 +488,11 @@ class Segments:
             cells: The mesh.
             low: Lower bound of κ, shape (cells,) or ().
             size: Of the bound, to which what is missed should be small.
+            norms: Whether ‖g − q‖ is to be small, too, and not the integrals alone.
         """
         g, facets, n = edge.g, edge.side, len(edge.measure)
-        pieces, reason = Pieces.of_facets(cells, facets), None
-        inside: FloatArray = np.zeros((2, n))
+        pieces, reason = Pieces.of_facets(cells, facets).finer(ROUNDS * edge.varies), None
+        inside: FloatArray = np.zeros((2, len(pieces.part)))
         points, weights = facet_quadrature(cells.domain.mesh, max(LOAD_DEGREE, g.degree))
         hats = np.column_stack([1.0 - points.sum(axis=1), points])
         known = g.constant is not None or not cells.comm.allreduce(n)
@@ -447,7 +509,8 @@ class Segments:
                     4.0 * edge.measure * _trace_constant(cells, facets) ** 2 / here / goal**2,
                 ]
             )
-            room = 8 * cells.comm.allreduce(n) + 1000
+            scales[1] *= norms
+            room = 8 * cells.comm.allreduce(len(pieces.part)) + 1000
             try:
                 pieces, inside = refine(
                     pieces,
@@ -486,7 +549,35 @@ class Segments:
             np.full(n, edge.bounded),
             low,
             reasons[0] if reasons else None,
+            edge.between(pieces, cells) if edge.varies else None,
         )
+
+    @property
+    def of_loss(self) -> FloatArray:
+        """Bounds of b on the pieces, shape (2, n)."""
+        return np.stack(2 * [self.loss[self.place]]) if self.between is None else self.between
+
+    @cached_property
+    def usual(self) -> FloatArray:
+        """b, or about its mean, shape (facets,)."""
+        if self.between is None:
+            return self.loss
+        middle = self.measure * self.between.mean(axis=0)
+        return self._over_facets(middle) / self._over_facets(self.measure)
+
+    @cached_property
+    def most(self) -> FloatArray:
+        """b, or an upper bound of it, shape (facets,)."""
+        if self.between is None:
+            return self.loss
+        found = np.zeros(len(self.loss))
+        np.maximum.at(found, self.place, self.between[1])
+        return found
+
+    @property
+    def steady(self) -> FloatArray:
+        """B where it is constant on the facet, 0 where it may not be, shape (facets,)."""
+        return self.loss if self.varies is None else np.where(self.varies, 0.0, self.loss)
 
     @cached_property
     def rest(self) -> FloatArray:
@@ -524,6 +615,23 @@ class Segments:
         """‖q − g_F‖²_F, shape (facets,)."""
         return self._over_facets(self.measure * (self.weights @ self.rest**2))
 
+    def taken(self, shed: FloatArray | None) -> FloatArray:
+        """‖b^{-1/2}τ‖²_F, or more, of what b takes up, shape (facets,).
+
+        Args:
+            shed: As in `target`.
+        """
+        area = self._over_facets(self.measure)
+        if self.between is None:
+            loss = np.maximum(self.loss, 1e-300)
+            found = np.where(self.given, self.squares / loss, 0.0)
+            return found if shed is None else found + shed**2 / (loss * area)
+        tau = np.where(self.given[self.place], self.rest, 0.0)
+        if shed is not None:
+            tau = tau + (shed / area)[self.place]
+        least = np.maximum(self.between[0], 1e-300)
+        return self._over_facets(self.measure * (self.weights @ tau**2) / least)
+
     @cached_property
     def bend(self) -> FloatArray:
         """The c with q − g_F nearest to a (λ_j − λ_k) + c (6 λ_j λ_k − 1), shape (facets,)."""
@@ -546,7 +654,7 @@ class Segments:
         found = np.zeros((d + 1, len(self.loss)))
         if d != 2 or not self.given.any():
             return found
-        inverse = np.divide(1.0, self.loss, out=np.zeros_like(self.loss), where=self.given)
+        inverse = np.divide(1.0, self.usual, out=np.zeros_like(self.loss), where=self.given)
         mean = 0.0 if shed is None else shed / self._over_facets(self.measure)
         found[0], found[1] = (mean + s * self.slope - self.bend for s in (1.0, -1.0))
         found[2] = 1.5 * self.bend
@@ -581,7 +689,7 @@ class Segments:
     def at_facets(
         self, vertices: FloatArray, bumps: FloatArray, w: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """b, and bounds of ‖g − b u_h‖_F and ‖v − u_h‖_F, by facet dof; 0 on other facets.
+        """Bounds of b, ‖g − b u_h‖_F and ‖v − u_h‖_F, by facet dof; 0 on other facets.
 
         Args:
             vertices: v at the vertices.
@@ -594,7 +702,7 @@ class Segments:
         ends = np.abs(vertices[self.facets.ends] - trace_of(self.cells, self.facets, w)).max(axis=0)
         bump = np.abs(bumps[at]) if self.cells.tdim == 2 else 0.0
         norm = np.sqrt(self._over_facets(self.measure * (self.weights @ self.values**2)))
-        found[:, at] = self.loss, norm + self.rough, np.sqrt(area) * (ends + bump)
+        found[:, at] = self.most, norm + self.rough, np.sqrt(area) * (ends + bump)
         return found[0], found[1], found[2]
 
     def change(self, vertices: FloatArray, bumps: FloatArray) -> float:

@@ -602,11 +602,21 @@ class Compiled:
         return (Tensor if ufl.shape(kappa) else Volume)(kappa, self.forms.mesh, self._rule)
 
     @cached_property
-    def with_reaction(self) -> tuple[fem.Function, Volume, Volume]:
-        """A function w that is affine on each cell, f − c w, and c w²; collective."""
-        mesh, c = self.forms.mesh, self.forms.reaction
-        w = fem.Function(fem.functionspace(mesh, ("DG", 1)))
-        return w, *(Volume(each, mesh, self._rule) for each in (self.forms.f - c * w, c * w**2))
+    def stand_in(self) -> fem.Function:
+        """A function w that is affine on each cell, in the place of u_h; collective."""
+        return fem.Function(fem.functionspace(self.forms.mesh, ("DG", 1)))
+
+    @cached_property
+    def with_reaction(self) -> tuple[Volume, Volume]:
+        """F − c w and c w² with the `stand_in` w; collective."""
+        mesh, c, w = self.forms.mesh, self.forms.reaction, self.stand_in
+        f, c_w2 = (Volume(each, mesh, self._rule) for each in (self.forms.f - c * w, c * w**2))
+        return f, c_w2
+
+    def with_loss(self, condition: Condition) -> tuple[Trace, Trace]:
+        """G − b w and b w² on a condition's part, likewise; collective."""
+        b, w = condition.loss, self.stand_in
+        return self.trace(condition.flux - b * w), self.trace(b * w**2)
 
     def by_cells(self, expression: Expr) -> fem.Expression:
         """What is constant on each cell, at one point there; collective."""

@@ -138,6 +138,10 @@ class Pieces:
             halves.append(Pieces(self.parent, corners, hats, 0.5 * self.part, self.frame))
         return halves[0] + halves[1]
 
+    def finer(self, rounds: int) -> Pieces:
+        """Their halves' halves, and so on."""
+        return self.halves().finer(rounds - 1) if rounds else self
+
     def around(self, point: FloatArray, hats: FloatArray) -> Pieces:
         """Cut each at a point inside of it with some barycentric coordinates, shape (d + 1, n)."""
         own = np.einsum("cn,chn->hn", hats, self.hats)

@@ -51,10 +51,15 @@ def range_of(expression: ufl.core.expr.Expr, cells: Cells) -> Range | None:
     Returns:
         None if the expression holds an operator whose range is not known, or has no bound.
     """
-    data, whole = lowered(expression), Pieces.of_cells(cells)
+    return range_on(expression, Pieces.of_cells(cells), cells)
+
+
+def range_on(expression: ufl.core.expr.Expr, whole: Pieces, cells: Cells) -> Range | None:
+    """Lower and upper bounds on pieces, shapes (n,); see `range_of`."""
+    data, n = lowered(expression), len(whole.part)
     try:
         jet = Enclosure(whole.boxes(cells), order=0)(data)
-        low, high = (np.array(np.broadcast_to(x, cells.number)) for x in (jet.low, jet.high))
+        low, high = (np.array(np.broadcast_to(x, n)) for x in (jet.low, jet.high))
         if has_conditions(data):
             # a jump along a cell's side does not concern the cell
             wide = np.flatnonzero(high > low)

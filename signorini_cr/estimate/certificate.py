@@ -8,6 +8,7 @@ what neither of them knows about u. Both come from u_h at linear cost, see `flux
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ from mpi4py import MPI
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import DiffusionOnMesh, diffusion
-from ..data.loads import NOTHING, Certain, Known, Segments, VolumeMoments, mean_to_norm, reacts
+from ..data.loads import NOTHING, Certain, Segments, VolumeMoments, mean_to_norm, reacts
 from ..data.moments import Coefficient, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
@@ -33,6 +34,7 @@ from .cusps import Cusps
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .gap import integrate, integrate_edge
 from .lifting import below
+from .loss import Loss, half
 from .reaction import Reaction
 from .sums import Sums, Totals
 
@@ -144,10 +146,10 @@ class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
     κ is given by its means, as `Coefficient` has them, and by least, a lower bound of its
-    eigenvalues; whether it varies within cells is told. hats and segments are moments of f and g,
-    left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are this
-    rank's shares of the contact forces in y, by the parts' numbers, missed is what quadrature may
-    have missed of f and g in each cell, shape (cells,) or (). reach is the radius of the ball
+    eigenvalues; whether it, c or b varies within cells is told. hats and segments are moments of f
+    and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are
+    this rank's shares of the contact forces in y, by the parts' numbers, missed is what quadrature
+    may have missed of f and g in each cell, shape (cells,) or (). reach is the radius of the ball
     around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖
     alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last row
     is about. on_contact_alone tells that part of the domain is held by contact alone: (2) is then
@@ -203,8 +205,9 @@ LIFT_SHARE = 1e-2
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
 ADRIFT = (
-    "part of the domain has no way to a place where u is held: there is no Γ0, no heat loss and no"
-    " reaction, and no contact whose force is larger than what is left of the equation"
+    "part of the domain has no way to a place where u is held: there is no Γ0, no part that loses"
+    " heat everywhere and no reaction, and no contact whose force is larger than what is left of"
+    " the equation"
 )
 CROSSED = "{} is not shown to be nowhere above the upper bound of the part"
 HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
@@ -248,7 +251,9 @@ class _Known:
         cells: What the certificate needs to know of it.
         kappa: The coefficient.
         c: The reaction.
+        b: The losses.
         square: Means of c u_h², and what these miss, where c varies within cells; else None.
+        squares: Integrals of b u_h², and what these miss, on parts where b varies within facets.
         certain: f − c u_h.
         segments: g − b u_h.
         flux: y.
@@ -262,7 +267,9 @@ class _Known:
     cells: Cells
     kappa: Coefficient
     c: Reaction
+    b: Loss
     square: Certain | None
+    squares: Sequence[Segments]
     certain: Certain
     segments: Segments
     flux: Flux
@@ -284,10 +291,10 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     data = diffusion(level.data)
     _insist(data.forms.uncertified)
     cells, alpha = data.cells, OnParts.of(data.alpha, data.cells)
-    kappa, c = Coefficient(data.compiled.kappa, cells), Reaction.of(data)
-    _insist(kappa.reason or c.reason or _crossed(data))
+    kappa, c, b = Coefficient(data.compiled.kappa, cells), Reaction.of(data), Loss.of(data)
+    _insist(kappa.reason or c.reason or b.reason or _crossed(data))
     w = vertex_rows(u, cells)
-    edge, rest = Known.of(data.edges, cells, w), c.rest(w)
+    edge, rest = b.known(w), c.rest(w)
     contact, signs = alpha.side, alpha.signs
     gap = signs * u[contact.dofs] - alpha.means
     flux = equilibrate(cells, kappa.mean, w, rest, edge, contact, signs, gap)
@@ -297,8 +304,8 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     size = _size(cells, kappa, w, flux)
     certain, square = c.certain(w, kappa, size)
     _insist(certain.reason or (None if square is None else square.reason))
-    segments = Segments.joined(data.edges, cells, w, kappa.low, size)
-    _insist(segments.reason)
+    segments, squares = b.certain(w, kappa, size)
+    _insist(next((each.reason for each in (segments, *squares) if each.reason), None))
     # y is to have the means that f − c u_h and g − b u_h have now
     flux.left += cells.volume * (certain.load.mean - rest.mean)
     change = segments.through - edge.shares.sum(axis=0)
@@ -310,7 +317,8 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
         left = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
-    return _Known(level, cells, kappa, c, square, certain, segments, flux, w, size, left, carried)
+    known = level, cells, kappa, c, b, square, squares, certain, segments, flux, w
+    return _Known(*known, size, left, carried)
 
 
 def _closed(
@@ -411,9 +419,9 @@ def _functional(known: _Known, plain: bool) -> Functional:
     """Say what v is to make small; plain tells that there are gradients only, on all ranks."""
     cells, kappa, segments = known.cells, known.kappa, known.segments
     steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
-    lossy = segments.loss > 0.0
+    lossy = segments.usual > 0.0
     side = segments.facets.picked(lossy)
-    loss = segments.loss[lossy] * measures(cells, side)
+    loss = segments.usual[lossy] * measures(cells, side)
     toward, strong = segments.target(known.flux.shed)[:, lossy], segments.given[lossy]
     masses = Masses(not plain, known.c.low, side, loss, toward, strong)
     return Functional(cells, known.w, kappa.mean, steady, masses)
@@ -441,6 +449,9 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
         if known.square.missed is not None:
             own += known.square.missed
         totals.energy_slack += 0.5 * float(np.sum(own))
+    lost, unsure = half(known.squares)
+    totals.energy -= lost
+    totals.energy_slack += unsure
     totals.contact = float(np.sum(v.contact))
     totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
     totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
@@ -549,7 +560,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,
-        varies=known.kappa.varies or known.c.varies,
+        varies=known.kappa.varies or known.c.varies or known.b.varies,
         excess=flux.excess,
         beyond=flux.beyond,
         vertices=v.vertices,

@@ -81,6 +81,12 @@ class Masses:
     toward: FloatArray
     strong: BoolArray
 
+    def largest(self, cells: Cells, side: BoundaryFacets) -> float:
+        """Return the largest b, nearly, on some facets of all ranks; collective."""
+        here = np.isin(self.side.dofs, side.dofs)
+        found = (self.loss / measures(cells, self.side))[here].max(initial=0.0)
+        return max(cells.comm.allgather(float(found)))
+
     def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
         """Return what c pulls heights of bumps by, in units of 8/3, shape (3, n)."""
         return (
@@ -207,9 +213,10 @@ class Floors:
             limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
         strong = np.zeros(len(cells.exterior), dtype=bool)
         strong[masses.side.dofs] = masses.strong
-        return cls(
-            side, signs, ends, bounds.middle, tuple(limits), strong[side.dofs], len(cells.exterior)
-        )
+        # to a bound that is a number no lifting brings v
+        curved = [np.full(len(p.middle), p.trace.constant is None) for p in bounds.parts]
+        strong = strong[side.dofs] & np.concatenate([np.empty(0, dtype=bool), *curved])
+        return cls(side, signs, ends, bounds.middle, tuple(limits), strong, len(cells.exterior))
 
     def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The least and the largest heights of bumps that they allow for, by facet dof.
@@ -265,7 +272,8 @@ def companion(
     cells, floors = functional.cells, Floors.of(functional.cells, alpha, functional.masses)
     draft = _started(functional, u_D, floors, flux)
     largest = max(1e-300, float(np.abs(draft.vertices).max(initial=0.0)))
-    boundary = Boundary(u_D, alpha, max(cells.comm.allgather(largest)), goal, highest)
+    scale = max(cells.comm.allgather(largest))
+    boundary = Boundary(u_D, alpha, scale, goal, highest, functional.masses)
     wrong = boundary.contradictions(cells, draft.vertices)
     excess, cusps = functional.excess(draft.vertices), None
     if cells.tdim == 2 and sweeps > 0:
@@ -363,6 +371,7 @@ class Boundary:
         scale: Size of the values.
         goal: What ‖∇ℓ‖ need not be known better than.
         highest: The largest κ.
+        masses: What E has of terms without gradients.
     """
 
     u_D: OnParts
@@ -370,6 +379,7 @@ class Boundary:
     scale: float
     goal: float
     highest: float
+    masses: Masses | None = None
 
     def contradictions(self, cells: Cells, v: FloatArray) -> list[str | None]:
         """Tell which data no function can satisfy, from v at the vertices; this rank's facets."""
@@ -868,7 +878,10 @@ def _lift(
     third = cells.ways_between(*side.ends) * (data.sign * thirds[side.dofs])
     companion = Cubic(v, data.sign * bumps[side.dofs], third)
     base, lossy = None, data.condition.loss
-    loss = 0.0 if lossy is None else number(lossy) or 0.0
+    loss = 0.0 if lossy is None else number(lossy)
+    if loss is None:
+        assert boundary.masses is not None
+        loss = boundary.masses.largest(cells, side)
     if obstacle and len(data.condition.bounds) == 1 and loss == 0.0:
         base = Cubic(ends, middle - ends.mean(axis=0), third)
     ratio = loss / boundary.highest

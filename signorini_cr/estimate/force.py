@@ -32,7 +32,7 @@ MEETS = (
     "the part touches another one on which u is set or bounded: what flows through it is no bounded"
     " functional of the solution"
 )
-VARIES = "the coefficient or the reaction varies within cells"
+VARIES = "the coefficient or the reaction varies within cells, or a heat loss within facets"
 SPATIAL = "they are worked out for d = 2 only"
 
 

@@ -366,9 +366,13 @@ def integrate_edge(
     squares = sizes**2 / low
     sums.indicators[at] += squares
     sums.totals.neumann = float(np.sum(squares))
-    if edge.loss.any():
+    if edge.most.any():
         _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
     if cells.tdim != 2:
+        # σ is known by its norm alone; what b takes up has a product with v − u_h all the same
+        taken = edge.measure * edge.weights[:, None] * edge.rest * edge.given[edge.place]
+        jump = apart(cells, w, edge, v.vertices, v.bumps)
+        sums.totals.load_companion += float(np.sum(taken * jump))
         return sums.totals.neumann
     if flux.beyond is not None:
         sums.totals.load += sums.totals.neumann
@@ -469,6 +473,8 @@ def _add_loss(
 ) -> None:
     """Add b‖v − u_h‖²_F, and ‖q − g_F‖²_F/b where b takes that up.
 
+    Where b varies within the facet, −½∫_F b u_h² is left to the caller.
+
     Args:
         cells: The mesh.
         w: u_h at the cells' vertices, shape (d + 1, cells).
@@ -479,18 +485,19 @@ def _add_loss(
     """
     if sums.zeroth is None:
         sums.zeroth = np.zeros(cells.number)
-    loss = edge.loss[edge.place] * edge.measure
-    apart = loss * (edge.weights @ jump**2)
+    steady, (least, most) = edge.steady[edge.place] * edge.measure, edge.of_loss * edge.measure
+    squares = edge.weights @ jump**2
+    apart = most * squares
     own = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
-    size = 0.5 * float(np.sum(loss * (edge.weights @ own**2)))
+    size = 0.5 * float(np.sum(steady * (edge.weights @ own**2)))
     sums.totals.energy += 0.5 * float(np.sum(apart)) - size
     sums.totals.energy_slack += EPS * size
+    sums.totals.energy_slack += 0.5 * float(np.sum((most - least) * squares))
     sums.totals.companion += float(np.sum(apart))
-    given = np.where(edge.given, edge.squares / np.maximum(edge.loss, 1e-300), 0.0)
+    given = edge.taken(flux.shed)
     if flux.shed is not None:
         n = len(edge.loss)
         area = np.bincount(edge.place, edge.measure, minlength=n)
-        given += flux.shed**2 / (np.maximum(edge.loss, 1e-300) * area)
         means = np.bincount(edge.place, edge.measure * (edge.weights @ jump), minlength=n) / area
         sums.totals.load_companion += float(flux.shed @ means)
     sums.totals.load += float(np.sum(given))

@@ -163,6 +163,10 @@ class Cells:
                 )
             self.volume[part], self.stiffness[:, part] = _shape(edges, self.lengths[:, part])
 
+    def drain(self, sinks: Mapping[int, FloatArray]) -> None:
+        """Let parts take up a flux, which asks for data that ask for a mesh; before all else."""
+        self.fixed, self.sinks = (*self.fixed, *sinks), sinks
+
     def unstretched(self) -> Cells:
         """The same with lengths as they are."""
         return self if self.stretch is None else Cells(self.domain, self.V, self.fixed, self.sinks)

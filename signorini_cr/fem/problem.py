@@ -359,7 +359,7 @@ class Forms:
 
     @property
     def uncertified(self) -> str | None:
-        """Why there is no certificate, if the form, the reaction or some condition has none."""
+        """Why there is no certificate, if the form or some condition has none."""
         if self.problem.form is not None:
             return "the form is the user's own: the flux that goes with it is not known"
         for condition in self.conditions:
@@ -367,8 +367,6 @@ class Forms:
                 return condition.uncertified
             if condition.loss is not None and condition.flux is None:
                 return f"{condition.part}: its kind has a loss, and no flux beside it"
-            if condition.loss is not None and not is_by_cells(condition.loss):
-                return f"{condition.part}: its coefficient varies within cells: it has no enclosure"
         return None
 
     @cached_property
