@@ -255,6 +255,8 @@ def solve_in_time(
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
     check_arguments(problem, domain)
     own = _capacities(problem, capacity)
+    if problem.exact is not None and problem.f is None:
+        raise InputError("f: a problem in time derives none from exact, which tells no ∂u/∂t")
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")
     reactions = _reactions(problem, domain)

@@ -293,3 +293,6 @@ def test_what_makes_no_sense_is_refused(wrong, said):
     problem = Problem(reaction=lambda x: x[0], conditions=waves(0.0).conditions)
     with pytest.raises(InputError, match="a reaction that is a number"):
         next(solve_in_time(problem, domain, end=1.0, steps=1))
+    problem = Problem(exact=lambda x: x[0], conditions=waves(0.0).conditions)
+    with pytest.raises(InputError, match="f: a problem in time derives none from exact"):
+        next(solve_in_time(problem, domain, end=1.0, steps=1))
