@@ -152,6 +152,10 @@ class Case:
         """C."""
         return self.c
 
+    def loss(self, i: int, x: Any, y: Any, sin: Any = np.sin) -> Any:
+        """B on an edge."""
+        return self.sides[i].b
+
     def through(self, i: int, x: Any, y: Any, sin: Any = np.sin, cos: Any = np.cos) -> Any:
         """κ∇u·n on an edge."""
         (p, q), (a, b), (xx, xy, yy) = NORMALS[i], self.slope(x, y, cos), self.tensor(x, y, sin)
@@ -165,7 +169,12 @@ class Case:
     def known(self, i: int, x: Any, y: Any, sin: Any = np.sin, cos: Any = np.cos) -> Any:
         """κ∂ₙu + b (u − u_ext), which is g where there is no contact."""
         side = self.sides[i]
-        return self.through(i, x, y, sin, cos) + side.b * (self.u(x, y, sin) - side.external)
+        off = self.loss(i, x, y, sin) * (self.u(x, y, sin) - side.external)
+        return self.through(i, x, y, sin, cos) + off
+
+    def coefficient_on(self, i: int) -> Any:
+        """B on an edge, for a Problem."""
+        return self.sides[i].b
 
     def problem(self) -> Problem:
         """All data, none derived from u."""
@@ -184,7 +193,7 @@ class Case:
                 apart = ufl.max_value(side.middle - sign * wave(x), 0.0)
                 return self.u(x[0], x[1], ufl.sin) - (sign * GAP / self.kappa) * apart
 
-            lossy = {"coefficient": side.b, "external": side.external}
+            lossy = {"coefficient": self.coefficient_on(i), "external": side.external}
             if side.kind == "contact":
                 return Contact(
                     None if side.bounds == "upper" else lambda x: off(x, 1.0),
@@ -235,7 +244,8 @@ class Case:
             u, g = self.u(x, y), self.known(i, x, y)
             if side.kind == "contact":
                 g = g - side.pressure(amplitude * np.sin(frequency * t + phase))
-            total += float(weights @ (0.5 * side.b * u**2 - (g + side.b * side.external) * u))
+            b = self.loss(i, x, y)
+            total += float(weights @ (0.5 * b * u**2 - (g + b * side.external) * u))
         return total
 
 
@@ -403,6 +413,33 @@ class Uneven(Case):
         return replace(super().problem(), reaction=lambda x: self.mass(x[0], x[1], ufl.sin))
 
 
+class Leaky(Uneven):
+    """The same, or c a number, with losses that vary within facets: waves, perhaps down to 0.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        super().__init__(rng)
+        if rng.random() < 0.5:
+            self.swing, self.right = 0.0, self.c
+        self.swings = [float(rng.choice([0.0, 1.0, 1.0, rng.uniform(0, 1)])) for _ in range(4)]
+        self.ripples = rng.uniform(-9, 9, 4), rng.uniform(0, 6, 4)
+
+    def loss(self, i: int, x: Any, y: Any, sin: Any = np.sin) -> Any:
+        """B (1 + a wave along the edge)."""
+        along, (frequencies, phases) = y if i % 2 else x, self.ripples
+        wave = sin(float(frequencies[i]) * along + float(phases[i]))
+        return self.sides[i].b * (1.0 + self.swings[i] * wave)
+
+    def coefficient_on(self, i: int) -> Any:
+        """B on an edge, for a Problem."""
+        if not self.sides[i].b * self.swings[i]:
+            return self.sides[i].b
+        return lambda x: self.loss(i, x[0], x[1], ufl.sin)
+
+
 CUT = 0.55
 """Where the line that cuts c off meets y = 0."""
 
@@ -491,7 +528,8 @@ def distances(solution: Solution, case: Case) -> tuple[float, float]:
             up, uq = values[on, (j + 1) % 3], values[on, (j + 2) % 3]
             z = p[:, None] + t[:, None] * (q - p)[:, None]
             gap = case.u(z[..., 0], z[..., 1]) - (up[:, None] + t * (uq - up)[:, None])
-            whole += side.b * float(np.linalg.norm(q - p, axis=1) @ (gap**2 @ w))
+            b = case.loss(i, z[..., 0], z[..., 1])
+            whole += float(np.linalg.norm(q - p, axis=1) @ ((b * gap**2) @ w))
     h1, whole = mesh.comm.allreduce(np.array([h1, whole]))
     return float(np.sqrt(h1)), float(np.sqrt(whole))
 
@@ -608,6 +646,7 @@ WEIGHTED = "The same with weights of either sign, also where contact and Dirichl
 MEANS = "Means of parts and of the domain"
 INTEGRALS = "Integrals and means with weights, of parts, materials and the domain"
 UNEVEN = "the same with c that varies within cells: waves, down to 0 or cut off along a slant line"
+LEAKY = "the same with b that varies within facets, waves, down to 0 as well; c may vary, too"
 LAYERS = "the same with κ, up to 1 : 10⁴, and c, up to 1e8 or 0, of their own left and right"
 
 
@@ -807,6 +846,7 @@ def terms(seed: int, quick: bool) -> Group:
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
             told(_drawn(seed, 2 if quick else 150, Layered, LAYERS)),
             told(_drawn(seed, 2 if quick else 150, Uneven, UNEVEN)),
+            told(_drawn(seed, 1 if quick else 60, Leaky, LEAKY)),
             told(_drawn(seed, 2 if quick else 60, Alone, ALONE)),
             told(_drawn(seed, 2 if quick else 60, OneHolds, ONE_HOLDS)),
             *(
