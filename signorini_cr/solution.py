@@ -105,7 +105,7 @@ class Solution:
         physics = self.level.physics
         if physics.exact is None:
             return None
-        with self._estimating():
+        with self.level.as_made(), self._estimating():
             return physics.errors(self.domain, self.u)
 
     @cached_property
@@ -155,7 +155,7 @@ class Solution:
         """Have the certificate that a quantity needs, and make room after it."""
         _ = self.certificate
         try:
-            with self._estimating():
+            with self.level.as_made(), self._estimating():
                 yield
         finally:
             self.level.tidy()

@@ -296,3 +296,48 @@ def test_what_makes_no_sense_is_refused(wrong, said):
     problem = Problem(exact=lambda x: x[0], conditions=waves(0.0).conditions)
     with pytest.raises(InputError, match="f: a problem in time derives none from exact"):
         next(solve_in_time(problem, domain, end=1.0, steps=1))
+
+
+def known(solution):
+    """What is certain about a solution."""
+    found = solution.certificate
+    return [found.bound_energy_norm, *found.energy, *solution.mean("domain"), *solution.flux("top")]
+
+
+MOVING = {
+    "external": lambda t: {"left": Robin(coefficient=2.0, external=1.0 - 4.0 * t)},
+    "loss": lambda t: {"left": Robin(coefficient=2.0 + 50.0 * t)},
+    "g": lambda t: {"left": Neumann(3.0 * t)},
+    "given": lambda t: {"top": Dirichlet(t)},
+    "obstacle": lambda t: {"floor": Contact(-0.2 + 0.1 * t)},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*MOVING, "coefficient", "reaction", "f"])
+def test_what_is_certain_of_a_solution_is_so_when_data_have_moved_on(name):
+    """Asked for at once and after the last step, and of `Solver` and `solve` as well."""
+    domain = SQUARE.mesh(0.4)
+    t = clock(domain)
+    conditions = {"floor": Contact(-0.2), "right": Neumann(), "top": Dirichlet(), "left": Neumann()}
+    if name in MOVING:
+        problem = Problem(f=-3.0, conditions=conditions | MOVING[name](t))
+    else:
+        problem = Problem(**({"f": -3.0, "conditions": conditions} | {name: 1.0 + 5.0 * t}))
+    timing = {"end": 1.0, "steps": 3, "time": t}
+    at_once = [known(solution) for _, solution in solve_in_time(problem, domain, **timing)]
+    steps = list(solve_in_time(problem, domain, **timing))
+    for expected, (_, solution) in zip(at_once, steps, strict=True):
+        assert known(solution) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    assert t.value == 1.0
+    with Solver(problem, domain, levels=2) as solver:
+        t.value = 0.25
+        expected, first = known(solver.solve()), solver.solve()
+        plain = solve(problem, domain)
+        beside = known(plain)
+        t.value = 1.0
+        solver.solve(before=first)
+        assert known(first) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    again = solve(problem, domain)
+    assert again.energy != pytest.approx(plain.energy, rel=1e-3)
+    assert [plain.certificate.bound_energy_norm, *plain.certificate.energy] == beside[:3]

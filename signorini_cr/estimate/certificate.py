@@ -224,9 +224,10 @@ def certify(solution: Found, sweeps: int = 2, flux_from: Found | None = None) ->
     began = time.perf_counter()
     base = solution if flux_from is None else flux_from
     try:
-        known = _equilibrated(solution, base)
-        v, sums = _companion(solution, known, sweeps)
-        certificate = _added_up(known, v, sums)
+        with base.level.as_made():
+            known = _equilibrated(solution, base)
+            v, sums = _companion(solution, known, sweeps)
+            certificate = _added_up(known, v, sums)
     except _NoBound as why:
         certificate = Certificate(reason=str(why))
     return replace(certificate, seconds=time.perf_counter() - began)

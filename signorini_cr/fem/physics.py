@@ -10,6 +10,7 @@ are on a combination of a facet's unknowns chooses that combination as one of th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,6 +18,7 @@ from dolfinx import fem
 
 from ..arrays import FloatArray, Int32Array
 from ..mesh.domain import Domain
+from .moment import Moment
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +118,9 @@ class Physics(Protocol):
 
     def on(self, domain: Domain) -> OnMesh:
         """Take it to a mesh."""
+
+    def moment(self, domains: Iterable[Domain]) -> Moment:
+        """Note what data that may change are at present, on some meshes."""
 
     def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:
         """‖u − w‖_h and ‖u − w‖ in L2, where u is known; collective."""

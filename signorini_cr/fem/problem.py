@@ -33,6 +33,7 @@ from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts
 from ..mesh.materials import Materials
 from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, is_by_cells, number
+from .moment import Moment
 from .simplified import simplified
 from .space import facet_entities, ufl_element
 
@@ -206,6 +207,11 @@ class Kernel:
             | dict(zip(self._stand_ins, functions, strict=True)),
             self._constants,
         )
+
+    @property
+    def constants(self) -> list[fem.Constant]:
+        """The Constants in the form."""
+        return list(self._constants)
 
     def values(self) -> list[FloatArray]:
         """What the Constants and Functions in the form have for values at present."""
@@ -394,6 +400,22 @@ class Forms:
             for kernel in (self.a, self.own_load):
                 found |= dict.fromkeys([] if kernel is None else kernel.own)
         return list(found)
+
+    @cached_property
+    def constants(self) -> list[fem.Constant]:
+        """The Constants that the data hold, each once."""
+        found: dict[fem.Constant, None] = {}
+        for each in self._data.values():
+            found |= dict.fromkeys(ufl.algorithms.analysis.extract_constants(each))
+        if self.problem.form is not None:
+            for kernel in (self.a, self.own_load):
+                found |= dict.fromkeys([] if kernel is None else kernel.constants)
+        return list(found)
+
+    def moment(self, domains: Iterable[Domain]) -> Moment:
+        """Note what the Constants and Functions are at present, on some meshes."""
+        own = [domain.own(function) for function in self.functions for domain in domains]
+        return Moment(self.constants, dict.fromkeys([*self.functions, *own]))
 
     @property
     def uniform(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,6 +38,11 @@ class Level:
         """Insist on a PETSc of real numbers in double precision."""
         if PETSc.ScalarType is not np.float64:
             raise InputError(f"PETSc's numbers are {PETSc.ScalarType.__name__}; float64 is needed")
+        self._moment = self.physics.moment([each.domain for each in self.meshes])
+
+    def as_made(self) -> AbstractContextManager[None]:
+        """A block in which data that may change are what they were when this was made."""
+        return self._moment.again()
 
     @property
     def number(self) -> int:
