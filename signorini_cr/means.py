@@ -113,7 +113,10 @@ def _bounded(
 
 def _place(forms: Forms, domain: Domain, where: str | None) -> str | None:
     """A part or a material, None for all of the domain; refuse others, and where u is a datum."""
-    own = [c.part for c in forms.conditions if c.fixed is None] + list(domain.materials.numbers)
+    materials = list(domain.materials.numbers)
+    own = [c.part for c in forms.conditions if c.fixed is None] + materials
+    if where in domain.parts and where in materials:
+        raise InputError(f"{where!r} is a part and a material: one of them needs another name")
     if where is None or where in own:
         return where
     if where == DOMAIN:

@@ -226,7 +226,8 @@ ABOUT = {
     QUANTITY: "Optional. What is wanted in an interval that is sure to hold it, each under a "
     "name of your own: one of `force`, `flux`, `mean` and `integral`, and where it is wanted. A "
     "part of a force or a flux must not touch other dirichlet or contact parts, where these have "
-    f"no bounds, unless a `weight` vanishes there; `{DOMAIN}` is all of the domain.",
+    f"no bounds, unless a `weight` vanishes there; `{DOMAIN}` is all of the domain, unless a part "
+    "or a material is called so.",
 }
 """The sections, and what is said of each."""
 

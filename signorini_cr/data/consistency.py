@@ -36,8 +36,9 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
         A sentence each, the same on all ranks.
     """
     found = []
-    for condition in forms.natural:
-        given = condition.source != "exact.u" and number(condition.main) != 0.0
+    for condition in forms.conditions:
+        main = condition.main
+        given = condition.source != "exact.u" and main is not None and number(main) != 0.0
         if given and domain.mesh.comm.allreduce(len(domain.facets(condition.number))) == 0:
             found.append(f"{condition.source}: it acts nowhere, for no facet is {condition.part}")
     if forms.exact is not None:

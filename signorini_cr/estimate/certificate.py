@@ -53,7 +53,9 @@ class Certificate:
 
     Attributes:
         bound_h1: ‖u − u_h‖_h, the broken norm (1.6), is at most this.
-        bound_energy_norm: The same for ‖κ^{1/2} ∇_h(u − u_h)‖.
+        bound_energy_norm: The same for the norm of the energy, whose square is
+            ‖κ^{1/2} ∇_h(u − u_h)‖² and, where there are a reaction c and a loss of heat b,
+            ‖c^{1/2} (u − u_h)‖² and ‖b^{1/2} (u − u_h)‖² on the boundary.
         bound_companion: The same for ‖κ^{1/2} ∇(u − v)‖, v the conforming companion.
         energy: J(u) lies between these two.
         parts: Where the bound comes from: the norms of y − κ∇u_h (flux) and of ∇(v − u_h)

@@ -107,9 +107,13 @@ class Loose:
         if adrift.any() and len(dofs := np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == bad)):
             nodes = compat.cell_nodes(V.mesh)[dofs[0] // V.dofmap.index_map_bs]
             middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
+            around = ", ".join(f"{x:g}" for x in middle)
+            missing = "no Dirichlet facet, no loss of heat, no reaction, and "
+            alone = number[bad] == V.dofmap.index_map.size_global * V.dofmap.index_map_bs
             complaint = (
-                "the domain falls into pieces, and the one around "
-                f"({', '.join(f'{x:g}' for x in middle)}) has no Dirichlet facet and "
+                f"there is {missing}"
+                if alone
+                else f"the domain falls into pieces, and the one around ({around}) has {missing}"
             ) + (
                 f"a net force ∫f + ∫g {amount}: only one {wanted}, which presses it onto the "
                 "obstacle, would hold it"

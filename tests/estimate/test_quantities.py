@@ -189,3 +189,13 @@ def test_integrals_over_tetrahedra():
         assert lower <= exact_value <= upper < lower + 1e-6
     with pytest.raises(InputError, match="for d = 2 only"):
         solution.flux("contact", weight=1.0)
+
+
+def test_a_part_and_a_material_of_the_same_name_are_not_told_apart():
+    below = {"right": [[0, 0], [2, 0], [2, 0.5], [0, 0.5]]}
+    polygon = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=below)
+    sides = [Contact(-9.0, g=-1.0), Neumann(), Dirichlet(1.0), Neumann()]
+    problem = Problem(conditions=dict(zip(STRIP_EDGES, sides, strict=True)))
+    solution = solve(problem, polygon.mesh(0.5))
+    with pytest.raises(InputError, match="'right' is a part and a material"):
+        solution.mean("right")
