@@ -103,7 +103,7 @@ class Solver:
         again = self._held and self._solved != 1
         lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, again)
         self._cycle = self._stack.enter_context(lent)
-        self._assembled, self._solved = self.physics.a.values(), 0
+        self._assembled, self._solved = self.physics.a.moment(), 0
 
     def _carry_down(self) -> None:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
@@ -117,10 +117,7 @@ class Solver:
 
     def _changed(self) -> bool:
         """Whether a_h would be another one by now; collective."""
-        now = self.physics.a.values()
-        pairs = zip(now, self._assembled, strict=True)
-        changed = not all(np.array_equal(one, other) for one, other in pairs)
-        return self._domain.mesh.comm.allreduce(changed, op=MPI.LOR)
+        return self._domain.mesh.comm.allreduce(not self._assembled.lasts, op=MPI.LOR)
 
     def __enter__(self) -> Self:
         """Begin."""

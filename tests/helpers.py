@@ -21,11 +21,14 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from signorini_cr import Domain, Problem, Solution, solve_levels
+from signorini_cr import Domain, Polygon, Problem, Solution, solve_levels
 
 ROOT = Path(__file__).parent.parent
 DEMOS = ROOT / "demos"
 MESHES = ROOT / "meshes"
+SIDES = ("floor", "right", "top", "left")
+SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
+"""The unit square, each side a part of its own."""
 
 
 def clean_environment(**more: str) -> dict[str, str]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from helpers import SQUARE
 from mpi4py import MPI
 from scipy.optimize import lsq_linear
 
@@ -13,7 +14,6 @@ from signorini_cr import (
     Form,
     InputError,
     Neumann,
-    Polygon,
     Problem,
     Robin,
     Solver,
@@ -23,8 +23,6 @@ from signorini_cr import (
 )
 
 WORLD = MPI.COMM_WORLD
-EDGES = ["floor", "right", "top", "left"]
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], EDGES, names=EDGES)
 
 
 def clock(domain):

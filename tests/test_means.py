@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import ufl
+from helpers import SQUARE
 from mpi4py import MPI
 
-from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, means, solve_levels
+from signorini_cr import Contact, Dirichlet, Neumann, Problem, means, solve_levels
 
-SIDES = ("floor", "right", "top", "left")
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
 BESIDE = {"left": Neumann(), "right": Neumann()}
 
 

@@ -10,7 +10,7 @@ are on a combination of a facet's unknowns chooses that combination as one of th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -119,7 +119,7 @@ class Physics(Protocol):
     def on(self, domain: Domain) -> OnMesh:
         """Take it to a mesh."""
 
-    def moment(self, domains: Iterable[Domain]) -> Moment:
+    def moment(self, domains: Sequence[Domain]) -> Moment:
         """Note what data that may change are at present, on some meshes."""
 
     def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from ufl.constantvalue import ComplexValue
 from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_pre_traversal
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import Int32Array
 from ..errors import InputError
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts
@@ -213,10 +213,9 @@ class Kernel:
         """The Constants in the form."""
         return list(self._constants)
 
-    def values(self) -> list[FloatArray]:
-        """What the Constants and Functions in the form have for values at present."""
-        constants = [np.array(each.value) for each in self._constants]
-        return constants + [each.x.array.copy() for each in self.own]
+    def moment(self) -> Moment:
+        """Note what the Constants and Functions in the form are at present."""
+        return Moment(self.constants, self.own)
 
 
 class Forms:
@@ -412,7 +411,7 @@ class Forms:
                 found |= dict.fromkeys([] if kernel is None else kernel.constants)
         return list(found)
 
-    def moment(self, domains: Iterable[Domain]) -> Moment:
+    def moment(self, domains: Sequence[Domain]) -> Moment:
         """Note what the Constants and Functions are at present, on some meshes."""
         own = [domain.own(function) for function in self.functions for domain in domains]
         return Moment(self.constants, dict.fromkeys([*self.functions, *own]))

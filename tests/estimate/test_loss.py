@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from helpers import SIDES, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -11,7 +12,6 @@ from signorini_cr import (
     Dirichlet,
     InputError,
     Neumann,
-    Polygon,
     Problem,
     Robin,
     solve,
@@ -21,8 +21,6 @@ from signorini_cr.estimate.certificate import certify
 
 pytestmark = pytest.mark.slow
 
-SIDES = ("floor", "right", "top", "left")
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
 KAPPA = 1.5
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -11,7 +12,6 @@ from signorini_cr import (
     Dirichlet,
     InputError,
     Neumann,
-    Polygon,
     Problem,
     Robin,
     solve,
@@ -20,9 +20,6 @@ from signorini_cr import (
 from signorini_cr.estimate.certificate import certify
 
 pytestmark = pytest.mark.slow
-
-SIDES = ("floor", "right", "top", "left")
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
 
 
 def u(x):
