@@ -189,7 +189,16 @@ class ProblemFile:
             check_pieces(forms, domain)  # capacity would hold all
         else:
             self.time.check(forms, domain)
-        return [*self._of_no_material(domain), *doubts(forms, domain)]
+        return [*self._of_no_material(domain), *self._of_no_time(), *doubts(forms, domain)]
+
+    def _of_no_time(self) -> list[str]:
+        """Say which capacities do nothing, for nothing changes in time."""
+        given = [] if self.time is not None else self.problem.materials.items()
+        return [
+            f"material.{name}.capacity: it does nothing without a section [time]"
+            for name, material in given
+            if material.capacity is not None
+        ]
 
     @staticmethod
     def _of_no_material(domain: Domain) -> list[str]:

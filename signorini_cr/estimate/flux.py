@@ -149,7 +149,7 @@ def relax(
     where c h_T² is larger than κ that is less than what ‖κ^{-1/2}(y − κ∇u_h)‖_T falls by. So it is
     with b, g − b u_h − y·n and ‖b^{-1/2} ·‖_F. The squares' sum is minimised by conjugate gradients
     in the fluxes through facets inside, on Γ0, with a b and in contact, but for those of cells
-    without a c; forces that come out below 0 are 0.
+    without a c. Forces that come out below 0 are 0; then it is done once more without them.
 
     Args:
         cells: The mesh.
@@ -169,8 +169,56 @@ def relax(
     if cells.comm.allreduce(ratio, op=MPI.MAX) < STRONG:
         return None
     takers = np.broadcast_to(reaction > 0.0, cells.number)
-    # in contact the force takes up what changes, and b nothing
-    loss, in_contact = np.zeros(len(cells.exterior)), on_contact.dofs[flux.touching]
+    pushing = flux.touching.copy()
+    for last in (False, True):
+        squares, free = _relaxed(cells, kappa, reaction, edge, on_contact, pushing)
+        fluxes = squares.least(flux, free)
+        there = on_contact.local[pushing], on_contact.cells[pushing]
+        off, before = signs[pushing], flux.contact[pushing]
+        force = before + off * fluxes[there]
+        pulls = np.zeros_like(pushing)
+        pulls[pushing] = force < 0.0
+        if last or not cells.comm.allreduce(bool(pulls.any()), op=MPI.LOR):
+            break
+        # where the force would pull there is none, and what is best without it is found anew
+        _let_go(flux, on_contact, signs, pulls)
+        pushing &= ~pulls
+    force = np.maximum(force, 0.0)
+    fluxes[there] = off * (force - before)
+    flux.contact[pushing] = force
+    flux.shed = np.where(squares.of_edge > 0.0, -fluxes[squares.sides], 0.0)
+    flux.excess += fluxes
+    flux.left += sum_rows(fluxes)
+    return takers
+
+
+def _let_go(flux: Flux, on_contact: BoundaryFacets, signs: FloatArray, which: BoolArray) -> None:
+    """Take contact forces out of y."""
+    there, force = (on_contact.local[which], on_contact.cells[which]), signs * flux.contact
+    np.subtract.at(flux.excess, there, force[which])
+    np.subtract.at(flux.left, there[1], force[which])
+    flux.contact[which] = 0.0
+
+
+def _relaxed(
+    cells: Cells,
+    kappa: FloatArray,
+    reaction: FloatArray,
+    edge: Known,
+    on_contact: BoundaryFacets,
+    pushing: BoolArray,
+) -> tuple[_Relaxed, BoolArray]:
+    """What is to become small, and which facets' fluxes may change, by facet dof; collective.
+
+    Args:
+        cells: The mesh.
+        kappa: Mean of κ, shape (cells,) or ().
+        reaction: c, shape (cells,) or ().
+        edge: Integrals of g − b u_h.
+        on_contact: The facets of Γ1, once for each bound.
+        pushing: Where the force takes up what changes, and b nothing, shape (n,).
+    """
+    loss, in_contact = np.zeros(len(cells.exterior)), on_contact.dofs[pushing]
     loss[edge.side.dofs] = edge.loss
     loss[in_contact] = 0.0
     held = cells.exterior.astype(np.float64)
@@ -179,30 +227,8 @@ def relax(
     held[on_contact.dofs] = loss[on_contact.dofs] == 0.0
     held[in_contact] = 0.0
     if reaction.ndim:
-        held[cells.facets[:, ~takers]] = 1.0
-    free = cells.share(held) == 0.0
-    squares = _Relaxed.of(cells, kappa, reaction, edge.side, loss)
-
-    def assembled(local: FloatArray) -> FloatArray:
-        return np.where(free, cells.over_facets(local), 0.0)
-
-    def image(way: FloatArray) -> FloatArray:
-        fluxes = squares.sign * way[cells.facets]
-        return assembled(squares.slopes(fluxes, sum_rows(fluxes), fluxes[squares.sides]))
-
-    down = -assembled(squares.slopes(flux.excess, flux.left, np.zeros(len(edge.loss))))
-    change = np.zeros_like(down)
-    descend(cells, image, change, down, squares.diagonal(), STEPS)
-    fluxes = squares.sign * change[cells.facets]
-    there = on_contact.local[flux.touching], on_contact.cells[flux.touching]
-    off, before = signs[flux.touching], flux.contact[flux.touching]
-    force = np.maximum(before + off * fluxes[there], 0.0)
-    fluxes[there] = off * (force - before)
-    flux.contact[flux.touching] = force
-    flux.shed = np.where(squares.of_edge > 0.0, -fluxes[squares.sides], 0.0)
-    flux.excess += fluxes
-    flux.left += sum_rows(fluxes)
-    return takers
+        held[cells.facets[:, reaction <= 0.0]] = 1.0
+    return _Relaxed.of(cells, kappa, reaction, edge.side, loss), cells.share(held) == 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,6 +278,26 @@ class _Relaxed:
             _inverse(loss[side.dofs] * measures(cells, side)),
             cells.ways * cells.turns * np.array([[1.0], [-1.0], [1.0]]),
         )
+
+    def least(self, flux: Flux, free: BoolArray) -> FloatArray:
+        """How fluxes out of the cells are to change, shape (3, cells); collective.
+
+        Args:
+            flux: y.
+            free: Which of them may, by facet dof.
+        """
+
+        def assembled(local: FloatArray) -> FloatArray:
+            return np.where(free, self.cells.over_facets(local), 0.0)
+
+        def image(way: FloatArray) -> FloatArray:
+            fluxes = self.sign * way[self.cells.facets]
+            return assembled(self.slopes(fluxes, sum_rows(fluxes), fluxes[self.sides]))
+
+        down = -assembled(self.slopes(flux.excess, flux.left, np.zeros(len(self.of_edge))))
+        change = np.zeros_like(down)
+        descend(self.cells, image, change, down, self.diagonal(), STEPS)
+        return self.sign * change[self.cells.facets]
 
     def slopes(self, excess: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
         """½ ∂ by the flux through each cell's facets, shape (3, cells).

@@ -26,7 +26,7 @@ from .certificate import Certificate, Made
 from .gap import apart
 from .weights import Beyond, Weight
 
-NO_BOUNDS = "the contact force has no bounds"
+NO_BOUNDS = "what flows through the part has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
 MEETS = (
     "the part touches another one on which u is set or bounded: what flows through it is no bounded"

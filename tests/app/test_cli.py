@@ -541,6 +541,18 @@ def test_surfaces_without_a_section(write) -> None:
         )
 
 
+def test_a_capacity_without_time(write) -> None:
+    """It does nothing, and that is said; with a section [time] it does, and nothing is said."""
+    mesh = msh([*LINES, "2 2 3 3 1 2 3", "2 2 3 3 1 3 4"])
+    write(mesh, "one.msh")
+    text = '[domain]\nmesh = "one.msh"\n[data]\nf = 1\n[material.body]\ncapacity = 2\n'
+    for more, said in ("", True), ("[time]\nend = 1\nsteps = 2\n", False):
+        status, _, err = run("check", write(text + more))
+        assert status == cli.DONE
+        told = "material.body.capacity: it does nothing without a section [time]"
+        assert COMM.bcast(told in " ".join(err.split())) == said
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input(name: str, write) -> None:
     text, words = BAD[name]

@@ -12,8 +12,10 @@ from signorini_cr import (
     Dirichlet,
     InputError,
     Neumann,
+    Polygon,
     Problem,
     Robin,
+    families,
     solve,
     solve_levels,
 )
@@ -148,3 +150,45 @@ def test_a_conforming_function_with_the_flux_of_the_other_element(c, b, scale):
         assert certificate.bound_energy_norm <= 2.0 * np.sqrt(square)
     low, high = certificate.energy
     assert low <= energy_of_the_solution(domain, at, b) <= high
+
+
+@pytest.mark.parametrize("sides", ["both", "below"])
+@pytest.mark.parametrize("size", [1e4, 1e6, 1e8])
+def test_contact_that_yields_to_a_reaction_and_a_loss(size, sides):
+    """On coarse meshes forces decide little: where c and b want a pull, b takes it, not y."""
+
+    def exact(x):
+        return ufl.sin(2 * x[0]) * ufl.cosh(x[1]) + x[1] * pull(x)
+
+    def pull(x):
+        # ∂u/∂y on the floor: below 0 where u = α, and above 0 where u = β
+        below = -(ufl.max_value(-x[0] - 0.3, 0.0) ** 3)
+        return below if sides == "below" else below + ufl.max_value(x[0] - 0.3, 0.0) ** 3
+
+    def off(x, sign):
+        return 0.5 * ufl.max_value(0.3 + sign * x[0], 0.0) ** 2
+
+    def external(x):
+        return ufl.sin(2 * x[0])
+
+    floor = Contact(
+        lambda x: external(x) - off(x, 1.0),
+        upper=None if sides == "below" else lambda x: external(x) + off(x, -1.0),
+        coefficient=size,
+        external=external,
+    )
+    names = ["floor", "right", "top", "left"]
+    conditions = dict(zip(names, (floor, Neumann(), Dirichlet(), Dirichlet()), strict=True))
+    polygon = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], names, names=names)
+    mesh = families.structured(polygon, 2, MPI.COMM_WORLD)
+    for solution in solve_levels(
+        Problem(exact=exact, reaction=size, conditions=conditions), mesh, 4
+    ):
+        domain = solution.domain
+        off_by = exact(ufl.SpatialCoordinate(domain.mesh)) - solution.u
+        slopes = ufl.grad(off_by)
+        ds = ufl.ds(domain.mesh, subdomain_data=domain.tags, metadata={"quadrature_degree": 10})
+        on_floor = fem.assemble_scalar(fem.form(size * off_by**2 * ds(domain.parts["floor"])))
+        inside = integral(domain, ufl.inner(slopes, slopes) + size * off_by**2)
+        error = np.sqrt(inside + domain.mesh.comm.allreduce(on_floor))
+        assert error <= solution.certificate.bound_energy_norm < 1.6 * error
