@@ -1,5 +1,7 @@
 """Heat losses that vary within facets: bounds and brackets against solutions in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
@@ -133,6 +135,22 @@ def test_with_a_reaction_that_varies(name, size):
         assert error <= certificate.bound_energy_norm < 1.3 * error
         low, high = certificate.energy
         assert low <= known.energy() <= high
+
+
+@pytest.mark.parametrize("c", [0.0, 30.0])
+@pytest.mark.parametrize("floor", FLOORS)
+def test_what_a_rule_misses_is_taken_up_by_a_strong_loss(floor, c):
+    """By few cells b u_ext is integrated badly: that is no flux which u has to make up for."""
+
+    def loss(_):
+        return 1e9
+
+    rough = replace(problem(loss, floor, c), quadrature_degree=2)
+    for solution in solve_levels(rough, SQUARE.mesh(0.9), 3):
+        error = Reference(solution.domain, loss, floor, c).error(solution.u)
+        energy = Reference(solution.domain, loss, floor, c).energy()
+        assert error <= solution.certificate.bound_energy_norm < 1.5 * error
+        assert solution.certificate.energy[0] <= energy <= solution.certificate.energy[1]
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
