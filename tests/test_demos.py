@@ -156,10 +156,10 @@ def test_the_gmsh_file_of_the_documents_is_read(tmp_path):
 
 @pytest.mark.serial
 def test_a_demo_starts_as_its_users_start_it(tmp_path):
-    done = start(DEMOS / "demo_certificate.py", tmp_path, ranks=2, SIGNORINI_DEMO_LEVELS="3")
+    done = start(DEMOS / "demo_wall.py", tmp_path, ranks=2, SIGNORINI_DEMO_LEVELS="3")
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     assert "written: " in done.stdout
-    assert is_picture(tmp_path / "certificate.png")
+    assert is_picture(tmp_path / "wall.png")
 
 
 def test_picture_of_the_error(shared_tmp_path):
