@@ -193,10 +193,11 @@ class ProblemFile:
 
     def _of_no_time(self) -> list[str]:
         """Say which capacities do nothing, for nothing changes in time."""
-        given = [] if self.time is not None else self.problem.materials.items()
+        if self.time is not None:
+            return []
         return [
             f"material.{name}.capacity: it does nothing without a section [time]"
-            for name, material in given
+            for name, material in self.problem.materials.items()
             if material.capacity is not None
         ]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import SQUARE
+from helpers import SIDES, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -177,9 +177,8 @@ def test_contact_that_yields_to_a_reaction_and_a_loss(size, sides):
         coefficient=size,
         external=external,
     )
-    names = ["floor", "right", "top", "left"]
-    conditions = dict(zip(names, (floor, Neumann(), Dirichlet(), Dirichlet()), strict=True))
-    polygon = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], names, names=names)
+    conditions = dict(zip(SIDES, (floor, Neumann(), Dirichlet(), Dirichlet()), strict=True))
+    polygon = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], SIDES, names=SIDES)
     mesh = families.structured(polygon, 2, MPI.COMM_WORLD)
     for solution in solve_levels(
         Problem(exact=exact, reaction=size, conditions=conditions), mesh, 4
