@@ -503,10 +503,12 @@ class Segments:
                 return np.stack([cubic, quadratic**2])
 
             here, goal = pick(low, facets.cells), SHARE * size
+            most = _trace_constant(cells, facets) ** 2 / here
+            inverse = np.divide(1.0, edge.loss, out=np.full(n, np.inf), where=edge.loss > 0.0)
             scales = np.stack(
                 [
                     2.0 * edge.measure / np.sqrt(here) / goal,
-                    4.0 * edge.measure * _trace_constant(cells, facets) ** 2 / here / goal**2,
+                    4.0 * edge.measure * np.minimum(most, inverse) / goal**2,
                 ]
             )
             scales[1] *= norms
@@ -683,8 +685,13 @@ class Segments:
         return self._by_cell(np.minimum(np.sqrt(squares), known + np.sqrt(rest)))
 
     def beyond(self) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg and Σ_F c_F ‖g − q‖_F for each."""
-        return self._by_cell(self.rough)
+        """Cells at Γg and Σ_F c_F ‖g − q‖_F for each, where b does not take up g − q."""
+        return self._by_cell(np.where(self.given, 0.0, self.rough))
+
+    @property
+    def beyond_loss(self) -> FloatArray:
+        """‖b^{-1/2}(g − q)‖²_F, or more, where b takes it up; 0 elsewhere, shape (facets,)."""
+        return np.where(self.given, self.rough**2 / np.maximum(self.loss, 1e-300), 0.0)
 
     def at_facets(
         self, vertices: FloatArray, bumps: FloatArray, w: FloatArray

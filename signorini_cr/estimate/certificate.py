@@ -681,6 +681,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     On T, ∫ (f − q) e = e_T ∫ (f − q) + ∫ (f − q)(e − e_T), with Poincaré's inequality for the last;
     on F, ∫ (g − q) e = e_T ∫ (g − q) + ∫ (g − q)(e − e_T) likewise. Whatever the signs of the first
     terms, they are bounded as if all were the same: by what they are for |e|, which has ∇e's norm.
+    Where b is strong, ∫ (g − q) e is at most ‖b^{-1/2}(g − q)‖ ‖b^{1/2} e‖ as a whole.
     """
     level, cells, kappa, size = known.level, known.cells, known.kappa, known.size
     certain, segments = known.certain, known.segments
@@ -703,10 +704,12 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         if v.cusps is not None:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
     at, sizes = segments.beyond()
-    on_edge = np.sqrt(np.sum(sizes**2 / pick(kappa.low, at)))
+    on_edge = np.sum(sizes**2 / pick(kappa.low, at))
     change += segments.change(v.vertices, v.bumps)
-    square, on_edge, change = cells.total(square, on_edge**2, change)
-    loose = np.sqrt(square) + np.sqrt(on_edge)
+    square, on_edge, of_loss, change = cells.total(
+        square, on_edge, np.sum(segments.beyond_loss), change
+    )
+    loose = np.hypot(np.sqrt(square) + np.sqrt(on_edge), np.sqrt(of_loss))
     if known.flux.carried is None:
         missed = _missed(cells, certain, segments)
         loose += unbalanced(level, cells, missed, kappa.least, size, known.c.low)
@@ -714,8 +717,9 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
 
 
 def _missed(cells: Cells, certain: Certain, segments: Segments) -> FloatArray:
-    """Bound what quadrature may have missed of the integrals of f and g, cell by cell."""
-    on_edge = np.bincount(segments.facets.cells, segments.missed, minlength=cells.number)
+    """Bound what quadrature may have missed of integrals of f, and of g but where b takes it up."""
+    on_facets = np.where(segments.given, 0.0, segments.missed)
+    on_edge = np.bincount(segments.facets.cells, on_facets, minlength=cells.number)
     return np.asarray(on_edge if certain.missed is None else certain.missed + on_edge)
 
 

@@ -9,10 +9,27 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.la import InsertMode
-from dolfinx.mesh import compute_midpoints, create_box, exterior_facet_indices, meshtags
+from dolfinx.mesh import (
+    compute_midpoints,
+    create_box,
+    create_unit_cube,
+    exterior_facet_indices,
+    meshtags,
+)
 from mpi4py import MPI
 
-from signorini_cr import Contact, Domain, InputError, Neumann, Polygon, Problem, solve, solve_levels
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Domain,
+    InputError,
+    Neumann,
+    Polygon,
+    Problem,
+    Robin,
+    solve,
+    solve_levels,
+)
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.diffusion import Diffusion
@@ -565,6 +582,44 @@ def test_tetrahedra():
         level = Level((NestedMesh(Diffusion(Problem(**data, **curved), mesh), domain),))
         solution.level, solution.u = level, fem.Function(level.V)
         assert "affine on the facets" in certify(solution).reason
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("c", [0.0, 30.0])
+@pytest.mark.parametrize("cells", [2, 4])
+def test_a_strong_loss_takes_up_what_quadrature_misses(cells, c):
+    """Facets of tetrahedra are cut a few times only, where b u_ext is far from polynomials."""
+    b, kappa = 1e9, 2.0
+    mesh = create_unit_cube(MPI.COMM_SELF, cells, cells, cells)
+    mesh.topology.create_connectivity(2, 3)
+    x, _, z = compute_midpoints(mesh, 2, exterior_facet_indices(mesh.topology)).T
+    parts = np.where(np.abs(x - 0.5) > 0.5 - 1e-9, 1, np.where(z > 1 - 1e-9, 2, 3))
+    tags = meshtags(mesh, 2, exterior_facet_indices(mesh.topology), parts.astype(np.int32))
+    domain = Domain.from_tags(mesh, tags, cold=1, lossy=2, rest=3)
+
+    def exact(x):
+        return ufl.sin(np.pi * x[0]) * ufl.exp(x[1]) * ufl.cos(1.3 * x[2] + 0.2 * x[1])
+
+    conditions = {"cold": Dirichlet(0.0), "lossy": Robin(coefficient=b), "rest": Neumann()}
+    problem = Problem(exact=exact, coefficient=kappa, reaction=c, conditions=conditions)
+    level = Level((NestedMesh(Diffusion(problem, mesh, parts=domain.parts), domain),))
+    u_h = fem.Function(level.V)
+    u_h.x.array[:] = np.linalg.solve(level.system.A[:, :], level.system.b)
+    certificate = certify(SimpleNamespace(level=level, u=u_h, element="CR", domain=domain))
+
+    u, n, on = exact(ufl.SpatialCoordinate(mesh)), ufl.FacetNormal(mesh), {"quadrature_degree": 10}
+    dx, ds = ufl.dx(mesh, metadata=on), ufl.Measure("ds", mesh, subdomain_data=tags, metadata=on)
+    off, flux = u - u_h, kappa * ufl.inner(ufl.grad(u), n)
+    f = c * u - kappa * ufl.div(ufl.grad(u))
+
+    def energy(v):
+        return (kappa * ufl.inner(ufl.grad(v), ufl.grad(v)) + c * v**2) * dx + b * v**2 * ds(2)
+
+    square = fem.assemble_scalar(fem.form(energy(off)))
+    work = f * u * dx + flux * u * ds(3) + (flux * u + b * u**2) * ds(2)
+    least = fem.assemble_scalar(fem.form(0.5 * energy(u) - work))
+    assert np.sqrt(square) <= certificate.bound_energy_norm < 2.5 * np.sqrt(square)
+    assert certificate.energy[0] <= least <= certificate.energy[1]
 
 
 def pressed(f=-1.0, rule=4):
