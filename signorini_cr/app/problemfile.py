@@ -426,14 +426,14 @@ def _domain(
         with naming("domain.holes", "holes must lie inside the polygon and apart from each other"):
             polygon = replace(polygon, holes=tuple(holes))
         polygon = replace(polygon, materials=polygons)
-    with naming("domain.boundary"):
-        polygon.check_parts()
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
     for name in names:
         if name not in labels:
             near = difflib.get_close_matches(name, labels, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise InputError(f"boundary.{name}: no edge is labelled {name}{hint}")
+    with naming("domain.boundary"):
+        polygon.check_parts()
     # From the longest edge on, facets grow inside only; none is longer than the diameter
     if size > polygon.diameter * (1 + 1e-9):
         raise InputError(

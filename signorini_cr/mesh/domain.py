@@ -392,7 +392,7 @@ class Polygon:
         boundary: Part of edge i, which runs from vertex i to vertex i + 1: a key of `PARTS`, or one
             of `names`.
         holes: Polygons inside this one, apart from each other.
-        names: Further parts that there may be, whose conditions are in `Problem.conditions`. With
+        names: Further parts, of an edge each or more, with conditions in `Problem.conditions`. With
             some, there need be no edge that is contact, and none that is dirichlet.
         materials: What lies in a polygon, shape (n, 2), consists of a material, whose data are in
             `Problem.materials`. These polygons may share edges and reach beyond the domain, but not
@@ -476,13 +476,19 @@ class Polygon:
             raise InputError("a hole has holes of its own: describe what lies in them separately")
 
     def check_parts(self) -> None:
-        """Insist on a Dirichlet and a contact part, unless there may be others.
+        """Insist on an edge for each name and, without names, on a Dirichlet and a contact part.
 
         A hole alone needs neither.
         """
+        labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
+        for name in itertools.chain(self.names, *(hole.names for hole in self.holes)):
+            if name not in labels:
+                raise InputError(
+                    f"no edge is labelled {name!r}, which is one of the names; found "
+                    f"{_list(sorted(labels))}"
+                )
         if self.names:
             return
-        labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
         for part in USUAL:
             if part not in labels:
                 raise InputError(
@@ -506,8 +512,9 @@ class Polygon:
             comm: The ranks that share the mesh.
 
         Raises:
-            InputError: The size is no positive number or longer than the diameter, no edge is
-                contact or none is Dirichlet, or gmsh can't make the mesh.
+            InputError: The size is no positive number or longer than the diameter, no edge has one
+                of the names or, without names, none is contact or Dirichlet, or gmsh can't make
+                the mesh.
         """
         insist_on_kind("size", size, Real, "a positive number")
         if not (np.isfinite(size) and size > 0):

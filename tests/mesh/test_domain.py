@@ -366,6 +366,16 @@ def test_parts_that_must_be_there(missing: str):
     assert f"no edge is labelled '{missing}'" in fails_alike(Polygon(RECTANGLE, labels).mesh, 0.5)
 
 
+def test_a_name_that_no_edge_has_is_refused():
+    """Else its condition would be none, and the default would hold where it was meant."""
+    labels = ("contact", "neumann", "dirichlet", "neumann")
+    polygon = Polygon(RECTANGLE, labels, names=("roof",))
+    assert "no edge is labelled 'roof', which is one of the names" in fails_alike(polygon.mesh, 0.5)
+    hole = Polygon([[0.4, 0.4], [0.6, 0.4], [0.5, 0.6]], ("roof",) * 3, names=("roof",))
+    around = Polygon(RECTANGLE, labels, holes=(hole,), names=("roof",))
+    assert "roof" in around.mesh(0.5).parts
+
+
 @pytest.mark.parametrize("size", [0, -1, np.nan, np.inf, 1e-12, 1e-4])
 def test_bad_sizes(size: float):
     assert f"size is {size}" in fails_alike(Polygon(RECTANGLE, LABELS).mesh, size)
