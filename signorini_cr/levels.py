@@ -257,6 +257,7 @@ def solve_level(
         ):
             data = Data(
                 row_sums=system.row_sums,
+                masses=system.masses,
                 rounding=system.data_rounding,
                 rounded=system.data_rounded,
                 loads=system.chi[system.bounded],

@@ -69,7 +69,11 @@ class Extended:
     Attributes:
         active: The active set.
         residual: A (x + remainder) − b.
+        masses: What rounding may leave of c and b in the entries of owned rows, shape (dofs,), and
+            what all values are off by; or None.
     """
+
+    masses: tuple[FloatArray, float] | None = None
 
     def __init__(
         self,
@@ -207,6 +211,10 @@ class Extended:
         rng = np.random.default_rng((seed, self._stiffness.comm.rank, 1))
         flows = self._stiffness.flows(self._vectors.x)
         answer.array[:] += DATUM * flows * rng.choice([-1.0, 1.0], len(flows)) - load
+        if self.masses is not None:
+            noise, offset = self.masses
+            size = noise * (np.abs(self._vectors.x.array_r) + offset)
+            answer.array[:] += size * rng.choice([-1.0, 1.0], len(size))
         forces = answer.array_r[bounded].copy()
         step = self._linear.correction(self.active, answer)
         self._stiffness.residual(step, self._nothing, self._work)

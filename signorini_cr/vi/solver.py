@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
@@ -33,6 +34,12 @@ from .system import DATUM, Vectors
 
 SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""
+
+ENTRIES = 3.0
+"""So many times the largest entry is what c and b have in a row and in those of its neighbours."""
+
+SLIGHT = 0.1
+"""What need not be worked out, in parts of what may be wrong with the forces."""
 
 SET_STEPS = 2
 """Newton steps to that end alone, when the residual as a whole is small enough already.
@@ -87,6 +94,7 @@ class Data:
 
     Attributes:
         row_sums: `System.row_sums`.
+        masses: `System.masses`; it is asked where it may count.
         rounding: `System.data_rounding`.
         rounded: Bound of what that may change, summed up, `System.data_rounded`.
         loads: χ in the bounded dofs, shape (n,).
@@ -95,6 +103,7 @@ class Data:
     """
 
     row_sums: Callable[[], FloatArray]
+    masses: Callable[[], FloatArray | None]
     rounding: DataRounding
     rounded: float
     loads: FloatArray
@@ -323,6 +332,8 @@ class NewtonTest:
         """Go on to twice the digits where double precision is not enough; collective."""
         assert self._data is not None
         extended = Extended(self._linear, self._cycle.operator, bounds, self._stiffness, vectors)
+        if self._masses is not None:
+            extended.masses = DATUM * self._masses, self._offset
         try:
             settled = extended.settle(self._data.rounding, self._data.loads, self._loose)
             active = extended.active.dofs
@@ -350,7 +361,7 @@ class NewtonTest:
         errors += STORED * stiffness.magnitude(x, facts.active.mask)
         errors += self._close(x, facts.active, moving=not sure)
         total = facts.forces.sum()
-        of_data = np.where(facts.forces > 0.0, self._of_data(x, facts.active), 0.0)
+        of_data = np.where(facts.forces > 0.0, self._of_data(x, facts.active, total), 0.0)
         with np.errstate(over="ignore"):  # no forces at all: everything is too much beside them
             relative = np.maximum(
                 errors / np.maximum(facts.sizes, 1e-300), of_data / max(total, 1e-300)
@@ -378,14 +389,34 @@ class NewtonTest:
         force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
         return self._stiffness.totals(np.where(active.mask, 0.0, force))
 
-    def _of_data(self, x: PETSc.Vec, active: ActiveSet) -> float:
-        """What rounding of the data may add to the forces, all together; collective."""
+    def _of_data(self, x: PETSc.Vec, active: ActiveSet, total: float) -> float:
+        """What rounding of the data may add to the forces, all together; collective.
+
+        An entry of the matrix that c or b has a part in is off by a rounding of the largest in its
+        cell, even where it is 0.
+
+        Args:
+            x: The iterate.
+            active: Its active set.
+            total: The sum of the forces.
+        """
         if self._data is None:
             return 0.0
         sizes = np.abs(x.array_r[active.bounded]) + self._offset
         own = float((self._cycle.operator.diagonal * sizes)[active.mask].sum())
-        total = self._stiffness.comm.allreduce(own)
-        return self._data.rounded + 2.0 * DATUM * float(total)
+        rounded = self._data.rounded + 2.0 * DATUM * float(self._stiffness.comm.allreduce(own))
+        # where it may count: no entry is larger than the largest on the diagonal
+        sizes = x.norm(PETSc.NormType.NORM_1) + x.getSize() * self._offset
+        most = ENTRIES * DATUM * self._stiffness.stiffest * sizes
+        if most <= SLIGHT * FORCES * total or self._masses is None:
+            return rounded
+        own = float(self._masses @ (np.abs(x.array_r) + self._offset))
+        return rounded + DATUM * float(self._stiffness.comm.allreduce(own))
+
+    @cached_property
+    def _masses(self) -> FloatArray | None:
+        """`System.masses`; collective."""
+        return None if self._data is None else self._data.masses()
 
     @property
     def _offset(self) -> float:

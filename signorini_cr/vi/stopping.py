@@ -84,6 +84,7 @@ class Stiffness:
         comm: The ranks.
         number: How many classes of dofs with a bound there are, over all ranks; some may be empty.
         contrast: Largest diagonal entry over the smallest.
+        stiffest: The largest of them.
         bounded: Class of each dof with a bound, shape (n,).
         made_of: What the rows of these are made of, summed over each class, shape (classes,).
         least: What forces are measured against at least, shape (classes,).
@@ -114,7 +115,7 @@ class Stiffness:
         entries[grid.dirichlet] = 0.0
         high = self.comm.allreduce(float(entries.max(initial=0.0)), op=MPI.MAX)
         entries[grid.dirichlet] = 1.0
-        self._smallest, self.contrast = low, max(high / low, 1.0)
+        self._smallest, self.stiffest, self.contrast = low, high, max(high / low, 1.0)
         self._kinds = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
         self._kind = self._classes(grid.operator.diagonal)
         self.number = self._kinds * LEVELS

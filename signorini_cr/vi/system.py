@@ -350,6 +350,29 @@ class System:
         sums.x.array[self.dirichlet] = 1.0
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
+    def masses(self) -> FloatArray | None:
+        """What c and b have in a row of A and in those of its neighbours, shape (dofs,).
+
+        An entry of A that is next to nothing may be what rounding has left of these.
+
+        Returns:
+            Sums of a_h(1, ·) of owned dofs; None where there are no c and no b.
+        """
+        if (of_constants := self._data.of_constants()) is None:
+            return None
+        Layout.of_space(self.u_D.function_space).shared_sum(of_constants)
+        pattern = self.A.duplicate(copy=True)
+        start, column, value = pattern.getValuesCSR()
+        pattern.setValuesCSR(start, column, np.ones_like(value))
+        pattern.assemble()
+        here, around = pattern.createVecs()
+        here.array[:] = np.abs(of_constants[: len(here.array_r)])
+        here.array[self.owned_dirichlet] = 0.0
+        pattern.mult(here, around)
+        found: FloatArray = around.array_r.copy()
+        release(pattern, here, around)
+        return found
+
     @property
     def data_rounded(self) -> float:
         """Bound of what rounding of u_D and of the loads may change in b, summed up; collective."""

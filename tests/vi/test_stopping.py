@@ -17,16 +17,20 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 import ufl
+from dolfinx import fem
 from dolfinx.mesh import compute_midpoints, create_mesh, exterior_facet_indices, meshtags
 from mpi4py import MPI
 
 from signorini_cr import (
     Contact,
+    Dirichlet,
     Domain,
     InputError,
+    Neumann,
     NotConverged,
     Polygon,
     Problem,
+    Robin,
     Solution,
     solve,
     solve_levels,
@@ -541,3 +545,49 @@ def test_an_offset_is_taken_off():
         assert np.all(np.abs(table["u"] - 100.0) < 1.0)
         assert np.all(table["u"][table["active"]] == table["obstacle"][table["active"]])
     assert solutions(block(1e4, 0.2), 1)[-1].level.system.offset == 0.0
+
+
+def soft_beside_a_loss(soft: float, b: float):
+    """Strips of κ = 1 and of something soft, b u lost above, contact on the other three sides."""
+    names = ("floor", "right", "top", "left")
+    polygon = Polygon([[0, 0], [2, 0], [2, 1], [0, 1]], names, names=names)
+    domain = polygon.mesh(0.3)
+    kappa = fem.Function(fem.functionspace(domain.mesh, ("DG", 0)))
+    across = lambda x: np.sin((0.2642 * x[0] + 0.9645 * x[1]) / 0.1215)  # noqa: E731
+    kappa.interpolate(lambda x: np.where(across(x) > 0.3, soft, 1.0))
+    upper = lambda x: 0.15 + 0.15 * x[0] + 0.2 * x[1]  # noqa: E731
+    conditions = {
+        "floor": Contact(lambda x: -0.05 + 0.2 * x[0] - 0.1 * x[1], upper=upper),
+        "right": Dirichlet(lambda x: x[0] / 5),
+        "top": Robin(coefficient=b, external=-0.2),
+        "left": Contact(upper=upper),
+    }
+    return Problem(f=-30.0, coefficient=kappa, conditions=conditions), domain
+
+
+def test_what_hangs_on_zeros_of_the_matrix_is_refused():
+    """b ∫ φ_i φ_j is 0 by symmetry, and 1e-16 b|F| in floating point: 1e-3 of what is soft.
+
+    Residual and last step know nothing of it; who assembles in another order finds other forces.
+    """
+    problem, domain = soft_beside_a_loss(3e-7, 1.7e7)
+    with pytest.raises(NotConverged, match="hangs on the last digit of the data"):
+        solve(problem, domain)
+    for soft, b in ((1e-2, 1e8), (3e-7, 1e3)):
+        assert solve(*soft_beside_a_loss(soft, b)).iterations.force_error < 1e-6
+
+
+def test_what_a_loss_has_in_rows_and_their_neighbours():
+    """b|F| in the three rows of a facet's cell."""
+    names = ("floor", "right", "top", "left")
+    square = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], names, names=names)
+    conditions = {name: Neumann() for name in names} | {"right": Robin(coefficient=7.0)}
+    problem = Problem(f=1.0, conditions=conditions)
+    level = solve(problem, square.mesh(0.5, MPI.COMM_SELF)).level
+    found, cells = level.system.masses(), level.data.cells
+    side = cells.sides[level.domain.parts["right"]]
+    expected = np.zeros(len(found))
+    np.add.at(expected, cells.facets[:, side.cells], 7.0 * 0.5)
+    assert len(side.cells) == 2 and np.allclose(found, expected, atol=1e-12)
+    plain = Problem(f=1.0, conditions=conditions | {"right": Dirichlet()})
+    assert solve(plain, square.mesh(0.5, MPI.COMM_SELF)).level.system.masses() is None
