@@ -408,7 +408,7 @@ class NewtonTest:
         # where it may count: no entry is larger than the largest on the diagonal
         sizes = x.norm(PETSc.NormType.NORM_1) + x.getSize() * self._offset
         most = ENTRIES * DATUM * self._stiffness.stiffest * sizes
-        if most <= SLIGHT * FORCES * total or self._masses is None:
+        if total == 0.0 or most <= SLIGHT * FORCES * total or self._masses is None:
             return rounded
         own = float(self._masses @ (np.abs(x.array_r) + self._offset))
         return rounded + DATUM * float(self._stiffness.comm.allreduce(own))
