@@ -69,11 +69,7 @@ class Extended:
     Attributes:
         active: The active set.
         residual: A (x + remainder) − b.
-        masses: What rounding may leave of c and b in the entries of owned rows, shape (dofs,), and
-            what all values are off by; or None.
     """
-
-    masses: tuple[FloatArray, float] | None = None
 
     def __init__(
         self,
@@ -82,8 +78,21 @@ class Extended:
         bounds: Bounds,
         stiffness: Stiffness,
         vectors: Vectors,
+        masses: FloatArray | None,
+        offset: float,
     ):
-        """Begin with the iterate and the active set that the linear solver had last."""
+        """Begin with the iterate and the active set that the linear solver had last.
+
+        Args:
+            linear: Solves reduced systems.
+            operator: The matrix.
+            bounds: The bounds.
+            stiffness: Classes of dofs.
+            vectors: Iterate, right-hand side and residual.
+            masses: As `System.masses` has them.
+            offset: `System.offset`.
+        """
+        self._masses, self._offset = masses, offset
         self._linear, self._operator, self._bounds = linear, operator, bounds
         self._stiffness, self._vectors = stiffness, vectors
         self.active, self.residual = linear.active, vectors.residual
@@ -211,9 +220,8 @@ class Extended:
         rng = np.random.default_rng((seed, self._stiffness.comm.rank, 1))
         flows = self._stiffness.flows(self._vectors.x)
         answer.array[:] += DATUM * flows * rng.choice([-1.0, 1.0], len(flows)) - load
-        if self.masses is not None:
-            noise, offset = self.masses
-            size = noise * (np.abs(self._vectors.x.array_r) + offset)
+        if self._masses is not None:
+            size = DATUM * self._masses * (np.abs(self._vectors.x.array_r) + abs(self._offset))
             answer.array[:] += size * rng.choice([-1.0, 1.0], len(size))
         forces = answer.array_r[bounded].copy()
         step = self._linear.correction(self.active, answer)

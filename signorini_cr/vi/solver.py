@@ -331,9 +331,8 @@ class NewtonTest:
     def settle(self, vectors: Vectors, bounds: Bounds) -> None:
         """Go on to twice the digits where double precision is not enough; collective."""
         assert self._data is not None
-        extended = Extended(self._linear, self._cycle.operator, bounds, self._stiffness, vectors)
-        if self._masses is not None:
-            extended.masses = DATUM * self._masses, self._offset
+        there = self._linear, self._cycle.operator, bounds, self._stiffness, vectors
+        extended = Extended(*there, self._masses, self._data.offset)
         try:
             settled = extended.settle(self._data.rounding, self._data.loads, self._loose)
             active = extended.active.dofs
