@@ -35,6 +35,9 @@ from .system import DATUM, Vectors
 SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""
 
+LARGE = 1e10
+"""Contrast of stiffness from which on it is told of when a solver gives up."""
+
 ENTRIES = 3.0
 """So many times the largest entry is what c and b have in a row and in those of its neighbours."""
 
@@ -186,8 +189,9 @@ def solve_vi(
         linear.free()
         stiffness.free()
     if reason < 0 or test.failure:
+        why = test.failure or _stopped(reason, inner, stiffness.contrast)
         raise NotConverged(
-            f"{test.failure or _stopped(reason, inner)} after {iterations.newton} Newton steps "
+            f"{why} after {iterations.newton} Newton steps "
             f"and {iterations.linear} linear iterations"
         )
     return iterations
@@ -241,10 +245,14 @@ def _reporting(
     return report
 
 
-def _stopped(reason: int, inner: int) -> str:
+def _stopped(reason: int, inner: int, contrast: float) -> str:
     """What to say when SNES gives up, and the linear solver perhaps before it."""
     words = f"SNES stopped with {_name(PETSc.SNES.ConvergedReason, reason)}"
-    return words + (f" (KSP {_name(PETSc.KSP.ConvergedReason, inner)})" if inner < 0 else "")
+    if inner < 0:
+        words += f" (KSP {_name(PETSc.KSP.ConvergedReason, inner)})"
+    if contrast > LARGE:
+        words += f", as the stiffness varies by a factor of {contrast:.1e}"
+    return words
 
 
 class NewtonTest:
