@@ -481,8 +481,8 @@ class Polygon:
         A hole alone needs neither.
         """
         labels = set(self.boundary).union(*(hole.boundary for hole in self.holes))
-        for name in itertools.chain(self.names, *(hole.names for hole in self.holes)):
-            if name not in labels:
+        for name in self.parts:
+            if name not in labels and name not in PARTS:
                 raise InputError(
                     f"no edge is labelled {name!r}, which is one of the names; found "
                     f"{_list(sorted(labels))}"

@@ -68,10 +68,10 @@ def energy_of(problem, domain):
 
 
 @pytest.mark.parametrize("name", ["S1", "A", "B", "C", "I", "S1_NEUMANN", "S1_RAISED"])
-@pytest.mark.parametrize("jitter, levels", [(0.0, 3), (0.2, 2)])
-def test_bound_is_above_the_error_and_near_it(name, jitter, levels):
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_bound_is_above_the_error_and_near_it(name, jitter):
     example = getattr(exact, name)
-    for solution in solve_levels(example.problem, example.structured(8, jitter=jitter), levels):
+    for solution in solve_levels(example.problem, example.structured(8, jitter=jitter), 3):
         certificate = certify(solution)
         effectivity = certificate.bound_h1 / solution.errors[0]
         assert 1.0 <= effectivity <= GOAL, (name, solution.cells)

@@ -19,6 +19,7 @@ import scipy.sparse.linalg
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import compute_midpoints, create_mesh, exterior_facet_indices, meshtags
+from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -548,7 +549,7 @@ def test_an_offset_is_taken_off():
 
 
 def soft_beside_a_loss(soft: float, b: float):
-    """Strips of κ = 1 and of something soft, b u lost above, contact on the other three sides."""
+    """Strips of κ = 1 and of something soft, b u lost above, contact below and on the left."""
     names = ("floor", "right", "top", "left")
     polygon = Polygon([[0, 0], [2, 0], [2, 1], [0, 1]], names, names=names)
     domain = polygon.mesh(0.3)
@@ -579,15 +580,13 @@ def test_what_hangs_on_zeros_of_the_matrix_is_refused():
 
 def test_what_a_loss_has_in_rows_and_their_neighbours():
     """b|F| in the three rows of a facet's cell."""
-    names = ("floor", "right", "top", "left")
-    square = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], names, names=names)
-    conditions = {name: Neumann() for name in names} | {"right": Robin(coefficient=7.0)}
+    conditions = {name: Neumann() for name in SQUARE.names} | {"right": Robin(coefficient=7.0)}
     problem = Problem(f=1.0, conditions=conditions)
-    level = solve(problem, square.mesh(0.5, MPI.COMM_SELF)).level
+    level = solve(problem, SQUARE.mesh(0.5, MPI.COMM_SELF)).level
     found, cells = level.system.masses(), level.data.cells
     side = cells.sides[level.domain.parts["right"]]
     expected = np.zeros(len(found))
     np.add.at(expected, cells.facets[:, side.cells], 7.0 * 0.5)
     assert len(side.cells) == 2 and np.allclose(found, expected, atol=1e-12)
     plain = Problem(f=1.0, conditions=conditions | {"right": Dirichlet()})
-    assert solve(plain, square.mesh(0.5, MPI.COMM_SELF)).level.system.masses() is None
+    assert solve(plain, SQUARE.mesh(0.5, MPI.COMM_SELF)).level.system.masses() is None
