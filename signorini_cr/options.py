@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -236,9 +237,10 @@ def explained() -> Iterator[Callable[[Callable[P, T]], Callable[P, T]]]:
     """Say what is behind errors of PETSc in a block.
 
     What Python code raises that PETSc calls, a monitor for one, comes out as it was raised. PETSc
-    hands on a number only, and the exception, which is pending meanwhile, gets lost where Python
-    happens to collect its garbage on the way; so a function is to be given to PETSc as the
-    context makes it, which keeps what it raises.
+    hands on a number only, and meanwhile the exception is pending, which whatever Python does then
+    may clear: petsc4py, which counts on it, ends the process with a segmentation fault if garbage
+    is collected on the way. So there is no collection in the block; and a function is to be given
+    to PETSc as the context makes it, which keeps what it raises.
 
     Raises:
         InputError: PETSc stopped, and options have been set.
@@ -255,6 +257,8 @@ def explained() -> Iterator[Callable[[Callable[P, T]], Callable[P, T]]]:
 
         return keeping
 
+    collects = gc.isenabled()
+    gc.disable()
     try:
         yield keep
     except PETSc.Error as error:
@@ -268,6 +272,9 @@ def explained() -> Iterator[Callable[[Callable[P, T]], Callable[P, T]]]:
             raise
         given = ", ".join(f"-{PREFIX}{name} {value}".rstrip() for name, value in options.items())
         raise InputError(f"PETSc can't solve with {given}: {_words(origin)}") from error
+    finally:
+        if collects:
+            gc.enable()
 
 
 def solve_once(

@@ -1,6 +1,7 @@
 """The solver: bounds where they belong, errors with names, options under the prefix."""
 
 import contextlib
+import gc
 
 import numpy as np
 import pytest
@@ -94,6 +95,23 @@ def test_what_a_monitor_raises_reaches_the_caller():
 
     with pytest.raises(Enough, match=r"^of that$"):
         solve(PROBLEM, SQUARE.mesh(0.25), monitor=monitor)
+
+
+def test_garbage_may_pile_up_when_a_monitor_raises():
+    """Collected before PETSc is back it took the exception along, and the process with it."""
+    thresholds = gc.get_threshold()
+
+    def monitor(*_):
+        gc.set_threshold(1)
+        raise KeyError("ours")
+
+    mesh = SQUARE.mesh(0.25)
+    try:
+        with pytest.raises(KeyError, match="ours"):
+            solve(PROBLEM, mesh, monitor=monitor)
+    finally:
+        gc.set_threshold(*thresholds)
+    assert gc.isenabled()
 
 
 def test_what_petsc_loses_on_the_way_reaches_the_caller():
