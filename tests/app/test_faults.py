@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr import memory
-from signorini_cr.app import cli
+from signorini_cr.app import cli, signals
 from signorini_cr.errors import InputError
 from signorini_cr.memory import ran_out_of_memory
 from signorini_cr.output import files
@@ -270,7 +270,7 @@ def test_a_signal_is_not_lost_in_a_finalizer() -> None:
 
     thing = Thing()
     watch = weakref.ref(thing, told)
-    with cli._interruptible() as asked:
+    with signals.interruptible() as asked:
         del thing
         assert watch() is None and asked == [signal.SIGTERM]
         with pytest.raises(KeyboardInterrupt):
@@ -325,7 +325,7 @@ def test_a_signal_waits_for_an_import(tmp_path: Path, monkeypatch: pytest.Monkey
         "loaded = 1\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    with cli._interruptible() as asked:
+    with signals.interruptible() as asked:
         module = importlib.import_module("told_while_loading")
         with pytest.raises(KeyboardInterrupt):
             time.sleep(5.0)
@@ -335,7 +335,7 @@ def test_a_signal_waits_for_an_import(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.serial
 def test_told_twice_is_told_once() -> None:
     """By the terminal and by mpirun: the second must not disturb what ends the run."""
-    with cli._interruptible() as asked:
+    with signals.interruptible() as asked:
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(5.0)

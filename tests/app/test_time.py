@@ -14,6 +14,7 @@ from helpers import is_picture
 from mpi4py import MPI
 
 from signorini_cr import evolution, limits, memory
+from signorini_cr.app import runs
 from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
@@ -352,7 +353,7 @@ def test_a_step_that_would_end_too_late_is_not_begun(
 
     monkeypatch.setattr(limits, "time", Clock)
     monkeypatch.setattr(limits.Limits, "admit_step", after)
-    monkeypatch.setattr("signorini_cr.app.cli._left", lambda args: args.max_time)
+    monkeypatch.setattr(runs._Run, "time_left", property(lambda run: run.args.max_time))
     out = shared_tmp_path / "out"
     assert solved(case(), out, "--max-time", 3.5) == 3
     if COMM.rank == 0:

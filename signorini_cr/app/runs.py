@@ -1,0 +1,391 @@
+"""What `solve` does: meshes or steps in time, solved one by one, told, and kept in the folder."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from petsc4py import PETSc
+
+from .. import __version__
+from ..errors import InputError, NotConverged, naming, on_root
+from ..mesh.domain import Domain
+from ..options import PREFIX
+from ..output import report as output
+from ..output import series, strip, tables
+from ..output.checkpoint import read_checkpoint
+from ..output.files import write_files, write_text
+from ..output.page import run_page
+from ..restart import Restart
+from ..rounding import at_most
+from ..solution import Solution
+from . import problemfile
+from .problemfile import ProblemFile
+from .screen import Screen, wrapped
+from .signals import keep
+from .statement import folded, statement
+
+
+def solve_case(
+    args: argparse.Namespace, screen: Screen, comm: Any, folder: Path, kept: list[output.Record]
+) -> None:
+    """Solve what the problem file says, and write it into a folder; collective.
+
+    Args:
+        args: The command line.
+        screen: Where it is told.
+        comm: The ranks.
+        folder: What is written goes there.
+        kept: Gets the records of the levels, or steps in time, that are safe in the folder.
+
+    Raises:
+        InputError: Of the problem file, or a folder with results of another run.
+        NotConverged: After levels, or steps, that are kept.
+    """
+    case, domain = read_case(args, screen, comm)
+    problem = statement(case, domain)
+    screen.line(f"{folded(problem)}\n")
+    run = _Run(args, screen, comm, folder, case, domain, problem, kept)
+    if case.time is None:
+        _solve_levels(run)
+    else:
+        _Steps(run).solve()
+
+
+def read_case(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemFile, Domain]:
+    """The checked problem file and the coarsest mesh; collective."""
+    case = problemfile.load(args.file, comm)
+    if getattr(args, "levels", None) is not None:
+        case = replace(case, levels=args.levels)
+    screen.progress("making the mesh")
+    domain = case.mesh(comm)
+    for doubt in case.check(domain):
+        screen.warn(f"{args.file}: {doubt}")
+    return case, domain
+
+
+def stopped(failure: NotConverged, kept: list[output.Record], folder: Path) -> str:
+    """What to say of a run that stops on a level."""
+    level = len(kept) if failure.level is None else failure.level
+    return f"stopped on level {level}: {failure.reason}\n{what_is_kept(kept, folder)}"
+
+
+def what_is_kept(kept: list[output.Record], folder: Path) -> str:
+    """What a run that has been ended leaves."""
+    if not kept:
+        return "no level was finished, nothing was written"
+    kind = "step" if "step" in kept[0] else "level"
+    first, last = kept[0][kind], kept[-1][kind]
+    if first == last:
+        return f"{kind} {first} is finished and kept in {folder}"
+    return f"{kind}s {first} to {last} are finished and kept in {folder}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """A problem, and where its solution goes.
+
+    Attributes:
+        args: The command line.
+        screen: Where it is told.
+        comm: The ranks.
+        folder: What is written goes there.
+        case: The problem.
+        domain: The coarsest mesh.
+        problem: What is told of it, by name.
+        kept: Records of what is safe in the folder.
+    """
+
+    args: argparse.Namespace
+    screen: Screen
+    comm: Any
+    folder: Path
+    case: ProblemFile
+    domain: Domain
+    problem: dict[str, str]
+    kept: list[output.Record]
+
+    @property
+    def element(self) -> str:
+        """As it is in the report."""
+        return str(self.args.element.upper())
+
+    @property
+    def time_left(self) -> float | None:
+        """What is left of --max-time."""
+        if self.args.max_time is None:
+            return None
+        return float(self.args.max_time + self.args.began - time.perf_counter())
+
+    def said(self) -> dict[str, Any]:
+        """All that the levels depend on, by the name the user knows it by; collective."""
+        said = {
+            **self.case.said,
+            "--element": self.args.element,
+            "signorini_cr": __version__,
+        }
+        for name, value in sorted(PETSc.Options(PREFIX).getAll().items()):
+            said[f"-{PREFIX}{name}"] = value
+        if isinstance(self.case.domain, Path):
+            content = on_root(self.comm, self.case.domain.read_bytes)
+            said["domain.mesh, the file"] = hashlib.sha256(content).hexdigest()[:16]
+        return said
+
+    def resumed(self, said: dict[str, Any]) -> Restart | None:
+        """Find where a run goes on, if it is to, and fill in what is kept of it; collective."""
+        if not self.args.resume:
+            return None
+        with naming("--resume"):
+            found = read_checkpoint(self.folder, self.comm)
+            if found is None:
+                return None
+            restart, facts = found
+            for key in sorted({*said, *facts["said"]}):
+                was, now = (each.get(key) for each in (facts["said"], said))
+                if was != now:
+                    was, now = (
+                        "not given" if each is None else json.dumps(each) for each in (was, now)
+                    )
+                    raise InputError(
+                        f"{self.folder} has results of another run: {key} was {was} and is {now}; "
+                        "the same is needed, or another --out"
+                    )
+        self.kept.extend(facts["times" if "times" in facts else "levels"])
+        return restart
+
+    def report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
+        """What report.json is made of; collective."""
+        case = self.case
+        return output.make_report(case.title, self.element, self.comm, levels, complete, case.units)
+
+    def write(
+        self, report: output.Record, finest: Solution, moments: Sequence[strip.Moment] = ()
+    ) -> str:
+        """Write what comes at the end, and return the names of the files; collective."""
+        self.screen.progress("writing")
+        with naming("--out"):
+            names = output.write_output(
+                self.folder, report, finest, resumable=True, moments=moments
+            )
+            if self.args.html:
+                names.append(self._write_page(report))
+        return ", ".join(names)
+
+    def _write_page(self, report: output.Record) -> str:
+        """The run as one page; collective."""
+
+        def make() -> str:
+            source = self.args.file.read_text(encoding="utf-8")
+            return run_page(self.folder, source, report, self.args.words, self.problem)
+
+        def draw(path: Path) -> None:
+            on_root(self.comm, write_text, path, make)
+
+        name = "report.html"
+        write_files(self.folder, {name: draw}, comm=self.comm)
+        return name
+
+
+def _solve_levels(run: _Run) -> None:
+    """Solve on one mesh after the other; collective."""
+    said, kept, screen = run.said(), run.kept, run.screen
+    restart = run.resumed(said)
+    for record in kept:
+        _tell(record, kept[0], screen)
+    finest: Solution | None = None
+    failure: NotConverged | None = None
+    try:
+        for solution in _solutions(run, restart):
+            if solution.level.number < len(kept):  # the one that it goes on from
+                finest = solution
+                continue
+            _ = solution.errors, solution.certificate  # the report reads what is there
+            before = kept[-1] if kept else None
+            record = output.level_record(solution, before, run.case.quantities)
+            report = run.report([*kept, record])
+            with naming("--out"):
+                restart = Restart.of(solution, restart, run.case.mode == "adaptive")
+                write = partial(output.write_levels, run.folder, report, solution, restart, said)
+                keep(write, kept, [record])
+            finest = solution
+            if screen.verbose:
+                taken = solution.iterations.preconditioner
+                screen.line(wrapped(taken, "  linear systems: "))
+            _tell(record, kept[0], screen)
+    except NotConverged as error:
+        failure = error
+    failure = failure or _above_tolerance(run.case, kept)
+    if finest is not None:
+        names = run.write(run.report(kept, failure is None), finest)
+        _conclude(run, names)
+    if failure is not None:
+        raise NotConverged(stopped(failure, kept, run.folder))
+
+
+def _solutions(run: _Run, restart: Restart | None) -> Iterator[Solution]:
+    def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
+        facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
+        run.screen.step(f"  level {level}  {facts}")
+
+    run.screen.progress("level 0")
+    return run.case.solutions(
+        run.domain,
+        element=run.element,
+        monitor=monitor,
+        max_time=run.time_left,
+        restart=restart,
+    )
+
+
+def _tell(record: output.Record, first: output.Record, screen: Screen) -> None:
+    """Print the row of a level, and the head before the first."""
+    if record is first:
+        screen.line(output.table_header(first))
+    screen.line(output.table_row(record, first))
+
+
+def _conclude(run: _Run, names: str) -> None:
+    """Say what the table above means, and what has come out."""
+    screen, records, units = run.screen, run.kept, run.case.units
+    screen.line("")
+    screen.text(tables.legend(records[0], units))
+    screen.line("")
+    screen.text(tables.facts(records[-1], units))
+    screen.text(tables.certified(records[-1], units))
+    screen.text(tables.times(records))
+    screen.text(f"written to {run.folder}: {names}")
+
+
+def _above_tolerance(case: ProblemFile, records: list[output.Record]) -> NotConverged | None:
+    """Say what stopped an adaptive run before the bound that was asked for was reached."""
+    tolerance = case.adaptive["tolerance"]
+    if tolerance == 0.0 or not records:
+        return None
+    bound = records[-1]["bound_h1"]
+    if bound is not None and bound <= tolerance:
+        return None
+    limit = (
+        f"levels = {case.levels}"
+        if len(records) >= case.levels
+        else f"max_dofs = {case.adaptive['max_dofs']}"
+    )
+    return NotConverged(
+        f"the certified bound is {at_most(bound)}, above the tolerance of {tolerance:g}, and"
+        f" {limit} allows no further mesh",
+        records[-1]["level"],
+    )
+
+
+class _Steps:
+    """A run in time.
+
+    Args:
+        run: Its problem and its folder.
+    """
+
+    def __init__(self, run: _Run):
+        """Find where it begins; collective."""
+        if run.element != "CR":
+            raise InputError("--element: problems in time are solved with cr")
+        self._run, case = run, run.case
+        assert case.time is not None
+        self._number = case.time.steps
+        self._back = 2 if case.time.scheme == "bdf2" else 1  # so many steps are behind the next
+        self._said = {**run.said(), "refine.levels (or --levels)": case.levels}
+        self._restart = run.resumed(self._said)
+        self._records: list[output.Record] = []
+        self._moments: list[strip.Moment] = []
+        self._last: list[Solution] = []
+        if self._restart is not None:
+            with naming("--resume"):
+                self._moments = series.read_moments(run.folder, run.comm)
+
+    def solve(self) -> None:
+        """Solve step after step; collective.
+
+        Raises:
+            NotConverged: After steps that are kept.
+        """
+        run, failure = self._run, None
+        for record in run.kept:
+            self._tell(record)
+        try:
+            self._solve_on()
+        except NotConverged as error:
+            failure = NotConverged(f"time step {len(self._records) + 1}: {error}")
+        if self._last:
+            if len(run.kept) < len(self._records):
+                keep(self._write_steps, run.kept, self._records[len(run.kept) :])
+            self._conclude(complete=failure is None)
+        if failure is not None:
+            raise NotConverged(f"{failure}\n{what_is_kept(run.kept, run.folder)}")
+
+    def _solve_on(self) -> None:
+        """Solve what is left, and keep what is worth it."""
+        run, done = self._run, len(self._run.kept)
+        run.screen.progress(f"step {done + 1}")
+        steps = run.case.steps(
+            run.domain,
+            run.case.levels,
+            max_time=run.time_left,
+            restart=self._restart,
+            done=max(done, 1),
+        )
+        for moment, solution in steps:
+            self._last = [solution, *self._last[: self._back]]
+            number = len(self._records) + 1
+            if number == done + 1 > 1 and len(self._last) == 1:  # the one that it goes on from
+                continue
+            record = series.step_record(number, moment, solution, run.case.quantities)
+            self._tell(record)
+            chosen = number in strip.chosen(self._number)
+            if chosen:
+                self._moments.append(strip.moment(moment, solution))
+            if chosen or series.is_kept(number):
+                keep(self._write_steps, run.kept, self._records[len(run.kept) :])
+            else:
+                with naming("--out"):
+                    series.write_step(run.folder, number, solution)
+
+    def _tell(self, record: output.Record) -> None:
+        """Print the row of a step, and the head before the first."""
+        self._records.append(record)
+        if len(self._records) == 1:
+            self._run.screen.line(series.header())
+        self._run.screen.line(series.row(record))
+
+    def _report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
+        return {**self._run.report(levels, complete), "times": self._records}
+
+    def _write_steps(self) -> None:
+        """Write what a run goes on from, and the tables; collective."""
+        run, last = self._run, self._last
+        with naming("--out"):
+            fields = [each.u for each in last]
+            self._restart = Restart.of_steps(fields, run.case.levels, self._restart)
+            series.write_steps(
+                run.folder, self._report([]), last[0], self._restart, self._said, self._moments
+            )
+
+    def _conclude(self, complete: bool) -> None:
+        """Write what comes at the end, and say what has come out; collective."""
+        run, records, units = self._run, self._records, self._run.case.units
+        finest = output.level_record(self._last[0]) | {"quantities": records[-1]["quantities"]}
+        names = run.write(self._report([finest], complete), self._last[0], self._moments)
+        screen = run.screen
+        screen.line("")
+        screen.text(series.legend(units))
+        screen.line("")
+        screen.text(f"at the end {tables.facts(finest, units)}")
+        for sentence in (series.certified(records), *series.over_time(records, units)):
+            screen.text(sentence)
+        screen.text(f"the last step's own problem, {tables.certified(finest, units)}")
+        screen.text(series.times(records))
+        screen.text(f"written to {run.folder}: {names}, times.csv, series.pvd and its fields")
