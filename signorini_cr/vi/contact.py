@@ -138,52 +138,30 @@ def contact_facts(
         residual: r = A u_h − b, ghosts up to date.
         iterations: What the solver says about its errors.
     """
-    mesh, facets, dofs = data.domain.mesh, system.bounded_facets, system.contact_dofs
     there = system.contact_facets
-    measure = there.measure
     at_dofs = _AtDofs.of(system, u, residual, 0.0 if iterations.extended else NOISE)
-    layout = Layout.of_space(u.function_space)
     pressure = at_dofs.force / there.share
-
-    def on_facets(values: FloatArray) -> FloatArray:
-        """Values at bounded dofs, 0 at others, as the facets see them."""
-        everywhere = np.zeros(len(u.x.array))
-        everywhere[system.bounded] = values
-        return layout.shared_sum(everywhere)[dofs]
-
-    state = on_facets(np.where(at_dofs.active.mask, 1.0, -1.0))
-    is_active: BoolArray = (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0)
-    below, above = system.obstacles_at_vertices
-    local = data.at_vertices(u, facets)
-    offset = system.offset
-    means = dofs.shape[1] > 1
-    fields: dict[str, npt.NDArray] = {
-        "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]) + offset,
-        "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]) + offset,
-        "u": local.mean(axis=1) + offset,
-        "pressure": on_facets(pressure).mean(axis=1),
-        "active": is_active,
-        "gap_at_vertices": np.minimum(local - (below - offset), above - offset - local),
-    }
+    fields = _at_facets(data, system, u, at_dofs, pressure)
+    measure, is_active = there.measure, fields["active"]
     table, transitions = there.walk.along(fields)
     sums = [
         np.sum(at_dofs.force),
         np.sum(measure[is_active]),
-        len(facets),
+        len(measure),
         np.sum(is_active),
         np.sum(np.abs(at_dofs.force * at_dofs.gap)),
         at_dofs.left @ at_dofs.left,
     ]
     ends = at_dofs.gap, at_dofs.side * pressure
     least = np.array([np.min(each, initial=np.inf) for each in ends])
-    comm = mesh.comm
+    comm = data.domain.mesh.comm
     force, length, number, number_active, complementarity, squares = summed(comm, np.array(sums))
     comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
     min_gap, min_pressure = least
     of_load = float(np.sqrt(squares)) / (system.residual_scale or 1.0)
     return Contact(
         comm=comm,
-        facets=facets,
+        facets=system.bounded_facets,
         vertices=there.vertices,
         measure=measure,
         **fields,
@@ -202,6 +180,41 @@ def contact_facts(
         ),
         _table=table,
     )
+
+
+def _at_facets(
+    data: OnMesh, system: System, u: fem.Function, at_dofs: _AtDofs, pressure: FloatArray
+) -> dict[str, npt.NDArray]:
+    """What `Contact` has of each facet, by name; collective.
+
+    Args:
+        data: The physics on the mesh.
+        system: The variational inequality.
+        u: u_h less the system's offset, ghosts up to date.
+        at_dofs: What it does at the dofs.
+        pressure: At the bounded dofs, shape (n,).
+    """
+    facets, dofs, offset = system.bounded_facets, system.contact_dofs, system.offset
+    layout = Layout.of_space(u.function_space)
+
+    def seen(values: FloatArray) -> FloatArray:
+        """Values at bounded dofs, 0 at others, as the facets see them."""
+        everywhere = np.zeros(len(u.x.array))
+        everywhere[system.bounded] = values
+        return layout.shared_sum(everywhere)[dofs]
+
+    state = seen(np.where(at_dofs.active.mask, 1.0, -1.0))
+    below, above = system.obstacles_at_vertices
+    local = data.at_vertices(u, facets)
+    means = dofs.shape[1] > 1
+    return {
+        "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]) + offset,
+        "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]) + offset,
+        "u": local.mean(axis=1) + offset,
+        "pressure": seen(pressure).mean(axis=1),
+        "active": (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0),
+        "gap_at_vertices": np.minimum(local - (below - offset), above - offset - local),
+    }
 
 
 @dataclass(frozen=True, eq=False)
