@@ -10,7 +10,7 @@ the block whatever fails in it, and on whichever rank.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -41,6 +41,20 @@ def rows_of(
     csr: tuple[Int32Array, Int32Array, FloatArray] = matrix.getValuesCSR()
     release(rows, columns, matrix)
     return csr
+
+
+def with_entries(A: PETSc.Mat, made: Callable[[FloatArray], FloatArray]) -> PETSc.Mat:
+    """A matrix with A's pattern and entries of its own; collective.
+
+    Args:
+        A: The matrix.
+        made: Of this rank's entries of A, shape (n,), makes those of the copy.
+    """
+    copy = A.duplicate(copy=True)
+    start, column, value = A.getValuesCSR()
+    copy.setValuesCSR(start, column, made(value))
+    copy.assemble()
+    return copy
 
 
 def numbers_of(A: PETSc.Mat, dofs: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
@@ -121,10 +135,7 @@ class ConstrainedMatrix:
     def magnitude(self, x: PETSc.Vec) -> FloatArray:
         """|A| |x| in the dofs that can be constrained, shape (n,): what a row of A x is made of."""
         if self._magnitudes is None:
-            self._magnitudes = self._rows.duplicate(copy=True)
-            start, column, value = self._rows.getValuesCSR()
-            self._magnitudes.setValuesCSR(start, column, np.abs(value))
-            self._magnitudes.assemble()
+            self._magnitudes = with_entries(self._rows, np.abs)
         sizes = x.duplicate()
         sizes.array[:] = np.abs(x.array_r)
         self._magnitudes.mult(sizes, self._product)

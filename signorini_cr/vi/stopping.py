@@ -31,6 +31,7 @@ from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
 from ..garbage import release
+from ..multigrid.constrained import with_entries
 from ..multigrid.cycle import Grid
 
 DECADES = 2.0
@@ -231,10 +232,7 @@ class Stiffness:
         sizes, flows = self._differences.createVecs()
         self._differences.mult(x, flows)
         flows.array[:] = np.abs(self._weights * flows.array_r)
-        made_of = self._differences.duplicate(copy=True)
-        start, column, value = made_of.getValuesCSR()
-        made_of.setValuesCSR(start, column, np.abs(value))
-        made_of.assemble()
+        made_of = with_entries(self._differences, np.abs)
         made_of.multTranspose(flows, sizes)
         found: FloatArray = sizes.array_r.copy()
         release(sizes, flows, made_of)

@@ -20,7 +20,7 @@ from ..fem.physics import Imposed, OnMesh
 from ..fem.space import facet_measures, ghosted_vector, shared_maximum, unknowns
 from ..fem.walk import Walk
 from ..garbage import release
-from ..multigrid.constrained import ConstrainedMatrix
+from ..multigrid.constrained import ConstrainedMatrix, with_entries
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import MATRICES, defaults
@@ -361,10 +361,7 @@ class System:
         if (of_constants := self._data.of_constants()) is None:
             return None
         Layout.of_space(self.u_D.function_space).shared_sum(of_constants)
-        pattern = self.A.duplicate(copy=True)
-        start, column, value = pattern.getValuesCSR()
-        pattern.setValuesCSR(start, column, np.ones_like(value))
-        pattern.assemble()
+        pattern = with_entries(self.A, np.ones_like)
         here, around = pattern.createVecs()
         here.array[:] = np.abs(of_constants[: len(here.array_r)])
         here.array[self.owned_dirichlet] = 0.0
