@@ -1,4 +1,4 @@
-"""Data that contradict one another: an exact solution that is none, a flux on no facet."""
+"""Data to think over: an exact solution that is none, a flux on no facet, κ that jumps in cells."""
 
 from __future__ import annotations
 
@@ -24,9 +24,16 @@ Found = tuple[FloatArray, FloatArray]
 ENOUGH = 1e-6
 """What is no difference, in parts of the largest value: an exact solution may be a fit."""
 
+JUMP = 2.0
+"""A factor by which κ may jump inside of a cell: the bound is not the sharper for another mesh."""
+
+HALVINGS = 30
+"""So many, and the halves of a cell's edge are shorter than what makes κ change by that factor,
+unless it jumps."""
+
 
 def doubts(forms: Forms, domain: Domain) -> list[str]:
-    """Say what contradicts itself in data that can be solved with; collective.
+    """Say what contradicts itself, or costs much, in data that can be solved with; collective.
 
     Args:
         forms: The data.
@@ -45,7 +52,44 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
         said = _Solution(forms, domain).complaint()
         if said is not None:
             found.append(f"exact.u: {said}: it is not the solution, and errors say how far from it")
-    return found
+    return found + _jumps(forms, domain)
+
+
+def _jumps(forms: Forms, domain: Domain) -> list[str]:
+    """Say that κ jumps inside of cells; collective."""
+    kappa: Any = forms.kappa
+    if number(kappa) is not None:
+        return []
+    mesh = domain.mesh
+    owned = mesh.topology.index_map(mesh.topology.dim).size_local
+    cells: Int32Array = np.arange(owned, dtype=np.int32)
+    corners = mesh.geometry.x[cell_nodes(mesh)[:owned]]
+    middle = corners.mean(axis=1, keepdims=True)
+    inner = middle + 0.99 * (corners - middle)  # what jumps at the cell's sides does not count
+
+    def sizes(points: FloatArray, cells: Int32Array) -> FloatArray:
+        found = evaluate(kappa, points.reshape(-1, 3), cells=cells)
+        values = np.ones(len(cells)) if found is None else found[0].reshape(len(cells), -1)
+        return np.linalg.norm(values.reshape(len(cells), -1), axis=1)
+
+    at = sizes(inner, cells.repeat(corners.shape[1])).reshape(owned, -1)
+    each = np.arange(owned)
+    low, high = (inner[each, which] for which in (at.argmin(axis=1), at.argmax(axis=1)))
+    for _ in range(HALVINGS):
+        between = 0.5 * (low + high)
+        least, value, most = (sizes(points, cells) for points in (low, between, high))
+        upper = value > np.sqrt(least * most)
+        high[upper], low[~upper] = between[upper], between[~upper]
+    factors = sizes(high, cells) / sizes(low, cells)
+    comm, many = mesh.comm, factors >= JUMP
+    number_of = comm.allreduce(int(many.sum()))
+    largest = comm.allreduce(float(factors.max(initial=1.0)), op=MPI.MAX)
+    if not number_of:
+        return []
+    return [
+        f"coefficient: it jumps by a factor of up to {largest:.3g} inside of {number_of} cells, and"
+        " the bound is the larger for it; lines of materials are lines of the mesh"
+    ]
 
 
 class _Solution:

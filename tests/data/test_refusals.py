@@ -475,6 +475,37 @@ def test_exact_solutions_that_are_none(data, words: str):
     assert words in said and "it is not the solution" in said
 
 
+@pytest.mark.parametrize(
+    ("kappa", "factor"),
+    [
+        (lambda x: ufl.conditional(x[0] + 0.3 * x[1] < 0.123, 50.0, 1.0), 50.0),
+        (lambda x: 2.0 + ufl.sign(x[1] - 0.55 + 0.1 * x[0]), 3.0),
+        (lambda x: ufl.conditional(x[0] < 0.123, 50.0, 1.0) * ufl.Identity(2), 50.0),
+        (lambda x: ufl.conditional(x[0] < 0.123, 1.9, 1.0), None),
+        (lambda x: ufl.conditional(x[0] < 0.0, 1.0 + 1e6 * abs(x[0]), 1.0), None),  # a kink
+        (lambda x: 2.0 + 1.9 * ufl.sin(60 * x[0]), None),
+        (lambda x: ufl.exp(40 * x[0]), None),
+    ],
+)
+def test_coefficients_that_jump_inside_of_cells(kappa, factor):
+    domain = Polygon(RECTANGLE, ("contact", "neumann", "dirichlet", "dirichlet")).mesh(0.3)
+    said = doubts(Forms(Problem(coefficient=kappa), domain.mesh), domain)
+    assert len(said) == (factor is not None)
+    assert factor is None or f"jumps by a factor of up to {factor:.3g} inside of " in said[0]
+
+
+def test_coefficients_that_jump_between_cells():
+    """Materials, a Function of degree 0, and a condition that lines of the mesh follow."""
+    halves = {"left": [[-2, 0], [0, 0], [0, 2], [-2, 2]]}
+    kinds = ("contact", "neumann", "dirichlet", "dirichlet")
+    domain = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], kinds, materials=halves).mesh(0.3)
+    step = Problem(coefficient=lambda x: ufl.conditional(x[0] < 0.0, 50.0, 1.0))
+    stiff = Problem(materials={"left": Material(coefficient=50.0)})
+    for problem in (step, stiff):
+        forms = Forms(problem, domain.mesh, "CR", domain.parts, domain.materials)
+        assert doubts(forms, domain) == []
+
+
 def test_the_examples_are_solutions():
     for example in exact.ALL.values():
         domain = example.mesh(0.3)
