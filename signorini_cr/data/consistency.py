@@ -87,8 +87,8 @@ def _jumps(forms: Forms, domain: Domain) -> list[str]:
     if not number_of:
         return []
     return [
-        f"coefficient: it jumps by a factor of up to {largest:.3g} inside of {number_of} cells, and"
-        " the bound is the larger for it; lines of materials are lines of the mesh"
+        f"coefficient: it jumps by a factor of up to {largest:.4g} inside of {number_of} cells, and"
+        " the bound is the larger for it; the mesh follows the polygon of a [material.NAME]"
     ]
 
 
