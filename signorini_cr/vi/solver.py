@@ -170,11 +170,11 @@ def solve_vi(
             if comm.allreduce(monitor is not None, op=MPI.LOR):
                 snes.setMonitor(keep(_reporting(comm, linear, monitor)))
             snes.solve(None, vectors.x)
-        reason, inner = snes.getConvergedReason(), linear.ksp.getConvergedReason()
-        extended = test.doubtful and reason > 0
-        if extended:
-            test.settle(vectors, bounds)
-        elif test.touching:
+            reason, inner = snes.getConvergedReason(), linear.ksp.getConvergedReason()
+            extended = test.doubtful and reason > 0
+            if extended:
+                test.settle(vectors, bounds)
+        if test.touching and not extended:
             vectors.residual.array[linear.active_now().dofs] = 0.0
         iterations = Iterations(
             snes.getIterationNumber(),
