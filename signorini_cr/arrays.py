@@ -14,9 +14,12 @@ Int64Array: TypeAlias = npt.NDArray[np.int64]
 
 
 def summed(comm: MPI.Comm, values: FloatArray) -> FloatArray:
-    """Sum up, in place, what the ranks have; collective.
+    """Sum up what the ranks have, in place where the array has floating-point numbers; collective.
 
-    mpi4py's `allreduce` would pickle the array, which takes longer than many a sum.
+    `np.bincount` has integers where it is given nothing to add up, on one rank perhaps, and what
+    the others then got would be no number. mpi4py's `allreduce` would pickle the array, which takes
+    longer than many a sum.
     """
+    values = np.asarray(values, dtype=np.float64)
     comm.Allreduce(MPI.IN_PLACE, values)
     return values

@@ -19,6 +19,7 @@ from signorini_cr import (
     solve_in_time,
     solve_levels,
 )
+from signorini_cr.arrays import summed
 from signorini_cr.restart import Restart
 
 pytestmark = [pytest.mark.slow, pytest.mark.ranks]
@@ -51,6 +52,15 @@ PROBLEMS = {
         },
         materials={"soft": Material(coefficient=0.1, f=lambda x: -1.0 - x[0], reaction=2.0)},
     ),
+    "strong": Problem(
+        f=lambda x: -1e4 * (1.0 + x[0]),
+        reaction=1e4,
+        conditions={
+            "contact": Contact(lambda x: -0.8 - 0.3 * x[0], coefficient=1e4, external=-1.0),
+            "dirichlet": Dirichlet(-1.0),
+            "neumann": Robin(coefficient=1e6, external=lambda x: -1.0 - x[1]),
+        },
+    ),
     "exact": Problem(exact=lambda x: x[0] ** 3 - 3.0 * x[0] * x[1] ** 2, obstacle=-9.0),
 }
 
@@ -68,6 +78,14 @@ def solved(
     if kind == "adaptive":
         return solve_adaptive(problem, domain, levels=5, restart=restart)
     return solve_levels(problem, domain, 3, "P1" if kind == "p1" else "CR", restart=restart)
+
+
+def test_sums_where_a_rank_has_nothing_to_add_up():
+    own = [0, 1, 1] if COMM.rank == COMM.size - 1 else []
+    counted = np.bincount(np.array(own, np.intp), np.full(len(own), 0.5), minlength=2)
+    assert np.array_equal(summed(COMM, counted), [0.5, 1.0])
+    nothing = np.bincount(np.empty(0, np.intp), np.empty(0), minlength=2)
+    assert summed(COMM, nothing).dtype == np.float64
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

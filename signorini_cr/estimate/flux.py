@@ -221,9 +221,9 @@ def _relaxed(
     loss, in_contact = np.zeros(len(cells.exterior)), on_contact.dofs[pushing]
     loss[edge.side.dofs] = edge.loss
     loss[in_contact] = 0.0
-    held = cells.exterior.astype(np.float64)
-    for part in cells.fixed:
-        held[cells.sides[part].dofs] = 0.0
+    held = np.zeros(len(cells.exterior))
+    for part, side in cells.sides.items():  # of this rank's cells: others may see a facet as well
+        held[side.dofs] = part not in cells.fixed
     held[on_contact.dofs] = loss[on_contact.dofs] == 0.0
     held[in_contact] = 0.0
     if reaction.ndim:
