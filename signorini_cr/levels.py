@@ -243,7 +243,9 @@ def solve_level(
     u, residual = system.start(), fem.Function(level.V)
     if level.loose is not None:
         level.loose.check(system, level.data.inflow())
-    if start.known is not None:
+    if system.is_trivial:
+        pass  # nothing is nearer than that
+    elif start.known is not None:
         known_start(start.known, level, u)
     elif start.coarser is not None:
         nested_start(start.coarser, level, u, start.before)

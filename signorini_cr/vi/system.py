@@ -254,13 +254,10 @@ class System:
     def _trivial(self) -> list[FloatArray]:
         """A times the most trivial start, and A times that without its constant; collective."""
         bounded = (self.lower > PETSc.NINFINITY) | (self.upper < PETSc.INFINITY)
-        comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
-        bottom, top = _range(comm, values)
-        middle = 0.5 * (bottom + top) if bottom <= top else 0.0
         products, start = [], self.A.createVecRight()
         product, owned = self.A.createVecLeft(), self.A.getLocalSize()[0]
         dirichlet, bounded = self.owned_dirichlet, bounded[:owned]
-        for number in dict.fromkeys((middle, -self.offset)):
+        for number in dict.fromkeys((self._middle(), -self.offset)):
             start.array[:] = number
             start.array[dirichlet] = self.u_D.x.array[dirichlet]
             own = self.lower[:owned][bounded], self.upper[:owned][bounded]
@@ -269,6 +266,12 @@ class System:
             products.append(product.array_r.copy())
         release(start, product)
         return products
+
+    def _middle(self) -> float:
+        """The number that u_D is around; collective."""
+        values = self.u_D.x.array[self.dirichlet]
+        bottom, top = _range(self.u_D.function_space.mesh.comm, values)
+        return 0.5 * (bottom + top) if bottom <= top else 0.0
 
     def _scale(self, trivial: Sequence[FloatArray]) -> float:
         """Measure the trivial start's residual; collective.
@@ -413,10 +416,21 @@ class System:
         return of_load, drawn(least + abs(self.offset))
 
     def start(self) -> fem.Function:
-        """The function that is u_D on Γ0 and 0 elsewhere, but for the offset."""
+        """The function that is u_D on Γ0 and 0 elsewhere, but for the offset; collective.
+
+        Where the most trivial one is the solution, as there is no load at all, it is that.
+        """
         u = fem.Function(self.u_D.function_space)
         u.x.array[:] = self.u_D.x.array
+        if self.is_trivial:
+            u.x.array[:] = self._middle()
+            u.x.array[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         return u
+
+    @property
+    def is_trivial(self) -> bool:
+        """Whether the most trivial function, on its bounds, leaves nothing of the equations."""
+        return self.residual_scale == 0.0
 
     def residual(self, u: fem.Function, r: fem.Function) -> float:
         """Compute r = A u − b, ghosts included, and its norm."""

@@ -97,6 +97,19 @@ def test_what_a_monitor_raises_reaches_the_caller():
         solve(PROBLEM, SQUARE.mesh(0.25), monitor=monitor)
 
 
+@pytest.mark.parametrize("height", [0.0, 1.0, -0.3])
+def test_where_there_is_no_load_there_is_nothing_to_solve(height):
+    """Steps went on from the rounding of the prolonged start until squares were lost."""
+    kinds = ["contact", "contact", "dirichlet", "dirichlet", "contact"]
+    domain = Polygon([[0.2, 0.4], [-0.2, 0.3], [-2, -0.2], [-0.5, -1.4], [1, 0]], kinds).mesh(0.7)
+    problem = Problem(dirichlet=height, obstacle=-2.0, coefficient=1.85)
+    for solution in solve_levels(problem, domain, levels=3):
+        assert solution.iterations.newton == solution.iterations.linear == 0
+        assert np.array_equal(solution.u.x.array, np.full_like(solution.u.x.array, height))
+        assert solution.contact.number_active == 0
+        assert solution.certificate.bound_h1 < 1e-10
+
+
 def test_garbage_may_pile_up_when_a_monitor_raises():
     """Collected before PETSc is back it took the exception along, and the process with it."""
     thresholds = gc.get_threshold()
