@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -69,10 +70,12 @@ def _jumps(forms: Forms, domain: Domain) -> list[str]:
 
     def sizes(points: FloatArray, cells: Int32Array) -> FloatArray:
         found = evaluate(kappa, points.reshape(-1, 3), cells=cells)
-        values = np.ones(len(cells)) if found is None else found[0].reshape(len(cells), -1)
-        return np.linalg.norm(values.reshape(len(cells), -1), axis=1)
+        if found is None:
+            return np.ones(len(cells))
+        rows: FloatArray = found[0].reshape(len(cells), math.prod(kappa.ufl_shape))
+        return np.linalg.norm(rows, axis=1)
 
-    at = sizes(inner, cells.repeat(corners.shape[1])).reshape(owned, -1)
+    at = sizes(inner, cells.repeat(corners.shape[1])).reshape(corners.shape[:2])
     each = np.arange(owned)
     low, high = (inner[each, which] for which in (at.argmin(axis=1), at.argmax(axis=1)))
     for _ in range(HALVINGS):
@@ -86,8 +89,9 @@ def _jumps(forms: Forms, domain: Domain) -> list[str]:
     largest = comm.allreduce(float(factors.max(initial=1.0)), op=MPI.MAX)
     if not number_of:
         return []
+    there = "a cell" if number_of == 1 else f"{number_of} cells"
     return [
-        f"coefficient: it jumps by a factor of up to {largest:.4g} inside of {number_of} cells, and"
+        f"coefficient: it jumps by a factor of up to {largest:.4g} inside of {there}, and"
         " the bound is the larger for it; the mesh follows the polygon of a [material.NAME]"
     ]
 

@@ -494,6 +494,22 @@ def test_coefficients_that_jump_inside_of_cells(kappa, factor):
     assert factor is None or f"jumps by a factor of up to {factor:.4g} inside of " in said[0]
 
 
+def test_coefficients_that_jump_in_one_of_two_cells():
+    """On more ranks than that some have none."""
+    domain = Polygon([[0, 0], [1, 0], [0, 1]], ("contact", "dirichlet", "neumann")).mesh(1.0)
+    for kappa, words in (
+        (
+            lambda x: ufl.conditional(x[0] < 0.9, 1.0, 7.0),
+            ["of up to 7 inside of a cell, and"],
+        ),
+        (lambda x: 7.0 + x[0], []),
+        (lambda x: ufl.as_matrix([[7.0 + x[0], 0.0], [0.0, 2.0]]), []),
+    ):
+        said = doubts(Forms(Problem(coefficient=kappa), domain.mesh), domain)
+        assert len(said) == len(words)
+        assert all(word in each for word, each in zip(words, said, strict=True))
+
+
 def test_coefficients_that_jump_between_cells():
     """Materials, a Function of degree 0, and a condition that lines of the mesh follow."""
     halves = {"left": [[-2, 0], [0, 0], [0, 2], [-2, 2]]}
