@@ -81,7 +81,7 @@ def _jumps(forms: Forms, domain: Domain) -> list[str]:
     for _ in range(HALVINGS):
         between = 0.5 * (low + high)
         least, value, most = (sizes(points, cells) for points in (low, between, high))
-        upper = value > np.sqrt(least * most)
+        upper = value > np.sqrt(least) * np.sqrt(most)
         high[upper], low[~upper] = between[upper], between[~upper]
     factors = sizes(high, cells) / sizes(low, cells)
     comm, many = mesh.comm, factors >= JUMP
