@@ -243,12 +243,11 @@ def solve_level(
     u, residual = system.start(), fem.Function(level.V)
     if level.loose is not None:
         level.loose.check(system, level.data.inflow())
-    if system.is_trivial:
-        pass  # nothing is nearer than that
-    elif start.known is not None:
-        known_start(start.known, level, u)
-    elif start.coarser is not None:
-        nested_start(start.coarser, level, u, start.before)
+    if not system.is_trivial:  # or u is the solution already
+        if start.known is not None:
+            known_start(start.known, level, u)
+        elif start.coarser is not None:
+            nested_start(start.coarser, level, u, start.before)
     if level.loose is not None:
         level.loose.hold(system, u)
     told = None if monitor is None else lambda *facts: monitor(level.number, *facts)

@@ -76,14 +76,16 @@ def _jumps(forms: Forms, domain: Domain) -> list[str]:
         return np.linalg.norm(rows, axis=1)
 
     at = sizes(inner, cells.repeat(corners.shape[1])).reshape(corners.shape[:2])
-    each = np.arange(owned)
-    low, high = (inner[each, which] for which in (at.argmin(axis=1), at.argmax(axis=1)))
+    cells = np.flatnonzero(np.ptp(at, axis=1) > 0.0).astype(np.int32)
+    ends = [which(at[cells], axis=1) for which in (np.argmin, np.argmax)]
+    (low, high), (least, most) = ([each[cells, end] for end in ends] for each in (inner, at))
     for _ in range(HALVINGS):
         between = 0.5 * (low + high)
-        least, value, most = (sizes(points, cells) for points in (low, between, high))
+        value = sizes(between, cells)
         upper = value > np.sqrt(least) * np.sqrt(most)
-        high[upper], low[~upper] = between[upper], between[~upper]
-    factors = sizes(high, cells) / sizes(low, cells)
+        high[upper], most[upper] = between[upper], value[upper]
+        low[~upper], least[~upper] = between[~upper], value[~upper]
+    factors = most / least
     comm, many = mesh.comm, factors >= JUMP
     number_of = comm.allreduce(int(many.sum()))
     largest = comm.allreduce(float(factors.max(initial=1.0)), op=MPI.MAX)

@@ -284,6 +284,22 @@ def test_rates_and_bounds_with_reactions_of_materials(soil, rock, adaptive):
     assert adaptive or np.isclose(errors[-2] / errors[-1], 2.0, rtol=0.05)
 
 
+@pytest.mark.ranks
+def test_what_a_strong_reaction_takes_up_is_that_of_one_rank():
+    """Ranks that see a facet of the boundary, but not its cell, have no say about its flux."""
+
+    def u(x):
+        return ufl.sin(2.0 * x[0] + x[1])
+
+    rock = Material(reaction=1e8, f=lambda x: 1e8 * u(x))
+    problem = Problem(dirichlet=u, obstacle=-1.0, reaction=1.0, materials={"rock": rock})
+    one, all_ranks = (
+        solve(problem, layers(8, comm)).certificate.parts
+        for comm in (MPI.COMM_SELF, MPI.COMM_WORLD)
+    )
+    assert one == pytest.approx(all_ranks, rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
