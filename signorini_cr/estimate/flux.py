@@ -488,10 +488,14 @@ def _carried(
         square = float(np.sum(kept**2 / (reaction * cells.volume)[takers]))
         total = float(cells.total(square)[0])
         return float(np.hypot(norm(fluxes), np.sqrt(total))) if all_reached else np.inf
-    found = norm(fluxes)
+    found, layers = norm(fluxes), cells.layers
+    if found > WORTH * size and cells.sinks:  # a b that is small is a dear way out
+        fluxes, all_reached = _carry(cells, left, cells.layers_from_fixed)
+        if all_reached and norm(fluxes) < found:
+            found, layers = norm(fluxes), cells.layers_from_fixed
     if found > WORTH * size:
         fluxes = _diffused(cells, left, kappa_min)
-        rest, _ = _carry(cells, left + sum_rows(fluxes))
+        rest, _ = _carry(cells, left + sum_rows(fluxes), layers)
         found = min(found, norm(fluxes + rest))
     return found
 
@@ -551,14 +555,18 @@ def carried_to_contact(
 def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     """Fluxes of nearly the smallest q with nearly ∫_T div q = −left_T; collective.
 
-    They are those of `equilibrate` for the load left_T/|T| and no contact. A few steps of conjugate
-    gradients are enough where there are few cells, and of use on any mesh.
+    They are those of `equilibrate` for the load left_T/|T|, a b and no contact. A few steps of
+    conjugate gradients are enough where there are few cells, and of use on any mesh.
     """
     d = cells.tdim
-    fixed = np.zeros(len(cells.exterior))
+    fixed, losses = np.zeros((2, len(cells.exterior)))
     for part in cells.fixed:
-        fixed[cells.sides[part].dofs] = 1.0
-    free = cells.share(fixed) == 0
+        side = cells.sides[part]
+        if part in cells.sinks:
+            losses[side.dofs] = cells.sinks[part] * measures(cells, side)
+        else:
+            fixed[side.dofs] = 1.0
+    free, losses = cells.share(fixed) == 0, cells.share(losses)
 
     def residuals(z: FloatArray) -> FloatArray:
         return d**2 * kappa * cells.apply(z[cells.facets], slice(0, cells.number))
@@ -567,15 +575,20 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
         return np.where(free, cells.over_facets(local), 0.0)
 
     load = np.tile(left / (d + 1), (d + 1, 1))
-    diagonal = nonzero(cells.over_facets(d**2 * kappa * cells.squares(slice(0, cells.number))))
-    down = assembled(load)
+    squares = cells.over_facets(d**2 * kappa * cells.squares(slice(0, cells.number)))
+    down, diagonal = assembled(load), nonzero(squares + losses)
     z = np.zeros_like(down)
-    descend(cells, lambda way: assembled(residuals(way)), z, down, diagonal, STEPS)
+
+    def image(way: FloatArray) -> FloatArray:
+        return assembled(residuals(way)) + losses * way
+
+    descend(cells, image, z, down, diagonal, STEPS)
     fluxes = residuals(z) - load
     half = 0.5 * cells.over_facets(fluxes)
     half[cells.exterior] = 0.0
     fluxes -= half[cells.facets]
-    fluxes[(cells.exterior & free)[cells.facets]] = 0.0
+    outside = (cells.exterior & free)[cells.facets]
+    fluxes[outside] = (-losses * z)[cells.facets][outside]
     return fluxes
 
 

@@ -192,16 +192,11 @@ class Cells:
             where: Which cells those are, in its order.
         """
         mesh = mesh or self.domain.mesh
-        d = mesh.geometry.dim
-        shape: tuple[int, ...] = () if self.stretch is None else (d, d)
-        function = fem.Function(fem.functionspace(mesh, ("DG", 0, shape)))
         values = np.broadcast_to(kappa, self.number)[where]
-        if self.stretch is not None:
-            inverse = np.linalg.inv(self.stretch[where])
-            values = (values[:, None, None] * (inverse @ inverse)).ravel()
-        function.x.array[: len(values)] = values
-        function.x.scatter_forward()
-        return function
+        if self.stretch is None:
+            return on_cells(mesh, values)
+        inverse = np.linalg.inv(self.stretch[where])
+        return on_cells(mesh, values[:, None, None] * (inverse @ inverse))
 
     @cached_property
     def diameter2(self) -> FloatArray:
@@ -259,6 +254,11 @@ class Cells:
     def layers(self) -> Layers:
         """Cells by the number of facets between them and Γ0 or a part with a b, nearest first."""
         return self.layered([self.sides[part].dofs for part in self.fixed])
+
+    @cached_property
+    def layers_from_fixed(self) -> Layers:
+        """The same with Γ0 alone; not all cells need have a way there."""
+        return self.layered([self.sides[p].dofs for p in self.fixed if p not in self.sinks])
 
     def layered(self, exits: Sequence[IndexArray], takers: BoolArray | None = None) -> Layers:
         """Sort cells by the number of facets between them and others, nearest first; collective.
@@ -465,6 +465,19 @@ class Cells:
     def trace(self, part: slice | IndexArray) -> FloatArray:
         """|T| Σ |∇λ_i|²."""
         return -2.0 * sum_rows(self.stiffness[:, part])
+
+
+def on_cells(mesh: Mesh, values: FloatArray) -> fem.Function:
+    """Make a function that is constant on each cell; collective.
+
+    Args:
+        mesh: The mesh.
+        values: Numbers or tensors on the cells of this rank, shape (cells, …).
+    """
+    function = fem.Function(fem.functionspace(mesh, ("DG", 0, values.shape[1:])))
+    function.x.array[: values.size] = values.ravel()
+    function.x.scatter_forward()
+    return function
 
 
 def corner_points(cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, FloatArray]:
