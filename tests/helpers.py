@@ -22,6 +22,8 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from signorini_cr import Domain, Polygon, Problem, Solution, solve_levels
+from signorini_cr.estimate.functional import Functional, Masses
+from signorini_cr.fem.cells import BoundaryFacets, Cells
 
 ROOT = Path(__file__).parent.parent
 DEMOS = ROOT / "demos"
@@ -122,3 +124,10 @@ def on_a_slope(dim: int, comm: MPI.Comm = MPI.COMM_WORLD, element: str = "CR") -
     problem = Problem(f=lambda x: 4.0 * (middle - x[0]), obstacle=slope, dirichlet=slope)
     *_, finest = solve_levels(problem, Domain.from_tags(mesh, tags), levels, element)
     return finest
+
+
+def of_gradients(cells: Cells, kappa: np.ndarray, w: np.ndarray | None = None) -> Functional:
+    """‖κ^{1/2}(∇v − ∇u_h)‖² and no masses."""
+    none = BoundaryFacets.joined([], 2), np.empty(0), np.empty((3, 0)), np.empty(0, dtype=bool)
+    w = np.empty((3, cells.number)) if w is None else w
+    return Functional(cells, w, kappa, np.array(True), Masses(False, np.array(0.0), *none))

@@ -617,21 +617,44 @@ class Segments:
         """‖q − g_F‖²_F, shape (facets,)."""
         return self._over_facets(self.measure * (self.weights @ self.rest**2))
 
-    def taken(self, shed: FloatArray | None) -> FloatArray:
+    @cached_property
+    def followed(self) -> BoolArray:
+        """Where y·n on thin cells is to have q's affine part, shape (facets,).
+
+        What that is wrong by, b times the error of u_h, costs little where b |F| is below κ, in
+        cells of any shape.
+        """
+        weak = self.loss * measures(self.cells, self.facets) <= pick(self.low, self.facets.cells)
+        return ~self.given | weak
+
+    def tau(self, carried: bool) -> FloatArray:
+        """What b takes up of q − g_F, shape (q, n).
+
+        Args:
+            carried: Whether y carries q's affine part where it is to.
+        """
+        tau = np.where(self.given[self.place], self.rest, 0.0)
+        if carried:
+            slope = np.where(self.given & self.followed, self.slope, 0.0)[self.place]
+            tau -= slope * (self.hats[:, 0] - self.hats[:, 1])
+        return tau
+
+    def taken(self, shed: FloatArray | None, carried: bool) -> FloatArray:
         """‖b^{-1/2}τ‖²_F, or more, of what b takes up, shape (facets,).
 
         Args:
             shed: As in `target`.
+            carried: As in `tau`.
         """
         area = self._over_facets(self.measure)
-        if self.between is None:
+        if self.between is None and not carried:
             loss = np.maximum(self.loss, 1e-300)
             found = np.where(self.given, self.squares / loss, 0.0)
             return found if shed is None else found + shed**2 / (loss * area)
-        tau = np.where(self.given[self.place], self.rest, 0.0)
+        tau = self.tau(carried)
         if shed is not None:
             tau = tau + (shed / area)[self.place]
-        least = np.maximum(self.between[0], 1e-300)
+        least = np.maximum(self.of_loss[0], 1e-300)
         return self._over_facets(self.measure * (self.weights @ tau**2) / least)
 
     @cached_property

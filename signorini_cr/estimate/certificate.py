@@ -27,11 +27,12 @@ from ..fem.cells import BoundaryFacets, Cells, blocks, measures, pick, sum_rows,
 from ..jit import compiled
 from ..rounding import at_most, interval
 from .beyond import Beyond
-from .companion import Companion, Functional, Lifted, Masses, companion, on_facet
+from .companion import Companion, Lifted, companion, on_facet
 from .cubic import cubed, with_thirds
 from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
+from .functional import Functional, Masses
 from .gap import integrate, integrate_edge
 from .lifting import below
 from .loss import Loss, half
@@ -421,14 +422,14 @@ def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, 
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal, highest)
     sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
-    if plain and promising(cells, kappa.mean, flux, sums):
-        if kappa.values is None and v.cusps is None:
+    if promising(cells, kappa.mean, flux, sums):
+        if plain and kappa.values is None and v.cusps is None:
             v = cubed(cells, kappa.mean, flux, v)
-        improve(cells, kappa.mean, load, known.segments, flux, v)
-        sums = integrate(cells, kappa, known.w, load, flux, v)
+        improve(cells, kappa, load, known.segments, flux, v, known.c.low)
+        sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
     if v.cusps is not None:
         sums.totals.energy_slack += v.cusps.add(
-            cells, known.w, load, kappa.low, flux, (v.excess, v.bumps), sums
+            cells, known.w, load, kappa.low, flux, known.c.low, (v.excess, v.bumps), sums
         )
     np.add.at(sums.indicators, alpha.side.cells, v.contact)
     return v, sums
@@ -437,7 +438,10 @@ def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, 
 def _functional(known: _Known, plain: bool) -> Functional:
     """Say what v is to make small; plain tells that there are gradients only, on all ranks."""
     cells, kappa, segments = known.cells, known.kappa, known.segments
-    steady = (kappa.high - kappa.low <= STEADY * kappa.mean) & plain
+    steady = kappa.high - kappa.low <= STEADY * kappa.mean
+    if reacts(known.c.high):  # next to a c that is large there u is like no power of the distance
+        steady &= known.c.high == known.c.low
+        steady &= known.c.high * cells.diameter2 <= kappa.low
     lossy = segments.usual > 0.0
     side = segments.facets.picked(lossy)
     loss = segments.usual[lossy] * measures(cells, side)

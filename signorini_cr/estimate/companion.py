@@ -19,15 +19,15 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
-from ..data.loads import reacts
 from ..data.moments import OnFacets, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, sum_rows
 from ..fem.conditions import number
 from .cusps import Cusps
 from .descent import descend, nonzero
 from .flux import Flux
+from .functional import Functional, Masses, Slopes
 from .lifting import Cubic, Lift, affine, joined, lift
-from .nearest import LARGEST, Slopes, nearest
+from .nearest import LARGEST, nearest
 from .shapes import bump_slopes, local_thirds, third_slopes
 
 Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
@@ -61,71 +61,13 @@ LITTLE = 0.01
 """Part of E that a round around some points has to take off for another one to be worth it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Masses:
-    """What E has of terms without gradients: c‖v − u_h‖² on cells, b‖v − u_h‖² on facets.
+MUCH = 0.1
+"""Part of E that the last round takes off where v needs to be solved for on all of the mesh: 0.01
+on ordinary meshes with singular points, 0.2 to 0.5 on thin cells."""
 
-    Attributes:
-        some: Whether there is a c or a b, here or on other ranks.
-        reaction: c, shape (cells,) or ().
-        side: Facets with a b.
-        loss: b |F| there, shape (n,).
-        toward: t/b − u_h there, at the ends and the height of a bump, shape (d + 1, n).
-        strong: Where b takes up what g has beyond its mean, and t/b is nearer to u than u_h is.
-    """
-
-    some: bool
-    reaction: FloatArray
-    side: BoundaryFacets
-    loss: FloatArray
-    toward: FloatArray
-    strong: BoolArray
-
-    def largest(self, cells: Cells, side: BoundaryFacets) -> float:
-        """Return the largest b, nearly, on some facets of all ranks; collective."""
-        here = np.isin(self.side.dofs, side.dofs)
-        found = (self.loss / measures(cells, self.side))[here].max(initial=0.0)
-        return max(cells.comm.allgather(float(found)))
-
-    def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
-        """Return what c pulls heights of bumps by, in units of 8/3, shape (3, n)."""
-        return (
-            pick(self.reaction, part)
-            * cells.volume[part]
-            / 20.0
-            * (excess - 2.0 * sum_rows(excess))
-        )
-
-    def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
-        """Return the same of b, on its facets."""
-        ends = excess[others[self.side.local].T, self.side.cells] - self.toward[:2]
-        return self.loss * (0.4 * self.toward[2] - 0.25 * ends.sum(axis=0))
-
-
-@dataclass(frozen=True, eq=False)
-class Functional:
-    """What v is to make small: E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses.
-
-    Attributes:
-        cells: The mesh.
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        kappa: Mean of κ, shape (cells,) or ().
-        steady: Where κ is constant on the cell, shape (cells,) or ().
-        masses: What E has beside gradients.
-    """
-
-    cells: Cells
-    w: FloatArray
-    kappa: FloatArray
-    steady: BoolArray
-    masses: Masses
-
-    def excess(self, v: FloatArray) -> FloatArray:
-        """Return v − u_h at the cells' vertices from v at the vertices, shape (d + 1, cells)."""
-        out = np.empty_like(self.w)
-        for part in blocks(self.cells.number):
-            np.subtract(v[self.cells.vertices[:, part]], self.w[:, part], out=out[:, part])
-        return out
+LEFT = 0.04
+"""Part of E that single values may promise in the end. That is 0.005 and less on ordinary meshes,
+0.2 on thin cells where v needs to be solved for on all of the mesh."""
 
 
 @dataclass(eq=False)
@@ -278,7 +220,7 @@ def companion(
     excess, cusps = functional.excess(draft.vertices), None
     if cells.tdim == 2 and sweeps > 0:
         poor = _improved(functional, draft, excess, u_D.side, floors, sweeps)
-        if poor and not functional.masses.some:
+        if poor:
             draft.vertices, draft.bumps, cusps = _solved(functional, draft, floors)
             excess = functional.excess(draft.vertices)
     above, lifts, reasons = boundary.lifted(
@@ -357,7 +299,7 @@ def _improved(
     energy, promise = _sweep(functional, excess, bumps, draft.free, (fixed, contact), sweeps)
     low, high = (limit[contact.dofs] for limit in floors.heights(draft.vertices))
     bumps[contact.dofs] = np.clip(bumps[contact.dofs], low, high)
-    promise += _promise(functional.cells, functional.kappa, excess, bumps, draft.loose)
+    promise += _promise(functional, excess, bumps, draft.loose)
     return promise > PROMISE * energy
 
 
@@ -476,7 +418,9 @@ def _solved(
 ) -> tuple[FloatArray, FloatArray, Cusps | None]:
     """Solve for the best v of degree 2, with cusps where they are called for; collective.
 
-    Each round is for the values that promise most, and those around them.
+    First around the values that promise most. Where v is still far from the best then, on the whole
+    mesh: in thin cells one value may hang on many, and cusps that were found with a v that is not
+    what it is to become may be in the way.
 
     Args:
         functional: What v is to make small.
@@ -486,12 +430,36 @@ def _solved(
     Returns:
         v at the vertices, the heights, and the cusps.
     """
+    promise = Promise.of(functional)
+    best, least, settled = _best(functional, draft, floors, promise, LAYERS)
+    if not settled:
+        other, energy, _ = _best(functional, draft, floors, promise, None)
+        if energy < least:
+            best = other
+    return best
+
+
+def _best(
+    functional: Functional, draft: Draft, floors: Floors, promise: Promise, layers: int | None
+) -> tuple[tuple[FloatArray, FloatArray, Cusps | None], float, float]:
+    """Solve for v in rounds, each for the values that promise most, and those around; collective.
+
+    Args:
+        functional: What v is to make small.
+        draft: v to begin with, and what of it may be changed.
+        floors: What the bounds ask of v.
+        promise: What values promise.
+        layers: How many layers of cells around them; None for all of the mesh.
+
+    Returns:
+        As `_solved`, E, and whether v is settled.
+    """
     cells, kappa, bounded = functional.cells, functional.kappa, floors.side.dofs
     v, bumps, loose, free = draft.vertices, draft.bumps, draft.loose, draft.free
-    promise, excess = Promise.of(cells, kappa), functional.excess(v)
-    slopes = Slopes.of(cells, kappa, excess, bumps)
+    excess = functional.excess(v)
+    slopes = Slopes.of(functional, excess, bumps)
     cusps: Cusps | None = None
-    near = promise.near(slopes, loose, free)
+    near = promise.near(slopes, loose, free, layers)
     if near is not None:
         # v is good enough but for some places; elsewhere cusps would be for what v is to become
         cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
@@ -499,9 +467,9 @@ def _solved(
     best, least = (v, bumps, cusps), cells.total(np.sum(slopes.energies))[0]
     for turn in range(ROUNDS):
         if turn > 0:
-            near = promise.near(slopes, loose, free)
+            near = promise.near(slopes, loose, free, layers)
         some, heights, at = near or (loose, free, slice(None))
-        step = nearest(cells, kappa, slopes, some, heights)
+        step = nearest(cells, kappa, slopes, some, heights, functional.masses)
         v, bumps, free = v + step[0], bumps + step[1], free.copy()
         down = np.zeros_like(loose)
         for sign, limit in floors.at_vertices:
@@ -516,17 +484,19 @@ def _solved(
         if cusps is not None and not isinstance(at, slice):
             at = np.union1d(at, cusps.at)
         excess[:, at] = v[cells.vertices[:, at]] - functional.w[:, at]
-        slopes.renew(cells, kappa, excess, bumps, at)
+        slopes.renew(functional, excess, bumps, at)
         if turn == 0:  # where v is good otherwise
             cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
         cusps = _fitted(functional, cusps, excess, bumps, slopes)
         energy, changes = cells.total(np.sum(slopes.energies), float(len(out) + down.sum()))
         settled = near is None or energy > (1.0 - LITTLE) * least
+        falling = near is not None and energy < (1.0 - MUCH) * least
         if energy < least:
             best, least = (v, bumps, cusps), energy
         if settled and changes == 0.0 and cusps is None:
             break
-    return best
+    little = promise.total(slopes, loose, free) <= LEFT * least
+    return best, least, little and not falling
 
 
 def _fitted(
@@ -570,20 +540,26 @@ class Promise:
     facets: FloatArray
 
     @classmethod
-    def of(cls, cells: Cells, kappa: FloatArray) -> Promise:
-        """Make it for a mean of κ, shape (cells,) or (); collective."""
+    def of(cls, functional: Functional) -> Promise:
+        """Make it; collective."""
+        cells, masses = functional.cells, functional.masses
         squares = np.empty((3, cells.number))
         for part in blocks(cells.number):
-            squares[:, part] = pick(kappa, part) * cells.squares(part)
-        traces = np.broadcast_to(4 / 3 * sum_rows(squares), squares.shape)
+            squares[:, part] = pick(functional.kappa, part) * cells.squares(part)
+        traces = np.tile(4 / 3 * sum_rows(squares), (3, 1))
+        if masses.reacts:
+            mass = masses.on_cells(cells, slice(0, cells.number))
+            squares += mass / 6.0
+            traces += 8.0 / 45.0 * mass
+        side = masses.side
+        np.add.at(squares, (cells.others[side.local].T, side.cells), masses.loss / 3.0)
+        np.add.at(traces, (side.local, side.cells), 8.0 / 15.0 * masses.loss)
         return cls(cells, nonzero(cells.over_vertices(squares)), nonzero(cells.over_facets(traces)))
 
-    def near(
+    def of_values(
         self, slopes: Slopes, loose: BoolArray, free: BoolArray
-    ) -> tuple[BoolArray, BoolArray, IndexArray] | None:
-        """Choose values that are worth being solved for; collective.
-
-        They are those that hold `FOREMOST` of all promise, and all within `LAYERS` around them.
+    ) -> tuple[FloatArray, FloatArray]:
+        """What each value promises, ghosts included; collective.
 
         Args:
             slopes: Those of v.
@@ -591,11 +567,9 @@ class Promise:
             free: Which heights may be changed.
 
         Returns:
-            Which of them are to be, and the cells of this rank that know of these; None if that is
-            most of the mesh, or nothing is promised.
+            By vertex and by facet dof.
         """
         cells = self.cells
-        owned = cells.owned_vertices(), cells.owned_facets()
         promises = cells.over_vertices(slopes.vertices), cells.over_facets(slopes.facets)
         for promise, weight, may in zip(
             promises, (self.vertices, self.facets), (loose, free), strict=True
@@ -603,11 +577,44 @@ class Promise:
             promise *= promise
             promise /= weight
             promise *= may
+        return promises
+
+    def total(self, slopes: Slopes, loose: BoolArray, free: BoolArray) -> float:
+        """What all of them promise; collective."""
+        vertices, facets = self.of_values(slopes, loose, free)
+        own = (
+            vertices[: self.cells.owned_vertices()].sum()
+            + facets[: self.cells.owned_facets()].sum()
+        )
+        return float(self.cells.total(float(own))[0])
+
+    def near(
+        self, slopes: Slopes, loose: BoolArray, free: BoolArray, layers: int | None
+    ) -> tuple[BoolArray, BoolArray, IndexArray] | None:
+        """Choose values that are worth being solved for; collective.
+
+        They are those that hold `FOREMOST` of all promise, and all within some layers around them.
+
+        Args:
+            slopes: Those of v.
+            loose: Which values at vertices may be changed.
+            free: Which heights may be changed.
+            layers: How many layers of cells around them; None for all.
+
+        Returns:
+            Which of them are to be, and the cells of this rank that know of these; None if that is
+            most of the mesh, or nothing is promised.
+        """
+        if layers is None:
+            return None
+        cells = self.cells
+        owned = cells.owned_vertices(), cells.owned_facets()
+        promises = self.of_values(slopes, loose, free)
         limit = _limit(cells, *(p[:n] for p, n in zip(promises, owned, strict=True)))
         chosen, much = (promise > limit for promise in promises)
         local, at = np.nonzero(much[cells.facets])
         chosen[cells.vertices[cells.others[local].T, at]] = True
-        chosen = cells.around(chosen, LAYERS)
+        chosen = cells.around(chosen, layers)
         few, all_ = cells.total(float(np.count_nonzero(chosen[: owned[0]])), float(owned[0]))
         if not 0.0 < few <= LARGEST * all_:
             return None
@@ -701,16 +708,11 @@ class _OfHeights:
         self.lost = np.zeros(len(cells.exterior))
         self.lost[masses.side.dofs] = 0.4 * masses.loss
         self.at = masses.side.local, masses.side.cells
-        self._reacts = reacts(masses.reaction)
+        self._reacts = masses.reacts
         for part in blocks(cells.number):
             self.own[part] = pick(functional.kappa, part) * cells.trace(part)
             if self._reacts:
-                self.own[part] += self._mass(part) / 15.0
-
-    def _mass(self, part: slice | IndexArray) -> FloatArray:
-        """c|T|, shape (n,)."""
-        cells, c = self.functional.cells, self.functional.masses.reaction
-        return np.asarray(pick(c, part) * cells.volume[part])
+                self.own[part] += masses.on_cells(cells, part) / 15.0
 
     def without_bumps(self, excess: FloatArray) -> tuple[float, FloatArray]:
         """Return E for no bumps, this rank's share, and −½ its slope on each cell.
@@ -725,7 +727,7 @@ class _OfHeights:
             np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
             energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
             if self._reacts:
-                mass = self._mass(part)
+                mass = masses.on_cells(cells, part)
                 energy += float(np.sum(mass * distance(excess[:, part], None)))
                 slope[:, part] += masses.pull(cells, excess[:, part], part)
         first, last, height = masses.toward
@@ -772,7 +774,8 @@ class _OfHeights:
             row *= twice
             row += own * height[i]
         if self._reacts:
-            out += self._mass(part) / 15.0 * sum_rows(height)
+            mass = self.functional.masses.on_cells(cells, part)
+            out += mass / 15.0 * sum_rows(height)
         return out
 
     def diagonal(self) -> FloatArray:
@@ -780,7 +783,7 @@ class _OfHeights:
         cells = self.functional.cells
         local = np.tile(self.own, (3, 1))
         if self._reacts:
-            local += self._mass(slice(0, cells.number)) / 15.0
+            local += self.functional.masses.on_cells(cells, slice(0, cells.number)) / 15.0
         np.add.at(local, self.at, self.lost[self.functional.masses.side.dofs])
         return nonzero(cells.over_facets(local))
 
@@ -802,24 +805,32 @@ def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
 
 
 def _promise(
-    cells: Cells, kappa: FloatArray, excess: FloatArray, bumps: FloatArray, loose: BoolArray
+    functional: Functional, excess: FloatArray, bumps: FloatArray, loose: BoolArray
 ) -> float:
-    """Return what ‖κ^{1/2}(∇v − ∇u_h)‖² would fall by if each vertex were put right alone.
+    """Return what E would fall by if each vertex were put right alone.
 
     Args:
-        cells: The mesh.
-        kappa: Mean of κ, shape (cells,) or ().
+        functional: E.
         excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
         bumps: Their heights.
         loose: Which values at vertices may be changed.
     """
+    cells, kappa, masses = functional.cells, functional.kappa, functional.masses
     slope, diagonal = np.empty_like(excess), np.empty_like(excess)
     for part in blocks(cells.number):
         k, height = pick(kappa, part), bumps[cells.facets[:, part]]
+        if masses.reacts:
+            fall, _ = masses.fall(cells, excess[:, part], height, part)
         height *= -4 / 3
         height += excess[:, part]
         np.multiply(k, cells.apply(height, part), out=slope[:, part])
         np.multiply(k, cells.squares(part), out=diagonal[:, part])
+        if masses.reacts:
+            slope[:, part] -= fall
+            diagonal[:, part] += masses.on_cells(cells, part) / 6.0
+    ends = cells.others[masses.side.local].T, masses.side.cells
+    np.subtract.at(slope, ends, masses.fall_on_facets(cells, excess, bumps, slice(None))[0])
+    np.add.at(diagonal, ends, masses.loss / 3.0)
     owned = slice(cells.owned_vertices())
     down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
     return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])

@@ -13,12 +13,15 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import FloatArray
-from ..data.loads import Segments, VolumeMoments
+from ..data.loads import NOTHING, Segments, VolumeMoments
+from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, measures, pick
 from .beyond import Beyond
 from .companion import Companion
 from .flux import Flux, field_squares
-from .nearest import Slopes, nearest
+from .functional import Slopes
+from .gap import taken_up
+from .nearest import nearest
 from .shapes import quadrature
 from .sums import Sums
 
@@ -48,32 +51,43 @@ def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
 
 
 def improve(
-    cells: Cells, kappa: FloatArray, load: VolumeMoments, edge: Segments, flux: Flux, v: Companion
+    cells: Cells,
+    kappa: Coefficient,
+    load: VolumeMoments,
+    edge: Segments,
+    flux: Flux,
+    v: Companion,
+    reaction: FloatArray = NOTHING,
 ) -> None:
     """Give y the curl and τ; collective.
 
     Args:
         cells: The mesh, d = 2.
-        kappa: Mean of κ, shape (cells,) or ().
+        kappa: The coefficient.
         load: Moments of f.
         edge: Values of g.
         flux: y, changed in place.
         v: v; its cusps do not count.
+        reaction: c, shape (cells,) or ().
     """
     rise = None if load.hats is None else 12.0 * load.hats
+    taken = taken_up(cells, load, kappa.low, slice(None), reaction)
+    if rise is not None and taken is not None:
+        rise = np.where(taken, 0.0, rise)
     given, held = np.zeros((2, len(cells.exterior)))
     # ω = 4 height λ_j λ_k has the slope 4 height (λ_j − λ_k)/|F|; to the left of the facet's normal
     # it goes from j to k, but for the facet 1 of cells whose vertices turn left
     side = edge.facets
     left = np.where(side.local == 1, -1.0, 1.0) * cells.turns[side.cells]
-    given[side.dofs] = left * edge.slope * measures(cells, side) / 4.0
+    slope = np.where(edge.followed, edge.slope, 0.0)  # elsewhere b takes it up
+    given[side.dofs] = left * slope * measures(cells, side) / 4.0
     for known in (v.boundary.alpha.side, side):
         held[known.dofs] = 1.0
     given, free = cells.share(given), cells.share(held) == 0.0
     flux.beyond = Beyond(given, rise)
-    slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa, flux, v), np.zeros(0))
+    slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa.mean, flux, v), np.zeros(0))
     none = np.zeros(len(v.vertices), dtype=bool)
-    _, heights = nearest(cells, np.asarray(1.0 / kappa), slopes, none, free)
+    _, heights = nearest(cells, np.asarray(1.0 / kappa.mean), slopes, none, free)
     flux.beyond = Beyond(np.where(free, heights, given), rise)
 
 

@@ -67,8 +67,8 @@ class Cusps:
         Args:
             cells: The mesh, d = 2.
             kappa: Mean of κ, shape (cells,) or ().
-            steady: Where κ is constant on the cell, shape (cells,) or ().
-            energies: The cells' shares of ‖κ^{1/2}(∇v − ∇u_h)‖², shape (cells,).
+            steady: Where κ is constant on the cell, and c, shape (cells,) or ().
+            energies: The cells' shares of E, shape (cells,).
 
         Returns:
             None if there is no such vertex on any rank.
@@ -117,9 +117,19 @@ class Cusps:
         return np.einsum("fn,fqin->qin", self.heights, self.slopes)
 
     @property
+    def value(self) -> FloatArray:
+        """ψ as a whole, shape (q, n)."""
+        return np.einsum("fn,fqn->qn", self.heights, self.values)
+
+    @property
     def means(self) -> FloatArray:
         """Means of ψ over the cells, shape (n,)."""
-        return np.einsum("q,fn,fqn->n", self.weights, self.heights, self.values)
+        return np.asarray(self.weights @ self.value)
+
+    @property
+    def moments(self) -> FloatArray:
+        """Means of ψ λ_i, shape (d + 1, n)."""
+        return np.einsum("q,qn,qin->in", self.weights, self.value, self.hats)
 
     def fitted(self, cells: Cells, excess: FloatArray, bumps: FloatArray) -> Cusps:
         """The same with the heights for which ∇(v + ψ) is nearest to ∇u_h, v given; collective.
@@ -187,11 +197,12 @@ class Cusps:
 
     def add(
         self, cells: Cells, w: FloatArray, load: VolumeMoments, low: FloatArray, flux: Flux,
-        v: tuple[FloatArray, FloatArray], sums: Sums,
+        reaction: FloatArray, v: tuple[FloatArray, FloatArray], sums: Sums,
     ) -> float:  # fmt: skip
         """Add ψ to the parts of the gap.
 
         ∫ (f − f_T) ψ is bounded by ‖κ^{-1/2}σ‖ ‖κ^{1/2}∇ψ‖ and goes into the slack.
+        c is a number on each of these cells, see `steady` of `Functional`.
 
         Args:
             cells: The mesh.
@@ -199,6 +210,7 @@ class Cusps:
             load: Moments of f.
             low: Lower bound of κ, shape (cells,) or ().
             flux: y.
+            reaction: c, shape (cells,) or ().
             v: Excess and bumps of v without ψ, see `fitted`.
             sums: What to add to.
 
@@ -223,6 +235,7 @@ class Cusps:
         sums.steepness[at] += steeper
         sums.middle[at] += more + 2.0 * cross
         sums.across[at] += more - 2.0 * cross
+        self._add_reaction(cells, reaction, flux, v, sums)
         if load.variance is None:
             return 0.0
         square = poincare(d) ** 2 * cells.diameter2[at] * cells.volume[at] * load.variance[at]
@@ -232,6 +245,31 @@ class Cusps:
             row[at] += 2.0 * slack
         sums.totals.slack += float(np.sum(slack))
         return float(np.sum(slack))
+
+    def _add_reaction(
+        self,
+        cells: Cells,
+        reaction: FloatArray,
+        flux: Flux,
+        v: tuple[FloatArray, FloatArray],
+        sums: Sums,
+    ) -> None:
+        """Add what ψ changes c‖v − u_h‖² by, and what c takes up of the equation's loose ends."""
+        if sums.apart is None or sums.zeroth is None:
+            return
+        (excess, bumps), at, value = v, self.at, self.value
+        apart = np.einsum("qin,in->qn", self.hats, excess[:, at])
+        for height, (j, k) in zip(bumps[cells.facets[:, at]], cells.others, strict=True):
+            apart += 4.0 * self.hats[:, j] * self.hats[:, k] * height
+        mass = pick(reaction, at) * cells.volume[at]
+        more = mass * (self.weights @ (value * (2.0 * apart + value)))
+        sums.totals.energy += 0.5 * float(np.sum(more))
+        sums.totals.companion += float(np.sum(more))
+        for row in (sums.apart, sums.zeroth, sums.indicators):
+            row[at] += more
+        if flux.taken_up is not None:
+            rest = np.where(flux.taken_up[at], flux.left[at], 0.0)
+            sums.totals.load_companion += float(rest @ self.means)
 
     def _flow(self, cells: Cells, slope: FloatArray) -> FloatArray:
         """κ |T| ∇λ_i·Σ_j γ_j ∇λ_j, shape (q, d + 1, n)."""

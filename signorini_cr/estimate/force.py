@@ -165,6 +165,8 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray
     if reacts(made.reaction):
         means = (sum_rows(v - w) * total + dot_rows(v - w, at)) / 12.0
         means += (2.0 * sum_rows(height) * total - dot_rows(height, at)) / 15.0
+        if made.cusps is not None:
+            means[made.cusps.at] += dot_rows(made.cusps.moments, at[:, made.cusps.at])
         work += made.reaction * cells.volume * means
     slack = np.abs(made.left * total) / (d + 1)
     if made.taken_up is not None:

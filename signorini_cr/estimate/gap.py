@@ -175,20 +175,24 @@ class _Gap:
         cells, sums, reaction = self.cells, self.sums, self.reaction
         load, volume = self.load, cells.volume[part]
         left = load.variance if self.flux.beyond is None else load.rest
-        assert left is not None
+        assert left is not None and load.variance is not None
         square = poincare(cells.tdim) ** 2 * cells.diameter2[part] * volume * left[part]
         share = square / pick(self.kappa.low, part)
-        taken = _taken_up(square, volume * left[part], self.kappa, part, reaction)
+        taken = taken_up(cells, load, self.kappa.low, part, reaction)
         if taken is not None and sums.zeroth is not None:
-            np.divide(volume * left[part], pick(reaction, part), out=share, where=taken)
+            whole = volume * load.variance[part]
+            np.divide(whole, pick(reaction, part), out=share, where=taken)
             square = np.where(taken, 0.0, square)
             sums.zeroth[part] = np.where(taken, share, 0.0)
         sums.indicators[part] += share
         sums.totals.load += float(np.sum(share))
+        work = volume * moment
         if self.flux.beyond is not None:
+            if taken is not None:
+                sums.totals.load_companion += float(np.sum(work[taken]))
+                share = np.where(taken, 0.0, share)
             _add_by_size(sums, part, share)
             return
-        work = volume * moment
         sums.totals.load_companion += float(np.sum(work))
         against, slack = self._against(part, pp, square, share)
         if taken is not None:
@@ -309,25 +313,27 @@ def _add_by_size(sums: Sums, where: slice | IndexArray, squares: FloatArray) -> 
     sums.middle[where] += squares + near
 
 
-def _taken_up(
-    square: FloatArray,
-    variance: FloatArray,
-    kappa: Coefficient,
+def taken_up(
+    cells: Cells,
+    load: VolumeMoments,
+    low: FloatArray,
     where: slice | IndexArray,
     reaction: FloatArray,
 ) -> BoolArray | None:
     """Tell where c takes up what f has beyond its mean more cheaply than σ; None for nowhere.
 
     Args:
-        square: Bound of ‖σ‖²_T, shape (n,).
-        variance: ‖f − f_T‖²_T, shape (n,).
-        kappa: The coefficient.
+        cells: The mesh.
+        load: Moments of f, which is not constant on each cell.
+        low: Lower bound of κ, shape (cells,) or ().
         where: Which cells.
         reaction: c, shape (cells,) or ().
     """
-    if not reacts(reaction):
+    if not reacts(reaction) or load.variance is None:
         return None
-    return np.asarray(variance * pick(kappa.low, where) < pick(reaction, where) * square)
+    variance = load.variance[where]
+    square = poincare(cells.tdim) ** 2 * cells.diameter2[where] * variance
+    return np.asarray(variance * pick(low, where) < pick(reaction, where) * square)
 
 
 def integrate_edge(
@@ -368,11 +374,12 @@ def integrate_edge(
     sums.totals.neumann = float(np.sum(squares))
     if edge.most.any():
         _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
-    if cells.tdim != 2:
+    if edge.given.any() and (cells.tdim != 2 or flux.beyond is not None):
         # σ is known by its norm alone; what b takes up has a product with v − u_h all the same
-        taken = edge.measure * edge.weights[:, None] * edge.rest * edge.given[edge.place]
+        taken = edge.measure * edge.weights[:, None] * edge.tau(flux.beyond is not None)
         jump = apart(cells, w, edge, v.vertices, v.bumps)
         sums.totals.load_companion += float(np.sum(taken * jump))
+    if cells.tdim != 2:
         return sums.totals.neumann
     if flux.beyond is not None:
         sums.totals.load += sums.totals.neumann
@@ -409,7 +416,7 @@ def _size_of_oscillation(
         return np.zeros(len(at))
     square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
     size: FloatArray = poincare(cells.tdim) * np.sqrt(square)
-    taken = _taken_up(size**2, cells.volume[at] * load.variance[at], kappa, at, reaction)
+    taken = taken_up(cells, load, kappa.low, at, reaction)
     return size if taken is None else np.where(taken, 0.0, size)
 
 
@@ -494,7 +501,7 @@ def _add_loss(
     sums.totals.energy_slack += EPS * size
     sums.totals.energy_slack += 0.5 * float(np.sum((most - least) * squares))
     sums.totals.companion += float(np.sum(apart))
-    given = edge.taken(flux.shed)
+    given = edge.taken(flux.shed, flux.beyond is not None)
     if flux.shed is not None:
         n = len(edge.loss)
         area = np.bincount(edge.place, edge.measure, minlength=n)

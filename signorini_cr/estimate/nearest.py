@@ -2,86 +2,44 @@
 
 Where few of its values are free, the cells that know of these are made a mesh of their own, and the
 system is as small as that.
-
-A function of degree 2 is given by its values at the vertices and the heights of its bumps
-b_F = 4 λ_j λ_k over the straight line through them, on each cell relative to u_h.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 from dolfinx.la import InsertMode
+from petsc4py import PETSc
 
 from .. import compat
-from ..arrays import BoolArray, FloatArray, IndexArray
-from ..fem.cells import Cells, blocks, dot_rows, pick, sum_rows
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from ..fem.cells import Cells, on_cells, sum_rows
 from ..fem.space import ghosted_vector, shared_maximum
 from ..garbage import release
 from ..jit import compiled
 from ..options import COMPANION, ESTIMATE_PREFIX, solve_once
+from .functional import Masses, Slopes
 
 SHARE = 1e-10
 """Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on
 any number of ranks."""
 
+OF_FACET = np.array([[4.0, -1.0, 2.0], [-1.0, 4.0, 2.0], [2.0, 2.0, 16.0]]) / 30.0
+"""Mass matrix of a facet of length 1, of its ends and its middle."""
+
 LARGEST = 0.5
 """Part of all cells up to which those that free values touch are made a mesh of their own."""
 
 
-@dataclass(frozen=True, eq=False)
-class Slopes:
-    """How fast E = ‖κ^{1/2}(∇v − ∇_h u_h)‖² falls, cell by cell.
-
-    Attributes:
-        vertices: −½ ∂E by v's values at the vertices with the bumps kept, shape (d + 1, cells).
-        facets: −½ ∂E by the heights of the bumps, shape (d + 1, cells).
-        energies: The cells' shares of E, shape (cells,).
-    """
-
-    vertices: FloatArray
-    facets: FloatArray
-    energies: FloatArray
-
-    @classmethod
-    def of(cls, cells: Cells, kappa: FloatArray, excess: FloatArray, bumps: FloatArray) -> Slopes:
-        """Compute them; collective.
-
-        Args:
-            cells: The mesh, d = 2.
-            kappa: Mean of κ, shape (cells,) or ().
-            excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
-            bumps: Heights by facet dof.
-        """
-        rows = np.empty_like(excess), np.empty_like(excess)
-        slopes = cls(*rows, np.empty(cells.number))
-        slopes.renew(cells, kappa, excess, bumps, slice(None))
-        return slopes
-
-    def renew(
-        self,
-        cells: Cells,
-        kappa: FloatArray,
-        excess: FloatArray,
-        bumps: FloatArray,
-        where: slice | IndexArray,
-    ) -> None:
-        """Compute them anew on some cells, or on all with ``slice(None)``; see `of`."""
-        for part in blocks(cells.number) if isinstance(where, slice) else (where,):
-            k, c, height = pick(kappa, part), excess[:, part], bumps[cells.facets[:, part]]
-            rest = cells.trace(part) - 2.0 * cells.squares(part)
-            at_vertices = -k * cells.apply(c - 4 / 3 * height, part)
-            at_facets = 4 / 3 * k * (cells.apply(c - 2.0 * height, part) - rest * height)
-            self.vertices[:, part], self.facets[:, part] = at_vertices, at_facets
-            self.energies[part] = -dot_rows(c, at_vertices) - dot_rows(height, at_facets)
-
-
 def nearest(
-    cells: Cells, kappa: FloatArray, slopes: Slopes, loose: BoolArray, free: BoolArray
+    cells: Cells,
+    kappa: FloatArray,
+    slopes: Slopes,
+    loose: BoolArray,
+    free: BoolArray,
+    masses: Masses | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """The way from v to the function of degree 2 that is nearest to u_h; collective.
 
@@ -91,6 +49,7 @@ def nearest(
         slopes: Those of v.
         loose: Which values at vertices are free.
         free: Which heights are free.
+        masses: What E has beside gradients, if anything.
 
     Returns:
         What is to be added to v's values at the vertices and to the heights of its bumps.
@@ -119,9 +78,14 @@ def nearest(
     b.x.array[fixed] = 0.0
     k = cells.coefficient(kappa, mesh, patch)
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    form = compiled(mesh.comm, fem.form, ufl.inner(k * ufl.grad(u), ufl.grad(w)) * ufl.dx)
+    energy = ufl.inner(k * ufl.grad(u), ufl.grad(w))
+    if masses is not None and masses.reacts:
+        energy += on_cells(mesh, np.broadcast_to(masses.reaction, cells.number)[patch]) * u * w
+    form = compiled(mesh.comm, fem.form, energy * ufl.dx)
     A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
     A.assemble()
+    if masses is not None and masses.some:
+        _add_losses(A, cells, masses, patch, dofs, held > 0.0)
     load, found = (ghosted_vector(V, function.x.array) for function in (b, x))
     solve_once(A, load, found, COMPANION | {"ksp_rtol": SHARE}, ESTIMATE_PREFIX)
     release(A, load, found)
@@ -134,3 +98,35 @@ def nearest(
     at_vertices[vertices] = corners
     heights[facets] = middles - 0.5 * (sum_rows(corners) - corners)
     return at_vertices, heights
+
+
+def _add_losses(
+    A: PETSc.Mat,
+    cells: Cells,
+    masses: Masses,
+    patch: slice | IndexArray,
+    dofs: Int32Array,
+    held: BoolArray,
+) -> None:
+    """Add ∫ b u w over facets; collective.
+
+    Args:
+        A: The matrix, in whose pattern this is.
+        cells: The mesh.
+        masses: b.
+        patch: Which cells the matrix is of.
+        dofs: Their dofs, shape (6, n).
+        held: Which dofs have rows and columns of the identity.
+    """
+    row = np.full(cells.number, -1)
+    row[patch] = np.arange(dofs.shape[1])
+    side, at = masses.side, row[masses.side.cells]
+    near = at >= 0
+    local, at, loss = side.local[near], at[near], masses.loss[near]
+    of_facet = np.vstack([dofs[cells.others[local].T, at], dofs[3 + local, at]]).T
+    of_facet = np.where(held[of_facet], -1, of_facet).astype(PETSc.IntType)  # which are passed over
+    start = np.arange(0, 3 * of_facet.size + 1, 3, dtype=PETSc.IntType)
+    columns = np.repeat(of_facet, 3, axis=0).ravel()
+    values = (loss[:, None, None] * OF_FACET).ravel()
+    A.setValuesLocalIJV(start, columns, values, addv=True, rowmap=of_facet.ravel())
+    A.assemble()

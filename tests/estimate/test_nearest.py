@@ -5,6 +5,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import create_rectangle, exterior_facet_indices, meshtags
+from helpers import of_gradients
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -12,7 +13,7 @@ from signorini_cr import Polygon, Problem, exact, solve_levels
 from signorini_cr.compat import cell_nodes
 from signorini_cr.estimate import companion, nearest
 from signorini_cr.estimate.certificate import certify
-from signorini_cr.estimate.nearest import Slopes
+from signorini_cr.estimate.functional import Slopes
 from signorini_cr.fem.cells import Cells
 from signorini_cr.mesh.domain import CONTACT, Domain
 from signorini_cr.mesh.families import structured
@@ -83,7 +84,7 @@ def test_a_small_system_has_the_same_solution(kappa, monkeypatch):
     rng = np.random.default_rng(WORLD.rank)
     kappa = np.array(2.0) if kappa == "constant" else rng.uniform(1, 3, cells.number)
     excess = rng.normal(size=(3, cells.number))
-    slopes = Slopes.of(cells, kappa, excess, np.zeros(len(cells.exterior)))
+    slopes = Slopes.of(of_gradients(cells, kappa), excess, np.zeros(len(cells.exterior)))
     at = places(cells)
     size = cells.domain.mesh.topology.index_map(0)
     loose = np.zeros(size.size_local + size.num_ghosts)
@@ -117,7 +118,7 @@ def test_multigrid_of_petsc_on_thin_cells(monkeypatch):
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
     rng = np.random.default_rng(WORLD.rank)
     excess = rng.normal(size=(3, cells.number))
-    slopes = Slopes.of(cells, np.array(1.0), excess, np.zeros(len(cells.exterior)))
+    slopes = Slopes.of(of_gradients(cells, np.array(1.0)), excess, np.zeros(len(cells.exterior)))
     size = cells.domain.mesh.topology.index_map(0)
     on_rim = np.zeros(size.size_local + size.num_ghosts)
     for side in cells.sides.values():
@@ -126,7 +127,7 @@ def test_multigrid_of_petsc_on_thin_cells(monkeypatch):
     monkeypatch.setitem(nearest.COMPANION, "pc_type", PETSc.PC.Type.GAMG)
     values, heights = nearest.nearest(cells, np.array(1.0), slopes, loose, free)
     assert not values[~loose].any() and not heights[~free].any()
-    after = Slopes.of(cells, np.array(1.0), excess + values[cells.vertices], heights)
+    after = Slopes.of(of_gradients(cells, np.array(1.0)), excess + values[cells.vertices], heights)
     for over, mine, before, left in (
         (cells.over_vertices, loose, slopes.vertices, after.vertices),
         (cells.over_facets, free, slopes.facets, after.facets),
@@ -158,10 +159,10 @@ def test_corners_take_small_systems(around_corners, monkeypatch):
     """Much is gained at single points: by systems of a few unknowns, as by those of all."""
     sizes, solve_for = [], companion.nearest
 
-    def noted(cells, kappa, slopes, loose, free):
+    def noted(cells, kappa, slopes, loose, free, masses):
         mine = loose[: cells.owned_vertices()].sum() + free[: cells.owned_facets()].sum()
         sizes.append(cells.total(float(mine))[0])
-        return solve_for(cells, kappa, slopes, loose, free)
+        return solve_for(cells, kappa, slopes, loose, free, masses)
 
     monkeypatch.setattr(companion, "nearest", noted)
     monkeypatch.setattr(companion, "PROMISE", 0.0)

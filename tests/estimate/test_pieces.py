@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from helpers import of_gradients
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
@@ -19,11 +20,13 @@ from signorini_cr.estimate import certificate, companion, cubic, flux, gap, lift
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
+from signorini_cr.estimate.functional import Functional, Masses, Slopes
 from signorini_cr.estimate.lifting import Cubic, Lift, lift
-from signorini_cr.estimate.nearest import Slopes, nearest
+from signorini_cr.estimate.nearest import nearest
 from signorini_cr.estimate.shapes import best_heights, quadrature
 from signorini_cr.estimate.sums import Sums
-from signorini_cr.fem.cells import BoundaryFacets, Cells, corner_points
+from signorini_cr.fem.cells import Cells, corner_points
+from signorini_cr.mesh.domain import DIRICHLET, NEUMANN
 from signorini_cr.mesh.families import structured
 
 WORLD = MPI.COMM_WORLD
@@ -338,7 +341,7 @@ def test_integrals_of_cusps(where):
     names = ("indicators", "steepness", "middle", "across")
     sums = Sums(**dict(zip(names, rows, strict=True)))
     fluxes = SimpleNamespace(excess=P, beyond=None)
-    assert cusp.add(cells, w, load, kappa, fluxes, (excess, bumps), sums) == 0.0
+    assert cusp.add(cells, w, load, kappa, fluxes, np.array(0.0), (excess, bumps), sums) == 0.0
     gains, means = cusp.gains(cells, excess, bumps), cusp.means
     of_hats, of_bumps = cusp.pulls(cells)
     steepness, energy, crosses = np.zeros((3, number))
@@ -376,7 +379,7 @@ def test_integrals_of_cusps(where):
     for row in (sums.middle, sums.across):
         row[:] = 0.0
     load.variance = variance
-    slack = cusp.add(cells, w, load, kappa, fluxes, (excess, bumps), sums)
+    slack = cusp.add(cells, w, load, kappa, fluxes, np.array(0.0), (excess, bumps), sums)
     truth = 0.0
     for cell, _, _, slope, weights, *_ in by_duffy(cells, cusp):
         h = np.linalg.norm(x[cell] - np.roll(x[cell], 1, axis=0), axis=1).max()
@@ -386,6 +389,28 @@ def test_integrals_of_cusps(where):
         assert np.isclose(sums.middle[cell], before[cell] + 2 * each)
         assert np.isclose(sums.across[cell], before[cell] - 4 * crosses[cell] + 2 * each)
     assert np.isclose(slack, truth) and np.isclose(sums.totals.slack, truth)
+    # c‖v − u_h‖², and what c takes up times ψ
+    c, load.variance = rng.uniform(1, 3, number), None
+    sums = Sums(**dict(zip(names, np.zeros((4, number)), strict=True)))
+    sums.zeroth, sums.apart = np.zeros((2, number))
+    fluxes = SimpleNamespace(
+        excess=P, beyond=None, left=rng.normal(size=number), taken_up=rng.uniform(size=number) < 0.5
+    )
+    cusp.add(cells, w, load, kappa, fluxes, c, (excess, bumps), sums)
+    apart, work, moments = np.zeros(number), 0.0, cusp.moments
+    for cell, n, value, _, weights, hats, _ in by_duffy(cells, cusp):
+        off = excess[:, cell] @ hats
+        for i, (j, m) in enumerate(cells.others):
+            off = off + 4 * bumps[cells.facets[i, cell]] * hats[j] * hats[m]
+        apart[cell] = c[cell] * weights @ ((off + value) ** 2 - off**2)
+        work += fluxes.taken_up[cell] * fluxes.left[cell] * (weights @ value) / cells.volume[cell]
+        assert np.allclose(moments[:, n], hats @ (weights * value) / cells.volume[cell], rtol=1e-9)
+    assert np.allclose(sums.apart, apart) and np.allclose(sums.zeroth, apart)
+    assert np.allclose(sums.indicators, change + apart)
+    assert np.isclose(sums.totals.companion, gains.sum() + apart.sum())
+    assert np.isclose(sums.totals.energy, energy.sum() + apart.sum() / 2)
+    assert np.isclose(sums.totals.load_companion, work)
+    assert np.allclose(sums.middle, change + 2 * crosses)
 
 
 @pytest.mark.serial
@@ -803,10 +828,11 @@ def test_nearest_function_of_degree_two(kappa):
     for side in cells.sides.values():
         on_rim[side.ends] = 1.0
     loose, free = cells.share(on_rim, 0) == 0.0, ~cells.exterior
-    before = Slopes.of(cells, kappa, excess, bumps)
+    functional = of_gradients(cells, kappa)
+    before = Slopes.of(functional, excess, bumps)
     values, heights = nearest(cells, kappa, before, loose, free)
     assert not values[~loose].any() and not heights[~free].any()
-    after = Slopes.of(cells, kappa, excess + values[cells.vertices], bumps + heights)
+    after = Slopes.of(functional, excess + values[cells.vertices], bumps + heights)
     scale = np.abs(before.vertices).max()
     assert np.abs(cells.over_vertices(after.vertices)[loose]).max() < 1e-6 * scale
     assert np.abs(cells.over_facets(after.facets)[free]).max() < 1e-6 * scale
@@ -836,7 +862,8 @@ def test_energy_of_a_function_of_degree_two():
                 total[cell] += 2 * weight * cells.volume[cell] * kappa[cell] * slope @ slope
         return total
 
-    slopes = Slopes.of(cells, kappa, excess, bumps)
+    functional = of_gradients(cells, kappa)
+    slopes = Slopes.of(functional, excess, bumps)
     assert np.allclose(slopes.energies, energy(excess, bumps))
     for i in range(3):
         step = np.zeros_like(excess)
@@ -844,22 +871,19 @@ def test_energy_of_a_function_of_degree_two():
         change = energy(excess + step, bumps) - energy(excess - step, bumps)
         assert np.allclose(slopes.vertices[i], -change / 4)
     free, bumps[~cells.exterior] = rng.uniform(size=len(bumps)) < 0.8, 0.0
-    rim, slopes = tuple(cells.sides.values()), Slopes.of(cells, kappa, excess, bumps)
-    whole = Slopes.of(cells, kappa, excess, bumps).energies.sum()
+    rim, slopes = tuple(cells.sides.values()), Slopes.of(functional, excess, bumps)
+    whole = Slopes.of(functional, excess, bumps).energies.sum()
     falls = np.zeros(len(bumps))
     np.add.at(falls, cells.facets, slopes.facets)
     traces = kappa * cells.trace(slice(0, cells.number))
     curvature = 4 / 3 * cells.over_facets(np.tile(traces, (3, 1)))
-    rim_without = BoundaryFacets.joined([], 2), np.empty(0), np.empty((3, 0)), np.empty(0, bool)
-    none = companion.Masses(False, np.array(0.0), *rim_without)
-    functional = companion.Functional(cells, None, kappa, None, none)
     found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, whole)
     assert np.isclose(promise, np.sum(falls[free] ** 2 / curvature[free]))
     # In as many steps as there are heights it finds the least
     best = bumps.copy()
     found, promise = companion._sweep(functional, excess, best, free, rim, 60)
-    after = Slopes.of(cells, kappa, excess, best)
+    after = Slopes.of(functional, excess, best)
     assert np.isclose(found, after.energies.sum()) and promise < 1e-12
     assert np.abs(cells.over_facets(after.facets)[free]).max() < 1e-6
     assert np.array_equal(best[~free], bumps[~free])
@@ -867,7 +891,7 @@ def test_energy_of_a_function_of_degree_two():
     loose = rng.uniform(size=cells.vertices.max() + 1) < 0.5
     falls = cells.over_vertices(slopes.vertices)
     curvature = cells.over_vertices(kappa * cells.squares(slice(0, cells.number)))
-    found = companion._promise(cells, kappa, excess, bumps, loose)
+    found = companion._promise(functional, excess, bumps, loose)
     assert np.isclose(found, np.sum(falls[loose] ** 2 / curvature[loose]))
 
 
@@ -1043,13 +1067,13 @@ def test_energy_with_masses():
     side = cells.sides[2]
     loss = rng.uniform(1, 4, len(side.cells))
     toward = rng.normal(size=(3, len(loss)))
-    masses = companion.Masses(True, np.array(c), side, loss, toward, loss > 2.0)
+    masses = Masses(True, np.array(c), side, loss, toward, loss > 2.0)
     points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
     hats = np.column_stack([1 - points.sum(axis=1), points])
     t, gauss = np.polynomial.legendre.leggauss(4)
 
-    def energy(bumps):
-        total = Slopes.of(cells, kappa, excess, bumps).energies.sum()
+    def energy(bumps, excess=excess):
+        total = Slopes.of(of_gradients(cells, kappa), excess, bumps).energies.sum()
         height = bumps[cells.facets]
         products = np.stack([4 * hats[:, j] * hats[:, k] for j, k in cells.others])
         values = hats @ excess + products.T @ height
@@ -1066,7 +1090,7 @@ def test_energy_with_masses():
     # heights that are known beforehand are those on the rim
     bumps[~cells.exterior] = 0.0
     rim = tuple(cells.sides.values())
-    functional = companion.Functional(cells, None, kappa, None, masses)
+    functional = Functional(cells, None, kappa, None, masses)
     found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, energy(bumps)) and promise > 0.0
     best = bumps.copy()
@@ -1077,6 +1101,47 @@ def test_energy_with_masses():
             moved = best.copy()
             moved[facet] += step
             assert energy(moved) > found
+    # cell by cell and value by value: E is a quadratic, so differences are exact
+    slopes = Slopes.of(functional, excess, best)
+    assert np.isclose(slopes.energies.sum(), energy(best))
+    by_facets = cells.over_facets(slopes.facets)
+    for facet in range(0, len(best), 5):
+        step = np.zeros_like(best)
+        step[facet] = 1.0
+        assert np.isclose(by_facets[facet], (energy(best - step) - energy(best + step)) / 4)
+    for cell in side.cells:
+        for i in range(3):
+            step = np.zeros_like(excess)
+            step[i, cell] = 1.0
+            change = energy(best, excess - step) - energy(best, excess + step)
+            assert np.isclose(slopes.vertices[i, cell], change / 4)
+    renewed = replace(slopes, **{name: rng.normal(size=getattr(slopes, name).shape)
+                                 for name in ("vertices", "facets", "energies")})  # fmt: skip
+    renewed.renew(functional, excess, best, np.arange(cells.number))
+    assert np.allclose(renewed.vertices, slopes.vertices)
+    assert np.allclose(renewed.energies, slopes.energies)
+    # what each vertex promises, and the best values of all
+    loose = rng.uniform(size=cells.vertices.max() + 1) < 0.5
+    by_vertices, promise = cells.over_vertices(slopes.vertices), companion.Promise.of(functional)
+    promised = np.sum(by_vertices[loose] ** 2 / promise.vertices[loose])
+    assert np.isclose(companion._promise(functional, excess, best, loose), promised)
+    vertex = int(np.flatnonzero(loose)[0])
+    step = (cells.vertices == vertex) * 1.0
+    curvature = energy(best, excess + step) + energy(best, excess - step) - 2.0 * energy(best)
+    assert np.isclose(promise.vertices[vertex], curvature / 2)
+    step = np.zeros_like(best)
+    step[side.dofs[1]] = 1.0
+    curvature = energy(best + step) + energy(best - step) - 2.0 * energy(best)
+    assert np.isclose(promise.facets[side.dofs[1]], curvature / 2)
+    free[:] = True  # a height that is held is a middle that is held
+    values, heights = nearest(cells, kappa, slopes, loose, free, masses)
+    after = Slopes.of(functional, excess + values[cells.vertices], best + heights)
+    assert after.energies.sum() < slopes.energies.sum()
+    for total, mine in (
+        (cells.over_vertices(after.vertices), loose),
+        (cells.over_facets(after.facets), free),
+    ):
+        assert np.abs(total[mine]).max() < 1e-7 * np.abs(by_vertices).max()
 
 
 @pytest.mark.parametrize("loss", [0.0, 50.0])
@@ -1180,11 +1245,11 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     limits = ((1, cells.largest_at_vertices(contact.ends, alpha[0])),)
     floors = companion.Floors(contact, signs, *alpha, limits, signs < 0.0, len(cells.exterior))
     start = companion.Draft(np.zeros(len(rim)), np.zeros(len(free)), loose, free)
-    functional = companion.Functional(cells, w, kappa, np.array(True), None)
+    functional = of_gradients(cells, kappa, w)
     v, bumps, found = companion._solved(functional, start, floors)
     assert found is None
-    after = Slopes.of(cells, kappa, v[cells.vertices] - w, bumps)
-    before = Slopes.of(cells, kappa, -w, start.bumps)
+    after = Slopes.of(functional, v[cells.vertices] - w, bumps)
+    before = Slopes.of(functional, -w, start.bumps)
     assert after.energies.sum() < before.energies.sum()
     pulls = cells.over_vertices(after.vertices), cells.over_facets(after.facets)
     inside = loose.copy()
@@ -1294,6 +1359,23 @@ def test_size_of_the_field_that_carries_a_quadratic_flux():
                 load = [length * (gauss / 2) @ (flux * s**p) * (q == 0) for p, q in powers]
                 least = np.sqrt(load @ np.linalg.lstsq(matrix, load, rcond=1e-11)[0])
                 assert least <= bound * (1 + 1e-9) and bound <= 1.5 * least
+
+
+@pytest.mark.serial
+def test_a_small_loss_is_no_way_out():
+    """What is left goes to Γ0, unless b takes it up at less: so that depends on b as it should."""
+    domain = square(6, ("dirichlet", "neumann", "neumann", "contact"), MPI.COMM_SELF)
+    V = fem.functionspace(domain.mesh, ("CR", 1))
+    one = np.array(1.0)
+
+    def found(b):
+        cells = Cells(domain, V, (DIRICHLET,), {} if b is None else {NEUMANN: np.array(b)})
+        left = np.abs(np.random.default_rng(3).normal(size=cells.number))
+        return flux._carried(cells, left, one, 0.0, np.array(0.0))
+
+    without = found(None)
+    for b, limits in ((1e-12, (0.95, 1.0)), (1e-3, (0.95, 1.0)), (1e6, (0.1, 0.9))):
+        assert limits[0] * without <= found(b) <= limits[1] * without * (1 + 1e-9)
 
 
 @pytest.mark.serial

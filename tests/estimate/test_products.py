@@ -19,8 +19,9 @@ from signorini_cr.data.pieces import Pieces
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
-from signorini_cr.estimate.companion import Companion, Floors, Functional, Masses, _at_vertices
+from signorini_cr.estimate.companion import Companion, Floors, _at_vertices
 from signorini_cr.estimate.curl import _pull
+from signorini_cr.estimate.functional import Functional, Masses
 from signorini_cr.estimate.lifting import Lift, affine, gaps
 from signorini_cr.estimate.sums import Sums, Totals
 from signorini_cr.fem.cells import BoundaryFacets, Cells
@@ -761,6 +762,31 @@ def test_what_pulls_at_bumps_of_the_curl(more):
 
 
 @pytest.mark.serial
+def test_what_b_takes_up_where_y_follows_it():
+    """On thin cells y·n has the affine part, but where b is so strong that this would be dear."""
+    _, cells, kappa, edge, _ = on_sides(34)
+    on, low = OnFacets(cells, edge.facets), kappa[edge.facets.cells]
+    length = on.length
+    loss = np.array([0.0, 1e-6, 0.9, 1.1, 1e3, 1e-3]) * low / length
+    given = np.array([False, False, True, True, True, False])
+    edge = replace(edge, loss=loss, low=kappa)
+    assert np.array_equal(edge.given, given)
+    assert np.array_equal(edge.followed, [True, True, True, False, False, True])
+    rest = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]
+    rest -= (rest @ on.weights)[:, None]
+    affine = 1.0 - 2.0 * on.s
+    slope = 3.0 * (rest * affine) @ on.weights
+    carried = rest - np.where([0, 0, 1, 0, 0, 0], slope, 0.0)[:, None] * affine
+    for values, whether in ((rest, False), (carried, True)):
+        truth = np.where(given, on.integral(values**2) / np.maximum(loss, 1e-300), 0.0)
+        assert np.allclose(edge.taken(None, whether), truth, rtol=1e-6, atol=1e-12)
+        squares = np.bincount(
+            edge.place, edge.measure * (edge.weights @ edge.tau(whether) ** 2), minlength=6
+        )
+        assert np.allclose(squares, np.where(given, on.integral(values**2), 0.0), rtol=1e-6)
+
+
+@pytest.mark.serial
 @pytest.mark.parametrize("plain", [False, True])
 def test_what_v_is_to_make_small(plain):
     """κ is steady where it does not vary; b |F| and t/b − u_h on facets with a b."""
@@ -771,13 +797,21 @@ def test_what_v_is_to_make_small(plain):
     varies = np.arange(cells.number) % 3 == 0
     of_cells = SimpleNamespace(low=kappa, mean=kappa * (1 + 1e-3 * varies))
     of_cells.high = kappa * (1 + 2e-3 * varies)
+    # cells where c varies, or is more than κ/h², are not steady either
+    reacts = np.arange(cells.number) % 5 * (not plain)
+    low, high = (
+        reacts * kappa / cells.diameter2 * each / 2.5 for each in (1.0, 1.0 + (reacts == 2))
+    )
+    c = SimpleNamespace(low=low, high=high)
+    if plain:
+        c.low = c.high = np.array(0.0)
     known = SimpleNamespace(
-        cells=cells, kappa=of_cells, segments=edge, w=0, c=SimpleNamespace(low=np.array(0.0)),
-        flux=SimpleNamespace(shed=shed),
-    )  # fmt: skip
+        cells=cells, kappa=of_cells, segments=edge, w=0, c=c, flux=SimpleNamespace(shed=shed)
+    )
     found = certificate._functional(known, plain)
     masses = found.masses
-    assert np.array_equal(found.steady, ~varies & plain) and masses.some == (not plain)
+    steady = ~varies & np.isin(reacts, [0, 1])
+    assert np.array_equal(found.steady, steady) and masses.some == (not plain)
     assert np.array_equal(masses.side.dofs, side.dofs[1:5])
     assert np.allclose(masses.loss, loss[1:5] * OnFacets(cells, side).length[1:5])
     assert np.array_equal(masses.strong, [False, False, True, True])
