@@ -382,7 +382,12 @@ SHEAR = 50.0
 
 
 def _thin(
-    name: str, formulas: tuple[Any, Any, Any], parameters: Any, edges: Any, quick: bool
+    name: str,
+    formulas: tuple[Any, Any, Any],
+    parameters: Any,
+    edges: Any,
+    quick: bool,
+    open_side: bool = False,
 ) -> Row:
     """Squares mapped to parallelograms.
 
@@ -392,16 +397,33 @@ def _thin(
         parameters: Theirs.
         edges: Where the square's lower and left side go.
         quick: Whether one mesh is enough.
+        open_side: Whether the right side is Neumann's, and there is one mesh more.
     """
     u, gradient, f = formulas
     lower, left = (np.array(edge, dtype=np.float64) for edge in edges)
     corners = [(0.0, 0.0), tuple(lower), tuple(lower + left), tuple(left)]
+    labels = ("contact", "neumann", "dirichlet", "dirichlet") if open_side else manufactured.HELD
+    normal = np.array([left[1], -left[0]]) / np.hypot(*left)
+
+    def g(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+        along, up = gradient(m, x, y, p)
+        return along * float(normal[0]) + up * float(normal[1])
+
     made = Exact(
-        "thin", parameters, manufactured.HELD, u, gradient, u, u, f=f, vertices=tuple(corners)
+        "thin",
+        parameters,
+        labels,
+        u,
+        gradient,
+        u,
+        u,
+        f=f,
+        g=g if open_side else None,
+        vertices=tuple(corners),
     )
     domains = []
-    for n in (8,) if quick else (8, 16, 32):
-        square = Polygon(np.array(manufactured.SQUARE), manufactured.HELD)
+    for n in (8,) if quick else (8, 16, 32, 64)[: 3 + open_side]:
+        square = Polygon(np.array(manufactured.SQUARE), labels)
         domain = families.structured(square, n, COMM)
         x = domain.mesh.geometry.x
         x[:, :2] = x[:, :2] @ np.array([lower, left])
@@ -613,6 +635,14 @@ def _parallelograms(quick: bool) -> list[Row]:
             (1.0, 3.0 / SHEAR, 0.3, 3.0, 0.0, 0.5),
             ([1, 0], [SHEAR, 1]),
             quick,
+        ),
+        _thin(
+            "squares sheared 1 : 50, u smooth, a side Neumann",
+            plain,
+            (1.0, 3.0 / SHEAR, 0.3, 3.0, 0.0, 0.5),
+            ([1, 0], [SHEAR, 1]),
+            quick,
+            open_side=True,
         ),
         _thin(
             "squares sheared 1 : 50, u sheared as well",
