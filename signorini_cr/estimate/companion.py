@@ -3,7 +3,7 @@
 v is continuous, v = u_D on Γ0 and v ≥ α on Γ1. It is P1 with the means of u_h's vertex values,
 weighted by κ, plus (for d = 2) a quadratic bump b_F = 4 λ_j λ_k on each facet, whose heights are
 found by sweeps that bring ∇v nearer to ∇u_h. Where that leaves much to be gained, v is found by
-solving for it, see `nearest`, around the points where it is, or on all of the mesh if that is
+solving for it, see `best`, around the points where it is, or on all of the mesh if that is
 everywhere; single vertices that hold much of what is left get `cusps`.
 What u_D and α have beyond quadratic polynomials goes into a lifting ℓ in the boundary cells, of
 which the norm is known. `docs/certificate.md` has the mathematics.
@@ -20,19 +20,21 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
 from ..data.moments import OnFacets, OnParts
-from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, sum_rows
+from ..fem.cells import BoundaryFacets, Cells, measures
 from ..fem.conditions import number
+from .best import solved
 from .cusps import Cusps
-from .descent import descend, nonzero
+from .draft import Draft, Floors
 from .flux import Flux
-from .functional import Functional, Masses, Slopes
+from .functional import Functional, Masses
+from .heights import promise_of_vertices, sweep
 from .lifting import Cubic, Lift, affine, joined, lift
-from .nearest import LARGEST, nearest
 from .shapes import bump_slopes, local_thirds, third_slopes
 
 Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
 
 JUMP = "u_D jumps where boundary facets meet: no function of finite energy has such values"
+
 BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
 
 PROMISE = 0.04
@@ -42,32 +44,6 @@ A sweep leaves 0.005 to 0.03 on ordinary meshes with a smooth coefficient, also 
 point; 0.05 on fine meshes where there are several, 0.07 where the coefficient is a checkerboard,
 and 0.2 and more on thin cells.
 """
-
-FOREMOST = 0.9
-"""Part of all promise that the values have around which v is solved for.
-
-On a mesh of a polygon with re-entrant corners 20 of 270,000 vertices have 0.95. More than this, or
-more layers, take longer, and bring the bound down by 0.2 to 0.4 %.
-"""
-
-LAYERS = 12
-"""How many layers of cells around these are solved for."""
-
-ROUNDS = 3
-"""How often v is solved for; after each time but the last what is below α is held there, and what
-promises most then may be elsewhere."""
-
-LITTLE = 0.01
-"""Part of E that a round around some points has to take off for another one to be worth it."""
-
-
-MUCH = 0.1
-"""Part of E that the last round takes off where v needs to be solved for on all of the mesh: 0.01
-on ordinary meshes with singular points, 0.2 to 0.5 on thin cells."""
-
-LEFT = 0.04
-"""Part of E that single values may promise in the end. That is 0.005 and less on ordinary meshes,
-0.2 on thin cells where v needs to be solved for on all of the mesh."""
 
 
 @dataclass(eq=False)
@@ -121,76 +97,6 @@ class Companion:
         return at
 
 
-@dataclass(frozen=True, eq=False)
-class Floors:
-    """What the bounds ask of v: s v is not below the quadratic through three values on each facet.
-
-    Attributes:
-        side: The facets of Γ1, once for each bound.
-        signs: s, shape (n,).
-        ends: The bounds at their ends, shape (d, n).
-        middle: At their midpoints, shape (n,).
-        at_vertices: The values of s, and for each the largest bound at each vertex, −∞ for none:
-            where parts with obstacles of their own meet, the higher one counts.
-        strong: Where v is drawn to t/b, as near to u as α is: there s v is not below α at the
-            middle, either, and no more is asked for, shape (n,).
-        facets: Number of facets.
-    """
-
-    side: BoundaryFacets
-    signs: FloatArray
-    ends: FloatArray
-    middle: FloatArray
-    at_vertices: tuple[tuple[int, FloatArray], ...]
-    strong: BoolArray
-    facets: int
-
-    @classmethod
-    def of(cls, cells: Cells, bounds: OnParts, masses: Masses) -> Floors:
-        """Collect them; collective."""
-        side, signs, ends = bounds.side, bounds.signs, bounds.ends
-        limits = []
-        for sign in sorted({each.sign for each in bounds.parts}, reverse=True):
-            here = signs == sign
-            limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
-        strong = np.zeros(len(cells.exterior), dtype=bool)
-        strong[masses.side.dofs] = masses.strong
-        # to a bound that is a number no lifting brings v
-        curved = [np.full(len(p.middle), p.trace.constant is None) for p in bounds.parts]
-        strong = strong[side.dofs] & np.concatenate([np.empty(0, dtype=bool), *curved])
-        return cls(side, signs, ends, bounds.middle, tuple(limits), strong, len(cells.exterior))
-
-    def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The least and the largest heights of bumps that they allow for, by facet dof.
-
-        Args:
-            v: v at the vertices, within the bounds.
-        """
-        above = self.signs * v[self.side.ends]
-        least = np.where(
-            self.strong,
-            self.middle - above.mean(axis=0),
-            _lowest(above, self.ends, self.middle),
-        )
-        low, high = np.full(self.facets, -np.inf), np.full(self.facets, np.inf)
-        up = self.signs > 0.0
-        low[self.side.dofs[up]] = least[up]
-        high[self.side.dofs[~up]] = -least[~up]
-        return low, high
-
-
-def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArray:
-    """Least heights of the bumps with which v stays above the quadratic through α's three values.
-
-    Args:
-        v: At the facets' ends, not below α, shape (2, n).
-        obstacle: α there.
-        middle: α at the midpoints, shape (n,).
-    """
-    room: FloatArray = np.sqrt(np.maximum(v - obstacle, 0.0)).sum(axis=0) ** 2 / 4
-    return middle - obstacle.mean(axis=0) - room
-
-
 def companion(
     functional: Functional,
     flux: Flux,
@@ -221,7 +127,7 @@ def companion(
     if cells.tdim == 2 and sweeps > 0:
         poor = _improved(functional, draft, excess, u_D.side, floors, sweeps)
         if poor:
-            draft.vertices, draft.bumps, cusps = _solved(functional, draft, floors)
+            draft.vertices, draft.bumps, cusps = solved(functional, draft, floors)
             excess = functional.excess(draft.vertices)
     above, lifts, reasons = boundary.lifted(
         cells, flux, draft.vertices, draft.bumps, np.zeros(len(draft.bumps))
@@ -229,23 +135,6 @@ def companion(
     words = [word for rank in cells.comm.allgather(wrong + reasons) for word in rank if word]
     reason = words[0] if words else None
     return Companion(draft.vertices, draft.bumps, excess, above, lifts, reason, boundary, cusps)
-
-
-@dataclass(eq=False)
-class Draft:
-    """v on the way.
-
-    Attributes:
-        vertices: v at the vertices, ghosts included.
-        bumps: Heights of v's bumps by facet dof, ghosts included.
-        loose: Which values at vertices may be changed.
-        free: Which heights may be changed.
-    """
-
-    vertices: FloatArray
-    bumps: FloatArray
-    loose: BoolArray
-    free: BoolArray
 
 
 def _started(functional: Functional, u_D: OnParts, floors: Floors, flux: Flux) -> Draft:
@@ -296,10 +185,10 @@ def _improved(
         Whether much would be gained by solving for v.
     """
     contact, bumps = floors.side, draft.bumps
-    energy, promise = _sweep(functional, excess, bumps, draft.free, (fixed, contact), sweeps)
+    energy, promise = sweep(functional, excess, bumps, draft.free, (fixed, contact), sweeps)
     low, high = (limit[contact.dofs] for limit in floors.heights(draft.vertices))
     bumps[contact.dofs] = np.clip(bumps[contact.dofs], low, high)
-    promise += _promise(functional, excess, bumps, draft.loose)
+    promise += promise_of_vertices(functional, excess, bumps, draft.loose)
     return promise > PROMISE * energy
 
 
@@ -411,429 +300,6 @@ def _at_vertices(
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ends.ravel()) / np.maximum(count, 1.0), where=count > 0)
     return v, at_bound
-
-
-def _solved(
-    functional: Functional, draft: Draft, floors: Floors
-) -> tuple[FloatArray, FloatArray, Cusps | None]:
-    """Solve for the best v of degree 2, with cusps where they are called for; collective.
-
-    First around the values that promise most. Where v is still far from the best then, on the whole
-    mesh: in thin cells one value may hang on many, and cusps that were found with a v that is not
-    what it is to become may be in the way.
-
-    Args:
-        functional: What v is to make small.
-        draft: v to begin with, and what of it may be changed.
-        floors: What the bounds ask of v.
-
-    Returns:
-        v at the vertices, the heights, and the cusps.
-    """
-    promise = Promise.of(functional)
-    best, least, settled = _best(functional, draft, floors, promise, LAYERS)
-    if not settled:
-        other, energy, _ = _best(functional, draft, floors, promise, None)
-        if energy < least:
-            best = other
-    return best
-
-
-def _best(
-    functional: Functional, draft: Draft, floors: Floors, promise: Promise, layers: int | None
-) -> tuple[tuple[FloatArray, FloatArray, Cusps | None], float, float]:
-    """Solve for v in rounds, each for the values that promise most, and those around; collective.
-
-    Args:
-        functional: What v is to make small.
-        draft: v to begin with, and what of it may be changed.
-        floors: What the bounds ask of v.
-        promise: What values promise.
-        layers: How many layers of cells around them; None for all of the mesh.
-
-    Returns:
-        As `_solved`, E, and whether v is settled.
-    """
-    cells, kappa, bounded = functional.cells, functional.kappa, floors.side.dofs
-    v, bumps, loose, free = draft.vertices, draft.bumps, draft.loose, draft.free
-    excess = functional.excess(v)
-    slopes = Slopes.of(functional, excess, bumps)
-    cusps: Cusps | None = None
-    near = promise.near(slopes, loose, free, layers)
-    if near is not None:
-        # v is good enough but for some places; elsewhere cusps would be for what v is to become
-        cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
-        cusps = _fitted(functional, cusps, excess, bumps, slopes)
-    best, least = (v, bumps, cusps), cells.total(np.sum(slopes.energies))[0]
-    for turn in range(ROUNDS):
-        if turn > 0:
-            near = promise.near(slopes, loose, free, layers)
-        some, heights, at = near or (loose, free, slice(None))
-        step = nearest(cells, kappa, slopes, some, heights, functional.masses)
-        v, bumps, free = v + step[0], bumps + step[1], free.copy()
-        down = np.zeros_like(loose)
-        for sign, limit in floors.at_vertices:
-            down |= some & (sign * v <= limit)
-            v = np.where(some, sign * np.maximum(sign * v, limit), v)
-        low, high = floors.heights(v)
-        out = np.unique(bounded[heights[bounded] & ((bumps <= low) | (bumps >= high))[bounded]])
-        # also where they are held since an earlier round: the facet's ends may have come down
-        bumps[bounded] = np.clip(bumps, low, high)[bounded]
-        free[out] = False
-        loose = loose & ~down
-        if cusps is not None and not isinstance(at, slice):
-            at = np.union1d(at, cusps.at)
-        excess[:, at] = v[cells.vertices[:, at]] - functional.w[:, at]
-        slopes.renew(functional, excess, bumps, at)
-        if turn == 0:  # where v is good otherwise
-            cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
-        cusps = _fitted(functional, cusps, excess, bumps, slopes)
-        energy, changes = cells.total(np.sum(slopes.energies), float(len(out) + down.sum()))
-        settled = near is None or energy > (1.0 - LITTLE) * least
-        falling = near is not None and energy < (1.0 - MUCH) * least
-        if energy < least:
-            best, least = (v, bumps, cusps), energy
-        if settled and changes == 0.0 and cusps is None:
-            break
-    little = promise.total(slopes, loose, free) <= LEFT * least
-    return best, least, little and not falling
-
-
-def _fitted(
-    functional: Functional,
-    cusps: Cusps | None,
-    excess: FloatArray,
-    bumps: FloatArray,
-    slopes: Slopes,
-) -> Cusps | None:
-    """Find the best heights of cusps, and add what these do to E and its slopes; collective.
-
-    Args:
-        functional: E.
-        cusps: The cusps, if there are any.
-        excess: v − u_h at the cells' vertices without bumps and cusps, shape (3, cells).
-        bumps: Heights of v's bumps by facet dof.
-        slopes: Those of v without cusps, changed in place.
-    """
-    if cusps is None:
-        return None
-    cells = functional.cells
-    cusps = cusps.fitted(cells, excess, bumps)
-    slopes.energies[cusps.at] += cusps.gains(cells, excess, bumps)
-    for rows, pull in zip((slopes.vertices, slopes.facets), cusps.pulls(cells), strict=True):
-        rows[:, cusps.at] -= pull
-    return cusps
-
-
-@dataclass(frozen=True, eq=False)
-class Promise:
-    """What E falls by if one value is put right as if it were alone: its slope's square over this.
-
-    Attributes:
-        cells: The mesh.
-        vertices: ½ ∂²E by values at vertices, ghosts included.
-        facets: The same by heights of bumps.
-    """
-
-    cells: Cells
-    vertices: FloatArray
-    facets: FloatArray
-
-    @classmethod
-    def of(cls, functional: Functional) -> Promise:
-        """Make it; collective."""
-        cells, masses = functional.cells, functional.masses
-        squares = np.empty((3, cells.number))
-        for part in blocks(cells.number):
-            squares[:, part] = pick(functional.kappa, part) * cells.squares(part)
-        traces = np.tile(4 / 3 * sum_rows(squares), (3, 1))
-        if masses.reacts:
-            mass = masses.on_cells(cells, slice(0, cells.number))
-            squares += mass / 6.0
-            traces += 8.0 / 45.0 * mass
-        side = masses.side
-        np.add.at(squares, (cells.others[side.local].T, side.cells), masses.loss / 3.0)
-        np.add.at(traces, (side.local, side.cells), 8.0 / 15.0 * masses.loss)
-        return cls(cells, nonzero(cells.over_vertices(squares)), nonzero(cells.over_facets(traces)))
-
-    def of_values(
-        self, slopes: Slopes, loose: BoolArray, free: BoolArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """What each value promises, ghosts included; collective.
-
-        Args:
-            slopes: Those of v.
-            loose: Which values at vertices may be changed.
-            free: Which heights may be changed.
-
-        Returns:
-            By vertex and by facet dof.
-        """
-        cells = self.cells
-        promises = cells.over_vertices(slopes.vertices), cells.over_facets(slopes.facets)
-        for promise, weight, may in zip(
-            promises, (self.vertices, self.facets), (loose, free), strict=True
-        ):
-            promise *= promise
-            promise /= weight
-            promise *= may
-        return promises
-
-    def total(self, slopes: Slopes, loose: BoolArray, free: BoolArray) -> float:
-        """What all of them promise; collective."""
-        vertices, facets = self.of_values(slopes, loose, free)
-        own = (
-            vertices[: self.cells.owned_vertices()].sum()
-            + facets[: self.cells.owned_facets()].sum()
-        )
-        return float(self.cells.total(float(own))[0])
-
-    def near(
-        self, slopes: Slopes, loose: BoolArray, free: BoolArray, layers: int | None
-    ) -> tuple[BoolArray, BoolArray, IndexArray] | None:
-        """Choose values that are worth being solved for; collective.
-
-        They are those that hold `FOREMOST` of all promise, and all within some layers around them.
-
-        Args:
-            slopes: Those of v.
-            loose: Which values at vertices may be changed.
-            free: Which heights may be changed.
-            layers: How many layers of cells around them; None for all.
-
-        Returns:
-            Which of them are to be, and the cells of this rank that know of these; None if that is
-            most of the mesh, or nothing is promised.
-        """
-        if layers is None:
-            return None
-        cells = self.cells
-        owned = cells.owned_vertices(), cells.owned_facets()
-        promises = self.of_values(slopes, loose, free)
-        limit = _limit(cells, *(p[:n] for p, n in zip(promises, owned, strict=True)))
-        chosen, much = (promise > limit for promise in promises)
-        local, at = np.nonzero(much[cells.facets])
-        chosen[cells.vertices[cells.others[local].T, at]] = True
-        chosen = cells.around(chosen, layers)
-        few, all_ = cells.total(float(np.count_nonzero(chosen[: owned[0]])), float(owned[0]))
-        if not 0.0 < few <= LARGEST * all_:
-            return None
-        at = np.flatnonzero(chosen[cells.vertices].any(axis=0))
-        facets, inside = cells.facets[:, at], chosen[cells.vertices[:, at]]
-        there = np.zeros(len(free), dtype=bool)
-        for facet, (j, k) in zip(facets, cells.others, strict=True):
-            there[facet[inside[j] | inside[k]]] = True
-        return loose & chosen, free & there, at
-
-
-def _limit(cells: Cells, *promises: FloatArray) -> float:
-    """Return what those are above that hold `FOREMOST` of the whole; collective.
-
-    Args:
-        cells: The mesh.
-        *promises: Those of this rank, shapes (n,).
-    """
-    largest = max(cells.comm.allgather(max(float(p.max(initial=0.0)) for p in promises)))
-    if largest == 0.0:
-        return 0.0
-    total, number = cells.total(sum(p.sum() for p in promises), float(sum(map(len, promises))))
-    # All that are below this together are no more than the rest; mostly that leaves few
-    least = (1.0 - FOREMOST) * total / number
-    some = np.concatenate([p[p > least] for p in promises])
-    # By classes, each 2^{1/4} below the one before. None ends at a value that equals the largest
-    # one, or that divided by a power of 2, but for rounding
-    classes = (4.0 * np.log2(largest / some) + 0.37).astype(np.intp)
-    held = cells.total(*np.bincount(classes, some, minlength=256))
-    last = int(np.searchsorted(np.cumsum(held), FOREMOST * total))
-    return float(largest * 2.0 ** ((0.37 - last - 1) / 4.0))
-
-
-def _sweep(
-    functional: Functional,
-    excess: FloatArray,
-    bumps: FloatArray,
-    free: BoolArray,
-    bumped: tuple[BoundaryFacets, ...],
-    steps: int,
-) -> tuple[float, float]:
-    """Make E smaller by conjugate gradients in the heights of the bumps; collective.
-
-    Args:
-        functional: E.
-        excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
-        bumps: Heights, improved in place.
-        free: Which of them may be.
-        bumped: The facets on which there are some to begin with.
-        steps: How many steps.
-
-    Returns:
-        E, and what it would fall by if each height were put right as if it were alone.
-    """
-    cells, held = functional.cells, np.flatnonzero(~free)
-    matrix = _OfHeights(functional)
-    energy, local = matrix.without_bumps(excess)
-    energy += matrix.with_bumps(bumps, bumped, local)
-
-    def assembled(local: FloatArray) -> FloatArray:
-        out = cells.over_facets(local)
-        out[held] = 0.0
-        return out
-
-    def image(way: FloatArray) -> FloatArray:
-        matrix.multiply(way, local)
-        return assembled(local)
-
-    down = assembled(local)
-    fall, square = descend(cells, image, bumps, down, matrix.diagonal(), steps)
-    return float(cells.total(energy)[0] - 4 / 3 * fall), float(4 / 3 * square)
-
-
-class _OfHeights:
-    """E as a quadratic functional of the heights of bumps, in units of 4/3.
-
-    On a cell its matrix is 2κ|T| ∇λ_i·∇λ_j outside the diagonal and κ|T| Σ|∇λ_k|² on it, and to
-    each entry c|T|/15 is added, on the diagonal twice.
-
-    Attributes:
-        functional: E.
-        own: κ|T| Σ|∇λ_k|² + c|T|/15, shape (cells,).
-        lost: What b adds to the diagonal, by facet dof.
-        at: Local numbers and cells of the facets with a b.
-    """
-
-    def __init__(self, functional: Functional):
-        """Take what is on the diagonal."""
-        cells, masses = functional.cells, functional.masses
-        self.functional, self.own = functional, np.empty(cells.number)
-        self.lost = np.zeros(len(cells.exterior))
-        self.lost[masses.side.dofs] = 0.4 * masses.loss
-        self.at = masses.side.local, masses.side.cells
-        self._reacts = masses.reacts
-        for part in blocks(cells.number):
-            self.own[part] = pick(functional.kappa, part) * cells.trace(part)
-            if self._reacts:
-                self.own[part] += masses.on_cells(cells, part) / 15.0
-
-    def without_bumps(self, excess: FloatArray) -> tuple[float, FloatArray]:
-        """Return E for no bumps, this rank's share, and −½ its slope on each cell.
-
-        Args:
-            excess: v − u_h at the cells' vertices, shape (3, cells).
-        """
-        cells, kappa, masses = self.functional.cells, self.functional.kappa, self.functional.masses
-        slope, energy = np.empty_like(excess), 0.0
-        for part in blocks(cells.number):
-            k = pick(kappa, part)
-            np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
-            energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
-            if self._reacts:
-                mass = masses.on_cells(cells, part)
-                energy += float(np.sum(mass * distance(excess[:, part], None)))
-                slope[:, part] += masses.pull(cells, excess[:, part], part)
-        first, last, height = masses.toward
-        ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
-        energy += float(np.sum(masses.loss * distance(ends, None)))
-        energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
-        np.add.at(slope, self.at, masses.pull_on_facets(excess, cells.others))
-        return energy, slope
-
-    def with_bumps(
-        self, bumps: FloatArray, bumped: tuple[BoundaryFacets, ...], slope: FloatArray
-    ) -> float:
-        """Return what E changes by with some bumps, this rank's share.
-
-        Args:
-            bumps: Heights by facet dof.
-            bumped: The facets on which there are some.
-            slope: −½ E's slope on each cell, shape (3, cells), changed in place.
-        """
-        cells, side = self.functional.cells, self.functional.masses.side
-        near = np.unique(np.concatenate([each.cells for each in (*bumped, side)]))
-        flow, height = slope[:, near], bumps[cells.facets[:, near]]
-        change = self._times(height, near, np.empty_like(height))
-        slope[:, near] = flow - change
-        energy = -4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
-        lost, height = self.lost[side.dofs], bumps[side.dofs]
-        np.subtract.at(slope, self.at, lost * height)
-        return energy + 4 / 3 * float(np.sum(lost * height**2))
-
-    def multiply(self, heights: FloatArray, out: FloatArray) -> None:
-        """Put the cells' matrices times heights by facet dof into an array, shape (3, cells)."""
-        cells, side = self.functional.cells, self.functional.masses.side
-        for part in blocks(cells.number):
-            self._times(heights[cells.facets[:, part]], part, out[:, part])
-        np.add.at(out, self.at, self.lost[side.dofs] * heights[side.dofs])
-
-    def _times(self, height: FloatArray, part: slice | IndexArray, out: FloatArray) -> FloatArray:
-        """Put the matrices, but for b, times heights of local bumps into an array."""
-        cells, own = self.functional.cells, self.own[part]
-        twice, stiffness = 2.0 * pick(self.functional.kappa, part), cells.stiffness[:, part]
-        for i, (j, k) in enumerate(cells.others):
-            row = np.multiply(stiffness[i + j - 1], height[j], out=out[i])
-            row += stiffness[i + k - 1] * height[k]
-            row *= twice
-            row += own * height[i]
-        if self._reacts:
-            mass = self.functional.masses.on_cells(cells, part)
-            out += mass / 15.0 * sum_rows(height)
-        return out
-
-    def diagonal(self) -> FloatArray:
-        """The diagonal by facet dof; collective."""
-        cells = self.functional.cells
-        local = np.tile(self.own, (3, 1))
-        if self._reacts:
-            local += self.functional.masses.on_cells(cells, slice(0, cells.number)) / 15.0
-        np.add.at(local, self.at, self.lost[self.functional.masses.side.dofs])
-        return nonzero(cells.over_facets(local))
-
-
-def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
-    """Means of (v − u_h)² over simplices of one, two or three dimensions, shape (n,).
-
-    Args:
-        c: v − u_h at the vertices, shape (k, n).
-        height: Heights of v's bumps on triangles, shape (3, n), if there are any.
-    """
-    k, total = len(c), sum_rows(c)
-    out = (total**2 + dot_rows(c, c)) / (k * (k + 1))
-    if height is not None:
-        whole = sum_rows(height)
-        out += (4.0 * total * whole - 2.0 * dot_rows(c, height)) / 15.0
-        out += 4.0 * (whole**2 + dot_rows(height, height)) / 45.0
-    return np.asarray(out)
-
-
-def _promise(
-    functional: Functional, excess: FloatArray, bumps: FloatArray, loose: BoolArray
-) -> float:
-    """Return what E would fall by if each vertex were put right alone.
-
-    Args:
-        functional: E.
-        excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
-        bumps: Their heights.
-        loose: Which values at vertices may be changed.
-    """
-    cells, kappa, masses = functional.cells, functional.kappa, functional.masses
-    slope, diagonal = np.empty_like(excess), np.empty_like(excess)
-    for part in blocks(cells.number):
-        k, height = pick(kappa, part), bumps[cells.facets[:, part]]
-        if masses.reacts:
-            fall, _ = masses.fall(cells, excess[:, part], height, part)
-        height *= -4 / 3
-        height += excess[:, part]
-        np.multiply(k, cells.apply(height, part), out=slope[:, part])
-        np.multiply(k, cells.squares(part), out=diagonal[:, part])
-        if masses.reacts:
-            slope[:, part] -= fall
-            diagonal[:, part] += masses.on_cells(cells, part) / 6.0
-    ends = cells.others[masses.side.local].T, masses.side.cells
-    np.subtract.at(slope, ends, masses.fall_on_facets(cells, excess, bumps, slice(None))[0])
-    np.add.at(diagonal, ends, masses.loss / 3.0)
-    owned = slice(cells.owned_vertices())
-    down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
-    return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
 
 
 def bend_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:

@@ -19,8 +19,9 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.loads import NOTHING, Segments, VolumeMoments, reacts, trace_of
 from ..data.moments import Coefficient
 from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
-from .companion import Companion, bend_squares, distance, on_facet
+from .companion import Companion, bend_squares, on_facet
 from .flux import Flux, field_squares
+from .heights import distance
 from .shapes import local_thirds, quadrature
 from .sums import Sums
 

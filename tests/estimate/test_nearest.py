@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from signorini_cr import Polygon, Problem, exact, solve_levels
 from signorini_cr.compat import cell_nodes
-from signorini_cr.estimate import companion, nearest
+from signorini_cr.estimate import best, companion, nearest
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.functional import Slopes
 from signorini_cr.fem.cells import Cells
@@ -140,12 +140,12 @@ def test_the_foremost_hold_what_they_are_to_hold():
     """And without those of the least class they would not."""
     cells = cells_of(4)
     values = np.random.default_rng(WORLD.rank).uniform(size=200) ** 9
-    limit = companion._limit(cells, values)
+    limit = best._limit(cells, values)
     everyones = np.concatenate(WORLD.allgather(values))
-    part = companion.FOREMOST * everyones.sum()
+    part = best.FOREMOST * everyones.sum()
     assert everyones[everyones > limit].sum() >= part
     assert everyones[everyones > 2**0.25 * limit].sum() < part
-    assert companion._limit(cells, 0.0 * values) == 0.0
+    assert best._limit(cells, 0.0 * values) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -157,21 +157,21 @@ def around_corners():
 @pytest.mark.slow
 def test_corners_take_small_systems(around_corners, monkeypatch):
     """Much is gained at single points: by systems of a few unknowns, as by those of all."""
-    sizes, solve_for = [], companion.nearest
+    sizes, solve_for = [], best.nearest
 
     def noted(cells, kappa, slopes, loose, free, masses):
         mine = loose[: cells.owned_vertices()].sum() + free[: cells.owned_facets()].sum()
         sizes.append(cells.total(float(mine))[0])
         return solve_for(cells, kappa, slopes, loose, free, masses)
 
-    monkeypatch.setattr(companion, "nearest", noted)
+    monkeypatch.setattr(best, "nearest", noted)
     monkeypatch.setattr(companion, "PROMISE", 0.0)
     local = certify(around_corners)
     small = sizes.copy()
     sizes.clear()
-    monkeypatch.setattr(companion, "LARGEST", -1.0)
+    monkeypatch.setattr(best, "LARGEST", -1.0)
     whole = certify(around_corners)
-    assert 1 <= len(small) <= companion.ROUNDS
+    assert 1 <= len(small) <= best.ROUNDS
     assert max(small) < 0.15 * max(sizes)
     assert local.bound_h1 <= 1.005 * whole.bound_h1
     monkeypatch.setattr(companion, "PROMISE", np.inf)

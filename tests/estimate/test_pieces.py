@@ -17,10 +17,13 @@ from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
 from signorini_cr.data.moments import OnParts
 from signorini_cr.estimate import certificate, companion, cubic, flux, gap, lifting, shapes
+from signorini_cr.estimate.best import Promise, solved
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
+from signorini_cr.estimate.draft import Draft, Floors, _lowest
 from signorini_cr.estimate.flux import _carry, field_squares, unbalanced
 from signorini_cr.estimate.functional import Functional, Masses, Slopes
+from signorini_cr.estimate.heights import promise_of_vertices, sweep
 from signorini_cr.estimate.lifting import Cubic, Lift, lift
 from signorini_cr.estimate.nearest import nearest
 from signorini_cr.estimate.shapes import best_heights, quadrature
@@ -877,12 +880,12 @@ def test_energy_of_a_function_of_degree_two():
     np.add.at(falls, cells.facets, slopes.facets)
     traces = kappa * cells.trace(slice(0, cells.number))
     curvature = 4 / 3 * cells.over_facets(np.tile(traces, (3, 1)))
-    found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
+    found, promise = sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, whole)
     assert np.isclose(promise, np.sum(falls[free] ** 2 / curvature[free]))
     # In as many steps as there are heights it finds the least
     best = bumps.copy()
-    found, promise = companion._sweep(functional, excess, best, free, rim, 60)
+    found, promise = sweep(functional, excess, best, free, rim, 60)
     after = Slopes.of(functional, excess, best)
     assert np.isclose(found, after.energies.sum()) and promise < 1e-12
     assert np.abs(cells.over_facets(after.facets)[free]).max() < 1e-6
@@ -891,7 +894,7 @@ def test_energy_of_a_function_of_degree_two():
     loose = rng.uniform(size=cells.vertices.max() + 1) < 0.5
     falls = cells.over_vertices(slopes.vertices)
     curvature = cells.over_vertices(kappa * cells.squares(slice(0, cells.number)))
-    found = companion._promise(functional, excess, bumps, loose)
+    found = promise_of_vertices(functional, excess, bumps, loose)
     assert np.isclose(found, np.sum(falls[loose] ** 2 / curvature[loose]))
 
 
@@ -1091,10 +1094,10 @@ def test_energy_with_masses():
     bumps[~cells.exterior] = 0.0
     rim = tuple(cells.sides.values())
     functional = Functional(cells, None, kappa, None, masses)
-    found, promise = companion._sweep(functional, excess, bumps.copy(), free, rim, 0)
+    found, promise = sweep(functional, excess, bumps.copy(), free, rim, 0)
     assert np.isclose(found, energy(bumps)) and promise > 0.0
     best = bumps.copy()
-    found, promise = companion._sweep(functional, excess, best, free, rim, 80)
+    found, promise = sweep(functional, excess, best, free, rim, 80)
     assert np.isclose(found, energy(best)) and promise < 1e-12
     for facet in np.flatnonzero(free):
         for step in (1e-3, -1e-3):
@@ -1122,9 +1125,9 @@ def test_energy_with_masses():
     assert np.allclose(renewed.energies, slopes.energies)
     # what each vertex promises, and the best values of all
     loose = rng.uniform(size=cells.vertices.max() + 1) < 0.5
-    by_vertices, promise = cells.over_vertices(slopes.vertices), companion.Promise.of(functional)
+    by_vertices, promise = cells.over_vertices(slopes.vertices), Promise.of(functional)
     promised = np.sum(by_vertices[loose] ** 2 / promise.vertices[loose])
-    assert np.isclose(companion._promise(functional, excess, best, loose), promised)
+    assert np.isclose(promise_of_vertices(functional, excess, best, loose), promised)
     vertex = int(np.flatnonzero(loose)[0])
     step = (cells.vertices == vertex) * 1.0
     curvature = energy(best, excess + step) + energy(best, excess - step) - 2.0 * energy(best)
@@ -1202,7 +1205,7 @@ def test_bumps_that_touch_the_obstacle():
     rng = np.random.default_rng(13)
     obstacle, middle = rng.normal(size=(2, 50)), rng.normal(size=50)
     v = obstacle + rng.uniform(0, 1, size=(2, 50))
-    heights = companion._lowest(v, obstacle, middle)
+    heights = _lowest(v, obstacle, middle)
     s = np.linspace(0, 1, 20001)[:, None]
     bump = 4 * s * (1 - s)
     above = v[0] + s * (v[1] - v[0]) + bump * heights
@@ -1228,7 +1231,7 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
 
     Where it is not, what is raised in the last round is not made up for.
     """
-    monkeypatch.setattr(companion.Cusps, "of", lambda *_: None)
+    monkeypatch.setattr(Cusps, "of", lambda *_: None)
     domain = square(4, comm=MPI.COMM_SELF)
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
     rng = np.random.default_rng(14)
@@ -1243,10 +1246,10 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     alpha = np.full((2, len(contact.cells)), height), np.full(len(contact.cells), height)
     signs = np.ones(len(contact.cells))
     limits = ((1, cells.largest_at_vertices(contact.ends, alpha[0])),)
-    floors = companion.Floors(contact, signs, *alpha, limits, signs < 0.0, len(cells.exterior))
-    start = companion.Draft(np.zeros(len(rim)), np.zeros(len(free)), loose, free)
+    floors = Floors(contact, signs, *alpha, limits, signs < 0.0, len(cells.exterior))
+    start = Draft(np.zeros(len(rim)), np.zeros(len(free)), loose, free)
     functional = of_gradients(cells, kappa, w)
-    v, bumps, found = companion._solved(functional, start, floors)
+    v, bumps, found = solved(functional, start, floors)
     assert found is None
     after = Slopes.of(functional, v[cells.vertices] - w, bumps)
     before = Slopes.of(functional, -w, start.bumps)
@@ -1257,7 +1260,7 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     limit = (1e-6 if height < 0 else 0.05) * np.abs(before.vertices).max()
     assert np.abs(pulls[0][inside]).max() < limit
     assert np.abs(pulls[1][~cells.exterior]).max() < limit
-    lowest = companion._lowest(v[contact.ends], *alpha)
+    lowest = _lowest(v[contact.ends], *alpha)
     assert np.all(bumps[contact.dofs] >= lowest - 1e-12)
     held = bumps[contact.dofs] <= lowest + 1e-12
     assert held.any() == (height == 0.0)
@@ -1392,5 +1395,5 @@ def test_no_round_leaves_v_below_the_obstacle():
     data = diffusion(solution.level.data)
     alpha = data.alpha[0].seen_from(data.cells)
     side = alpha.side(data.cells)
-    lowest = companion._lowest(made.vertices[side.ends], alpha.ends, alpha.middle)
+    lowest = _lowest(made.vertices[side.ends], alpha.ends, alpha.middle)
     assert np.all(made.bumps[side.dofs] >= lowest - 1e-12)

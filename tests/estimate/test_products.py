@@ -19,8 +19,9 @@ from signorini_cr.data.pieces import Pieces
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
-from signorini_cr.estimate.companion import Companion, Floors, _at_vertices
+from signorini_cr.estimate.companion import Companion, _at_vertices
 from signorini_cr.estimate.curl import _pull
+from signorini_cr.estimate.draft import Floors
 from signorini_cr.estimate.functional import Functional, Masses
 from signorini_cr.estimate.lifting import Lift, affine, gaps
 from signorini_cr.estimate.sums import Sums, Totals

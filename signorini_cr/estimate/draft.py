@@ -1,0 +1,99 @@
+"""v on the way to the companion, and what its bounds ask of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import BoolArray, FloatArray
+from ..data.moments import OnParts
+from ..fem.cells import BoundaryFacets, Cells
+from .functional import Masses
+
+
+@dataclass(eq=False)
+class Draft:
+    """v on the way.
+
+    Attributes:
+        vertices: v at the vertices, ghosts included.
+        bumps: Heights of v's bumps by facet dof, ghosts included.
+        loose: Which values at vertices may be changed.
+        free: Which heights may be changed.
+    """
+
+    vertices: FloatArray
+    bumps: FloatArray
+    loose: BoolArray
+    free: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Floors:
+    """What the bounds ask of v: s v is not below the quadratic through three values on each facet.
+
+    Attributes:
+        side: The facets of Γ1, once for each bound.
+        signs: s, shape (n,).
+        ends: The bounds at their ends, shape (d, n).
+        middle: At their midpoints, shape (n,).
+        at_vertices: The values of s, and for each the largest bound at each vertex, −∞ for none:
+            where parts with obstacles of their own meet, the higher one counts.
+        strong: Where v is drawn to t/b, as near to u as α is: there s v is not below α at the
+            middle, either, and no more is asked for, shape (n,).
+        facets: Number of facets.
+    """
+
+    side: BoundaryFacets
+    signs: FloatArray
+    ends: FloatArray
+    middle: FloatArray
+    at_vertices: tuple[tuple[int, FloatArray], ...]
+    strong: BoolArray
+    facets: int
+
+    @classmethod
+    def of(cls, cells: Cells, bounds: OnParts, masses: Masses) -> Floors:
+        """Collect them; collective."""
+        side, signs, ends = bounds.side, bounds.signs, bounds.ends
+        limits = []
+        for sign in sorted({each.sign for each in bounds.parts}, reverse=True):
+            here = signs == sign
+            limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
+        strong = np.zeros(len(cells.exterior), dtype=bool)
+        strong[masses.side.dofs] = masses.strong
+        # to a bound that is a number no lifting brings v
+        curved = [np.full(len(p.middle), p.trace.constant is None) for p in bounds.parts]
+        strong = strong[side.dofs] & np.concatenate([np.empty(0, dtype=bool), *curved])
+        return cls(side, signs, ends, bounds.middle, tuple(limits), strong, len(cells.exterior))
+
+    def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The least and the largest heights of bumps that they allow for, by facet dof.
+
+        Args:
+            v: v at the vertices, within the bounds.
+        """
+        above = self.signs * v[self.side.ends]
+        least = np.where(
+            self.strong,
+            self.middle - above.mean(axis=0),
+            _lowest(above, self.ends, self.middle),
+        )
+        low, high = np.full(self.facets, -np.inf), np.full(self.facets, np.inf)
+        up = self.signs > 0.0
+        low[self.side.dofs[up]] = least[up]
+        high[self.side.dofs[~up]] = -least[~up]
+        return low, high
+
+
+def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArray:
+    """Least heights of the bumps with which v stays above the quadratic through α's three values.
+
+    Args:
+        v: At the facets' ends, not below α, shape (2, n).
+        obstacle: α there.
+        middle: α at the midpoints, shape (n,).
+    """
+    room: FloatArray = np.sqrt(np.maximum(v - obstacle, 0.0)).sum(axis=0) ** 2 / 4
+    return middle - obstacle.mean(axis=0) - room

@@ -1,0 +1,198 @@
+"""Steps that improve the heights of v's bumps, and what more would be gained; d = 2."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import BoolArray, FloatArray, IndexArray
+from ..fem.cells import BoundaryFacets, blocks, dot_rows, pick, sum_rows
+from .descent import descend, nonzero
+from .functional import Functional
+
+
+def sweep(
+    functional: Functional,
+    excess: FloatArray,
+    bumps: FloatArray,
+    free: BoolArray,
+    bumped: tuple[BoundaryFacets, ...],
+    steps: int,
+) -> tuple[float, float]:
+    """Make E smaller by conjugate gradients in the heights of the bumps; collective.
+
+    Args:
+        functional: E.
+        excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
+        bumps: Heights, improved in place.
+        free: Which of them may be.
+        bumped: The facets on which there are some to begin with.
+        steps: How many steps.
+
+    Returns:
+        E, and what it would fall by if each height were put right as if it were alone.
+    """
+    cells, held = functional.cells, np.flatnonzero(~free)
+    matrix = _OfHeights(functional)
+    energy, local = matrix.without_bumps(excess)
+    energy += matrix.with_bumps(bumps, bumped, local)
+
+    def assembled(local: FloatArray) -> FloatArray:
+        out = cells.over_facets(local)
+        out[held] = 0.0
+        return out
+
+    def image(way: FloatArray) -> FloatArray:
+        matrix.multiply(way, local)
+        return assembled(local)
+
+    down = assembled(local)
+    fall, square = descend(cells, image, bumps, down, matrix.diagonal(), steps)
+    return float(cells.total(energy)[0] - 4 / 3 * fall), float(4 / 3 * square)
+
+
+class _OfHeights:
+    """E as a quadratic functional of the heights of bumps, in units of 4/3.
+
+    On a cell its matrix is 2κ|T| ∇λ_i·∇λ_j outside the diagonal and κ|T| Σ|∇λ_k|² on it, and to
+    each entry c|T|/15 is added, on the diagonal twice.
+
+    Attributes:
+        functional: E.
+        own: κ|T| Σ|∇λ_k|² + c|T|/15, shape (cells,).
+        lost: What b adds to the diagonal, by facet dof.
+        at: Local numbers and cells of the facets with a b.
+    """
+
+    def __init__(self, functional: Functional):
+        """Take what is on the diagonal."""
+        cells, masses = functional.cells, functional.masses
+        self.functional, self.own = functional, np.empty(cells.number)
+        self.lost = np.zeros(len(cells.exterior))
+        self.lost[masses.side.dofs] = 0.4 * masses.loss
+        self.at = masses.side.local, masses.side.cells
+        self._reacts = masses.reacts
+        for part in blocks(cells.number):
+            self.own[part] = pick(functional.kappa, part) * cells.trace(part)
+            if self._reacts:
+                self.own[part] += masses.on_cells(cells, part) / 15.0
+
+    def without_bumps(self, excess: FloatArray) -> tuple[float, FloatArray]:
+        """Return E for no bumps, this rank's share, and −½ its slope on each cell.
+
+        Args:
+            excess: v − u_h at the cells' vertices, shape (3, cells).
+        """
+        cells, kappa, masses = self.functional.cells, self.functional.kappa, self.functional.masses
+        slope, energy = np.empty_like(excess), 0.0
+        for part in blocks(cells.number):
+            k = pick(kappa, part)
+            np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
+            energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
+            if self._reacts:
+                mass = masses.on_cells(cells, part)
+                energy += float(np.sum(mass * distance(excess[:, part], None)))
+                slope[:, part] += masses.pull(cells, excess[:, part], part)
+        first, last, height = masses.toward
+        ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
+        energy += float(np.sum(masses.loss * distance(ends, None)))
+        energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
+        np.add.at(slope, self.at, masses.pull_on_facets(excess, cells.others))
+        return energy, slope
+
+    def with_bumps(
+        self, bumps: FloatArray, bumped: tuple[BoundaryFacets, ...], slope: FloatArray
+    ) -> float:
+        """Return what E changes by with some bumps, this rank's share.
+
+        Args:
+            bumps: Heights by facet dof.
+            bumped: The facets on which there are some.
+            slope: −½ E's slope on each cell, shape (3, cells), changed in place.
+        """
+        cells, side = self.functional.cells, self.functional.masses.side
+        near = np.unique(np.concatenate([each.cells for each in (*bumped, side)]))
+        flow, height = slope[:, near], bumps[cells.facets[:, near]]
+        change = self._times(height, near, np.empty_like(height))
+        slope[:, near] = flow - change
+        energy = -4 / 3 * float(np.sum(dot_rows(height, 2.0 * flow - change)))
+        lost, height = self.lost[side.dofs], bumps[side.dofs]
+        np.subtract.at(slope, self.at, lost * height)
+        return energy + 4 / 3 * float(np.sum(lost * height**2))
+
+    def multiply(self, heights: FloatArray, out: FloatArray) -> None:
+        """Put the cells' matrices times heights by facet dof into an array, shape (3, cells)."""
+        cells, side = self.functional.cells, self.functional.masses.side
+        for part in blocks(cells.number):
+            self._times(heights[cells.facets[:, part]], part, out[:, part])
+        np.add.at(out, self.at, self.lost[side.dofs] * heights[side.dofs])
+
+    def _times(self, height: FloatArray, part: slice | IndexArray, out: FloatArray) -> FloatArray:
+        """Put the matrices, but for b, times heights of local bumps into an array."""
+        cells, own = self.functional.cells, self.own[part]
+        twice, stiffness = 2.0 * pick(self.functional.kappa, part), cells.stiffness[:, part]
+        for i, (j, k) in enumerate(cells.others):
+            row = np.multiply(stiffness[i + j - 1], height[j], out=out[i])
+            row += stiffness[i + k - 1] * height[k]
+            row *= twice
+            row += own * height[i]
+        if self._reacts:
+            mass = self.functional.masses.on_cells(cells, part)
+            out += mass / 15.0 * sum_rows(height)
+        return out
+
+    def diagonal(self) -> FloatArray:
+        """The diagonal by facet dof; collective."""
+        cells = self.functional.cells
+        local = np.tile(self.own, (3, 1))
+        if self._reacts:
+            local += self.functional.masses.on_cells(cells, slice(0, cells.number)) / 15.0
+        np.add.at(local, self.at, self.lost[self.functional.masses.side.dofs])
+        return nonzero(cells.over_facets(local))
+
+
+def promise_of_vertices(
+    functional: Functional, excess: FloatArray, bumps: FloatArray, loose: BoolArray
+) -> float:
+    """Return what E would fall by if each vertex were put right alone.
+
+    Args:
+        functional: E.
+        excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
+        bumps: Their heights.
+        loose: Which values at vertices may be changed.
+    """
+    cells, kappa, masses = functional.cells, functional.kappa, functional.masses
+    slope, diagonal = np.empty_like(excess), np.empty_like(excess)
+    for part in blocks(cells.number):
+        k, height = pick(kappa, part), bumps[cells.facets[:, part]]
+        if masses.reacts:
+            fall, _ = masses.fall(cells, excess[:, part], height, part)
+        height *= -4 / 3
+        height += excess[:, part]
+        np.multiply(k, cells.apply(height, part), out=slope[:, part])
+        np.multiply(k, cells.squares(part), out=diagonal[:, part])
+        if masses.reacts:
+            slope[:, part] -= fall
+            diagonal[:, part] += masses.on_cells(cells, part) / 6.0
+    ends = cells.others[masses.side.local].T, masses.side.cells
+    np.subtract.at(slope, ends, masses.fall_on_facets(cells, excess, bumps, slice(None))[0])
+    np.add.at(diagonal, ends, masses.loss / 3.0)
+    owned = slice(cells.owned_vertices())
+    down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
+    return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
+
+
+def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
+    """Means of (v − u_h)² over simplices of one, two or three dimensions, shape (n,).
+
+    Args:
+        c: v − u_h at the vertices, shape (k, n).
+        height: Heights of v's bumps on triangles, shape (3, n), if there are any.
+    """
+    k, total = len(c), sum_rows(c)
+    out = (total**2 + dot_rows(c, c)) / (k * (k + 1))
+    if height is not None:
+        whole = sum_rows(height)
+        out += (4.0 * total * whole - 2.0 * dot_rows(c, height)) / 15.0
+        out += 4.0 * (whole**2 + dot_rows(height, height)) / 45.0
+    return np.asarray(out)
