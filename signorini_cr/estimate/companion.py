@@ -28,7 +28,7 @@ from .draft import Draft, Floors
 from .flux import Flux
 from .functional import Functional, Masses
 from .heights import promise_of_vertices, sweep
-from .lifting import Cubic, Lift, affine, joined, lift
+from .lifting import Cubic, Lift, affine, cheaper, joined, lift
 from .shapes import bump_slopes, local_thirds, third_slopes
 
 Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
@@ -361,5 +361,9 @@ def _lift(
         loss = boundary.masses.largest(cells, side)
     if obstacle and len(data.condition.bounds) == 1 and loss == 0.0:
         base = Cubic(ends, middle - ends.mean(axis=0), third)
-    ratio = loss / boundary.highest
-    return lift(cells, side, trace, base, companion, boundary.scale, boundary.goal, obstacle, ratio)
+    more = boundary.scale, boundary.goal, obstacle, loss / boundary.highest
+    found = lift(cells, side, trace, base, companion, *more)
+    if base is None or not cells.total(float(np.sum(found.steep**2)))[0] > boundary.goal**2:
+        return found
+    # α may be far above its interpolant, where it has a kink, and v above α
+    return cheaper(found, lift(cells, side, trace, None, companion, *more))

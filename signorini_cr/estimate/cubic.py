@@ -21,6 +21,9 @@ from .flux import Flux
 from .lifting import Cubic
 from .shapes import best_heights, local_thirds, quadrature, third_slopes
 
+TOUCHING = 1e-12
+"""How far v is from α in the middle of a facet where it is meant to be α, in parts of the data."""
+
 
 def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companion:
     """Give v cubic functions; collective.
@@ -40,6 +43,8 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         near = apart < distance[side.dofs]
         distance[side.dofs[near]] = apart[near]
         own = data.sign * cells.ways_between(*side.ends) * _of_data(data)
+        if data.condition.fixed is None:  # v need not follow α where it is above it
+            own = np.where(apart <= TOUCHING * boundary.scale, own, 0.0)
         thirds[side.dofs[near]] = own[near]
     cells.share(thirds)
     thirds += _fitted(cells, kappa, replace(v, thirds=thirds))

@@ -97,8 +97,10 @@ def left_by(dual: Made, made: Made) -> float:
 
 
 def in_p1(dual: Certificate, cells: Cells) -> Made | None:
-    """What a dual's certificate is made of, if its companion is in P1; collective."""
+    """What a dual's certificate is made of, if v is in P1 and y·n a number a facet; collective."""
     made = dual._made
-    if made is None or dual.bound_companion is None or made.thirds is not None:
+    if made is None or dual.bound_companion is None:
+        return None
+    if made.thirds is not None or made.beyond is not None:
         return None
     return None if cells.total(float(np.abs(made.bumps).sum()))[0] > 0.0 else made

@@ -372,6 +372,32 @@ def test_sheared_cells_with_masses(n, loss, reaction):
     assert 1.0 <= effectivity(solution, gradient, more=more) <= 1.3
 
 
+@pytest.mark.parametrize("n", [8, 64])
+@pytest.mark.parametrize("flat", [1.0, 50.0])
+def test_obstacle_with_a_kink_where_contact_ends(n, flat):
+    """u = y² − y/2 + x/100; in the kink's facet α is far above its own quadratic, and v above α."""
+
+    def gradient(x, _):
+        return np.stack([0.0 * x[:, 0] + 0.01, 2.0 * x[:, 1] - 0.5], axis=1)
+
+    def u(x):
+        return x[1] ** 2 - 0.5 * x[1] + 0.01 * x[0]
+
+    kink = 0.5483
+    conditions = {
+        "below": Contact(
+            lambda x: u(x) - 0.3 * ufl.max_value(x[0] - kink, 0.0),
+            g=lambda x: 0.5 - ufl.max_value(kink - x[0], 0.0),
+        ),
+        "rest": Dirichlet(u),
+    }
+    squashed = lambda x, y: (x, y / flat)  # noqa: E731
+    domain = rectangle((0, 0), (1, 1), n, n, below, squashed, below=1, rest=2)
+    solution = solve(Problem(f=-2.0, conditions=conditions), domain)
+    assert 0.1 < solution.contact.length < 0.9
+    assert 1.0 <= effectivity(solution, gradient) <= (1.1 if flat == 1.0 else 1.4)
+
+
 @pytest.mark.parametrize("c", [0.0, 1.0, 1e4, 1e8])
 @pytest.mark.parametrize("b", [0.0, 1e-3, 1.0, 1e3, 1e8])
 @pytest.mark.parametrize("move", [_sheared, lambda x, y: (50 * x, y)], ids=["sheared", "flat"])
