@@ -26,6 +26,7 @@ from signorini_cr.estimate.functional import Functional, Masses, Slopes
 from signorini_cr.estimate.heights import promise_of_vertices, sweep
 from signorini_cr.estimate.lifting import Cubic, Lift, lift
 from signorini_cr.estimate.nearest import nearest
+from signorini_cr.estimate.settled import in_p1
 from signorini_cr.estimate.shapes import best_heights, quadrature
 from signorini_cr.estimate.sums import Sums
 from signorini_cr.fem.cells import Cells, corner_points
@@ -1362,6 +1363,33 @@ def test_size_of_the_field_that_carries_a_quadratic_flux():
                 load = [length * (gauss / 2) @ (flux * s**p) * (q == 0) for p, q in powers]
                 least = np.sqrt(load @ np.linalg.lstsq(matrix, load, rcond=1e-11)[0])
                 assert least <= bound * (1 + 1e-9) and bound <= 1.5 * least
+
+
+@pytest.mark.serial
+def test_the_cheaper_lifting_counts_facet_by_facet():
+    """With all that belongs to it; and one that is none counts nowhere."""
+    steep = np.array([1.0, 2.0, 0.0]), np.array([2.0, 1.0, 0.0])
+    one, other = (Lift(a, a + 10, a + 20, a - 30, a + 40) for a in steep)
+    found = lifting.cheaper(one, other)
+    for row, shift in (("steep", 0), ("area", 10), ("beyond", 20), ("least", -30), ("edge", 40)):
+        assert np.array_equal(getattr(found, row), np.array([1.0, 1.0, 0.0]) + shift)
+    none = Lift.none(np.zeros(3), "rough")
+    assert lifting.cheaper(one, none) is one and lifting.cheaper(none, other) is other
+    assert lifting.cheaper(none, none).reason == "rough"
+
+
+@pytest.mark.serial
+def test_duals_that_may_correct_forces():
+    """In P1, and with a flux that is constant on facets."""
+    cells, *_ = some_cells(3)
+    made = SimpleNamespace(thirds=None, beyond=None, bumps=np.zeros(len(cells.exterior)))
+    dual = SimpleNamespace(_made=made, bound_companion=1.0)
+    assert in_p1(dual, cells) is made
+    for name, value in (("thirds", 1), ("beyond", 1), ("bumps", made.bumps + 1.0)):
+        changed = SimpleNamespace(**{**vars(made), name: value})
+        assert in_p1(SimpleNamespace(_made=changed, bound_companion=1.0), cells) is None
+    assert in_p1(SimpleNamespace(_made=None, bound_companion=1.0), cells) is None
+    assert in_p1(SimpleNamespace(_made=made, bound_companion=None), cells) is None
 
 
 @pytest.mark.serial
