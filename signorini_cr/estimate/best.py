@@ -68,7 +68,7 @@ def solved(
 
 def _best(
     functional: Functional, draft: Draft, floors: Floors, promise: Promise, layers: int | None
-) -> tuple[tuple[FloatArray, FloatArray, Cusps | None], float, float]:
+) -> tuple[tuple[FloatArray, FloatArray, Cusps | None], float, bool]:
     """Solve for v in rounds, each for the values that promise most, and those around; collective.
 
     Args:
@@ -79,7 +79,7 @@ def _best(
         layers: How many layers of cells around them; None for all of the mesh.
 
     Returns:
-        As `solved`, E, and whether v is settled.
+        As `solved`, E, and whether v is settled, as far as more of the mesh would make it so.
     """
     cells, kappa, bounded = functional.cells, functional.kappa, floors.side.dofs
     v, bumps, loose, free = draft.vertices, draft.bumps, draft.loose, draft.free
@@ -92,9 +92,11 @@ def _best(
         cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
         cusps = _fitted(functional, cusps, excess, bumps, slopes)
     best, least = (v, bumps, cusps), cells.total(np.sum(slopes.energies))[0]
+    local = falling = False
     for turn in range(ROUNDS):
         if turn > 0:
             near = promise.near(slopes, loose, free, layers)
+        local |= near is not None
         some, heights, at = near or (loose, free, slice(None))
         step = nearest(cells, kappa, slopes, some, heights, functional.masses)
         v, bumps, free = v + step[0], bumps + step[1], free.copy()
@@ -122,8 +124,8 @@ def _best(
             best, least = (v, bumps, cusps), energy
         if settled and changes == 0.0 and cusps is None:
             break
-    little = promise.total(slopes, loose, free) <= LEFT * least
-    return best, least, little and not falling
+    settled = not falling and promise.total(slopes, loose, free) <= LEFT * least
+    return best, least, settled or not local
 
 
 def _fitted(
