@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
 from ..data.moments import OnFacets, OnParts
-from ..fem.cells import BoundaryFacets, Cells, measures
+from ..fem.cells import THIN, BoundaryFacets, Cells, measures
 from ..fem.conditions import number
 from .best import solved
 from .cusps import Cusps
@@ -282,17 +283,20 @@ def _at_vertices(
         v /= np.maximum(collect(flat, None), 1.0)
     at_bound, loss = flux.touching.copy(), np.zeros(floors.facets)
     loss[masses.side.dofs] = masses.loss
+    of_thin = _of_thin_cells(functional)
     for sign, limit in floors.at_vertices:
         here = flux.touching & (floors.signs == sign)
         there = floors.side.ends[:, here]
         held = collect(there.ravel(), None) > 0
-        if masses.some:
-            # what leaving t/b for α costs in ‖p − b‖², and what not doing so costs in 4C
-            of_b, of_force = (
+        if masses.some or of_thin is not None:
+            # what leaving t/b and u_h for α costs in ‖p − b‖², and what not doing so costs in 4C
+            costs, of_force = (
                 collect(there.ravel(), np.tile(each[here], len(there)))
                 for each in (loss[floors.side.dofs], 2.0 * (cells.tdim + 1) * flux.contact)
             )
-            held &= of_b * np.where(held, sign * v - limit, 0.0) <= of_force
+            if of_thin is not None:
+                costs += of_thin
+            held &= costs * np.where(held, sign * v - limit, 0.0) <= of_force
         at_bound[here] = held[there].all(axis=0)
         moved = np.where(held, limit, np.maximum(sign * v, limit))
         np.copyto(v, sign * moved, where=limit > -np.inf)
@@ -300,6 +304,19 @@ def _at_vertices(
     count = collect(ends, None)
     np.copyto(v, collect(ends, u_D.ends.ravel()) / np.maximum(count, 1.0), where=count > 0)
     return v, at_bound
+
+
+def _of_thin_cells(functional: Functional) -> FloatArray | None:
+    """(d + 1) Σ κ|T||∇λ_i|² at vertices of thin cells, where v may be dear to move; or None.
+
+    On others what u_h has at the vertices of facets in contact is near α.
+    """
+    cells = functional.cells
+    thin = cells.diameter2 > THIN * cells.volume
+    if cells.tdim != 2 or not cells.comm.allreduce(bool(thin.any()), op=MPI.LOR):
+        return None
+    squares = np.where(thin, functional.kappa, 0.0) * cells.squares(slice(0, cells.number))
+    return (cells.tdim + 1) * cells.over_vertices(squares)
 
 
 def bend_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:

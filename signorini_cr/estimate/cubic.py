@@ -45,6 +45,8 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         own = data.sign * cells.ways_between(*side.ends) * _of_data(data)
         if data.condition.fixed is None:  # v need not follow α where it is above it
             own = np.where(apart <= TOUCHING * boundary.scale, own, 0.0)
+        if len(data.condition.bounds) > 1:  # following one bound v might pass the other
+            own = np.zeros_like(own)
         thirds[side.dofs[near]] = own[near]
     cells.share(thirds)
     thirds += _fitted(cells, kappa, replace(v, thirds=thirds))

@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..data.loads import NOTHING, Segments, VolumeMoments
 from ..data.moments import Coefficient
-from ..fem.cells import Cells, blocks, measures, pick
+from ..fem.cells import THIN, Cells, blocks, measures, pick
 from .beyond import Beyond
 from .companion import Companion
 from .flux import Flux, field_squares
@@ -24,10 +24,6 @@ from .gap import taken_up
 from .nearest import nearest
 from .shapes import quadrature
 from .sums import Sums
-
-THIN = 25.0
-"""h_T²/|T| of cells from which on they are thin: 2.3 if all sides are equal, 4 for half a square,
-20 for half a rectangle 1 : 10."""
 
 HELD = 0.1
 """Part of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖² that ‖p‖² on thin cells must make up."""

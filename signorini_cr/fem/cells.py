@@ -106,6 +106,10 @@ class BoundaryFacets:
 
 Layers = list[tuple[IndexArray, BoolArray]]
 
+THIN = 25.0
+"""h_T²/|T| of cells from which on they are thin: 2.3 if all sides are equal, 4 for half a square,
+20 for half a rectangle 1 : 10."""
+
 
 class Cells:
     """What the certificate needs to know of a mesh.
