@@ -401,7 +401,7 @@ def test_obstacle_with_a_kink_where_contact_ends(n, flat):
 @pytest.mark.parametrize("n", [8, 32])
 @pytest.mark.parametrize("power", [1, 2])
 def test_contact_where_there_is_none_on_sheared_cells(n, power):
-    """u_h is in contact on all facets, u on half of them; v = u is a quadratic within the bounds."""
+    """u_h is in contact on all facets, u on half of them; v = u is a quadratic and admissible."""
 
     def gradient(x, _):
         return np.stack([0.0 * x[:, 0] - 0.01, 0.5 - 2.0 * x[:, 1]], axis=1)
@@ -575,6 +575,34 @@ def test_companion_is_admissible_where_it_is_solved_for():
     ds = ufl.Measure("ds", mesh, subdomain_data=solution.domain.tags)
     wrong = fem.form(ufl.max_value(-v, 0.0) * ds(CONTACT) + v**2 * ds(DIRICHLET))
     assert WORLD.allreduce(fem.assemble_scalar(wrong)) < 1e-12
+
+
+def test_companion_is_within_both_bounds_on_thin_cells():
+    """v that follows a curved α by cubics may not pass a β that is a number."""
+
+    def alpha(x):
+        s = 16 * (x[0] - 0.5)
+        return 0.1 * ufl.max_value(s - 0.5, 0.0) - 0.25 * ufl.max_value(s - 0.4, 0.0)
+
+    def parts(x, y):
+        return np.where(y < 1e-9, 1, np.where(y > 1 - 1e-9, 2, 3))
+
+    names = {"below": 1, "above": 2, "beside": 3}
+    flat = lambda x, y: (x, y / 50)  # noqa: E731
+    domain = rectangle((0, 0), (1, 1), 16, 16, parts, flat, **names)
+    conditions = {
+        "below": Contact(alpha, upper=0.0),
+        "above": Dirichlet(lambda x: ufl.sin(3 * x[0]) - 5.0),
+        "beside": Neumann(0.0),
+    }
+    f = lambda x: -2.0 - 5e4 * x[1] * ufl.sin(9 * x[0])  # noqa: E731
+    solution = solve(Problem(f=f, conditions=conditions), domain)
+    v = certify(solution).companion
+    assert v.function_space.element.basix_element.degree == 3  # thin cells get more
+    x = ufl.SpatialCoordinate(domain.mesh)
+    below = ufl.conditional(ufl.lt(x[1], 1e-9), 1.0, 0.0)
+    passed = below * ufl.max_value(v, 0.0) * ufl.ds(domain=domain.mesh, degree=40)
+    assert WORLD.allreduce(fem.assemble_scalar(fem.form(passed))) < 1e-10
 
 
 # ---- singular points, and what is left alone
