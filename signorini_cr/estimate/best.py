@@ -124,8 +124,9 @@ def _best(
             best, least = (v, bumps, cusps), energy
         if settled and changes == 0.0 and cusps is None:
             break
-    settled = not falling and promise.total(slopes, loose, free) <= LEFT * least
-    return best, least, settled or not local
+    if not local:
+        return best, least, True
+    return best, least, not falling and promise.total(slopes, loose, free) <= LEFT * least
 
 
 def _fitted(

@@ -35,7 +35,6 @@ from .shapes import bump_slopes, local_thirds, third_slopes
 Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
 
 JUMP = "u_D jumps where boundary facets meet: no function of finite energy has such values"
-
 BELOW = "u_D is below α where Γ0 meets Γ1: no function satisfies both"
 
 PROMISE = 0.04
@@ -45,7 +44,6 @@ A sweep leaves 0.005 to 0.03 on ordinary meshes with a smooth coefficient, also 
 point; 0.05 on fine meshes where there are several, 0.07 where the coefficient is a checkerboard,
 and 0.2 and more on thin cells.
 """
-
 
 SHARED = 0.03
 """What it costs to move v at a vertex of thin cells, in parts of Σ κ|T||∇λ_i|², which it would cost
@@ -317,8 +315,10 @@ def _of_thin_cells(functional: Functional) -> FloatArray | None:
     On others what u_h has at the vertices of facets in contact is near α.
     """
     cells = functional.cells
+    if cells.tdim != 2:
+        return None
     thin = cells.diameter2 > THIN * cells.volume
-    if cells.tdim != 2 or not cells.comm.allreduce(bool(thin.any()), op=MPI.LOR):
+    if not cells.comm.allreduce(bool(thin.any()), op=MPI.LOR):
         return None
     squares = np.where(thin, functional.kappa, 0.0) * cells.squares(slice(0, cells.number))
     return (cells.tdim + 1) * SHARED * cells.over_vertices(squares)

@@ -35,19 +35,16 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         v: Without cusps.
     """
     boundary, thirds = v.boundary, np.zeros(len(cells.exterior))
-    distance = np.full(len(thirds), np.inf)  # of two bounds the nearer one is that which counts
     for data in (*boundary.u_D.parts, *boundary.alpha.parts):
+        if len(data.condition.bounds) > 1:  # following one bound v might pass the other
+            continue
         side = data.side(cells)
-        middle = v.vertices[side.ends].mean(axis=0) + v.bumps[side.dofs]
-        apart = np.abs(data.sign * middle - data.middle)
-        near = apart < distance[side.dofs]
-        distance[side.dofs[near]] = apart[near]
         own = data.sign * cells.ways_between(*side.ends) * _of_data(data)
         if data.condition.fixed is None:  # v need not follow α where it is above it
+            middle = v.vertices[side.ends].mean(axis=0) + v.bumps[side.dofs]
+            apart = np.abs(data.sign * middle - data.middle)
             own = np.where(apart <= TOUCHING * boundary.scale, own, 0.0)
-        if len(data.condition.bounds) > 1:  # following one bound v might pass the other
-            own = np.zeros_like(own)
-        thirds[side.dofs[near]] = own[near]
+        thirds[side.dofs] = own
     cells.share(thirds)
     thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
     contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)

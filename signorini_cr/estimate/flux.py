@@ -491,8 +491,9 @@ def _carried(
     found, layers = norm(fluxes), cells.layers
     if found > WORTH * size and cells.sinks:  # a b that is small is a dear way out
         fluxes, all_reached = _carry(cells, left, cells.layers_from_fixed)
-        if all_reached and norm(fluxes) < found:
-            found, layers = norm(fluxes), cells.layers_from_fixed
+        other = norm(fluxes)
+        if all_reached and other < found:
+            found, layers = other, cells.layers_from_fixed
     if found > WORTH * size:
         fluxes = _diffused(cells, left, kappa_min)
         rest, _ = _carry(cells, left + sum_rows(fluxes), layers)

@@ -51,15 +51,6 @@ class Masses:
         found = (self.loss / measures(cells, self.side))[here].max(initial=0.0)
         return max(cells.comm.allgather(float(found)))
 
-    def pull(self, cells: Cells, excess: FloatArray, part: slice) -> FloatArray:
-        """Return what c pulls heights of bumps by, in units of 8/3, shape (3, n)."""
-        return self.on_cells(cells, part) / 20.0 * (excess - 2.0 * sum_rows(excess))
-
-    def pull_on_facets(self, excess: FloatArray, others: IndexArray) -> FloatArray:
-        """Return the same of b, on its facets."""
-        ends = excess[others[self.side.local].T, self.side.cells] - self.toward[:2]
-        return self.loss * (0.4 * self.toward[2] - 0.25 * ends.sum(axis=0))
-
     def fall(
         self, cells: Cells, excess: FloatArray, height: FloatArray, part: slice | IndexArray
     ) -> tuple[FloatArray, FloatArray]:

@@ -89,15 +89,14 @@ class _OfHeights:
             np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
             energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
             if self._reacts:
-                mass = masses.on_cells(cells, part)
-                energy += float(np.sum(mass * distance(excess[:, part], None)))
-                slope[:, part] += masses.pull(cells, excess[:, part], part)
-        first, last, height = masses.toward
-        ends = excess[cells.others[masses.side.local].T, masses.side.cells] - (first, last)
-        energy += float(np.sum(masses.loss * distance(ends, None)))
-        energy += float(masses.loss @ (8 / 15 * height**2 - 2 / 3 * height * ends.sum(axis=0)))
-        np.add.at(slope, self.at, masses.pull_on_facets(excess, cells.others))
-        return energy, slope
+                flat = np.zeros_like(excess[:, part])
+                at_vertices, at_facets = masses.fall(cells, excess[:, part], flat, part)
+                energy -= float(np.sum(dot_rows(excess[:, part], at_vertices)))
+                slope[:, part] += 0.75 * at_facets
+        none = np.zeros(len(cells.exterior))
+        _, at_middle, of_facets = masses.fall_on_facets(cells, excess, none, slice(None))
+        np.add.at(slope, self.at, 0.75 * at_middle)
+        return energy + float(np.sum(of_facets)), slope
 
     def with_bumps(
         self, bumps: FloatArray, bumped: tuple[BoundaryFacets, ...], slope: FloatArray
