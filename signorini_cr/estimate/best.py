@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..fem.cells import Cells, blocks, pick, sum_rows
+from ..fem.cells import Cells
 from .cusps import Cusps
-from .descent import nonzero
 from .draft import Draft, Floors
 from .functional import Functional, Slopes
+from .heights import curvatures
 from .nearest import LARGEST, nearest
 
 FOREMOST = 0.9
@@ -172,19 +172,7 @@ class Promise:
     @classmethod
     def of(cls, functional: Functional) -> Promise:
         """Make it; collective."""
-        cells, masses = functional.cells, functional.masses
-        squares = np.empty((3, cells.number))
-        for part in blocks(cells.number):
-            squares[:, part] = pick(functional.kappa, part) * cells.squares(part)
-        traces = np.tile(4 / 3 * sum_rows(squares), (3, 1))
-        if masses.reacts:
-            mass = masses.on_cells(cells, slice(0, cells.number))
-            squares += mass / 6.0
-            traces += 8.0 / 45.0 * mass
-        side = masses.side
-        np.add.at(squares, (cells.others[side.local].T, side.cells), masses.loss / 3.0)
-        np.add.at(traces, (side.local, side.cells), 8.0 / 15.0 * masses.loss)
-        return cls(cells, nonzero(cells.over_vertices(squares)), nonzero(cells.over_facets(traces)))
+        return cls(functional.cells, *curvatures(functional))
 
     def of_values(
         self, slopes: Slopes, loose: BoolArray, free: BoolArray

@@ -149,6 +149,28 @@ class _OfHeights:
         return nonzero(cells.over_facets(local))
 
 
+def curvatures(functional: Functional) -> tuple[FloatArray, FloatArray]:
+    """Return ½ ∂²E by single values at vertices and by single heights, ghosts included; collective.
+
+    Args:
+        functional: E.
+    """
+    return _of_vertices(functional), 4 / 3 * _OfHeights(functional).diagonal()
+
+
+def _of_vertices(functional: Functional) -> FloatArray:
+    """Return ½ ∂²E by values at vertices, ghosts included; collective."""
+    cells, masses = functional.cells, functional.masses
+    local = np.empty((3, cells.number))
+    for part in blocks(cells.number):
+        np.multiply(pick(functional.kappa, part), cells.squares(part), out=local[:, part])
+        if masses.reacts:
+            local[:, part] += masses.on_cells(cells, part) / 6.0
+    ends = cells.others[masses.side.local].T, masses.side.cells
+    np.add.at(local, ends, masses.loss / 3.0)
+    return nonzero(cells.over_vertices(local))
+
+
 def promise_of_vertices(
     functional: Functional, excess: FloatArray, bumps: FloatArray, loose: BoolArray
 ) -> float:
@@ -161,7 +183,7 @@ def promise_of_vertices(
         loose: Which values at vertices may be changed.
     """
     cells, kappa, masses = functional.cells, functional.kappa, functional.masses
-    slope, diagonal = np.empty_like(excess), np.empty_like(excess)
+    slope = np.empty_like(excess)
     for part in blocks(cells.number):
         k, height = pick(kappa, part), bumps[cells.facets[:, part]]
         if masses.reacts:
@@ -169,15 +191,12 @@ def promise_of_vertices(
         height *= -4 / 3
         height += excess[:, part]
         np.multiply(k, cells.apply(height, part), out=slope[:, part])
-        np.multiply(k, cells.squares(part), out=diagonal[:, part])
         if masses.reacts:
             slope[:, part] -= fall
-            diagonal[:, part] += masses.on_cells(cells, part) / 6.0
     ends = cells.others[masses.side.local].T, masses.side.cells
     np.subtract.at(slope, ends, masses.fall_on_facets(cells, excess, bumps, slice(None))[0])
-    np.add.at(diagonal, ends, masses.loss / 3.0)
     owned = slice(cells.owned_vertices())
-    down, weight = (cells.over_vertices(values)[owned] for values in (slope, diagonal))
+    down, weight = cells.over_vertices(slope)[owned], _of_vertices(functional)[owned]
     return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
 
 
