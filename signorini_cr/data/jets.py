@@ -111,8 +111,16 @@ class Boxes:
         return np.divide(width, volume, out=np.ones_like(width), where=width < volume)
 
 
+CHOICES = 5
+"""How many conditions an expression may have that is written as choices first: 2⁵ expressions."""
+
 STRIP = 1e-13
 """What counts as rounding of a coordinate, in parts of it."""
+
+STEPS = 6
+"""To where a condition changes, by a fixed slope: on small pieces a step leaves little."""
+
+ALWAYS = np.array(True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +194,36 @@ def differences(expression: Any, ordered: bool = True) -> list[Any]:
     return list(dict.fromkeys(found))
 
 
+def choices_first(expression: Any) -> Any:
+    """The same lowered expression as a choice between expressions without any, if these are few.
+
+    What jumps by itself may not do so as a part of a whole: where(x > 0, 1, 0) x is continuous.
+    """
+    nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
+    conditions = dict.fromkeys(
+        e.ufl_operands[0] for e in nodes if isinstance(e, classes.Conditional)
+    )
+    return _chosen(expression, list(conditions)) if len(conditions) <= CHOICES else expression
+
+
+def _chosen(e: Any, conditions: Sequence[Any]) -> Any:
+    """The expression, with one choice after the other."""
+    if not conditions:
+        return e
+    first, *more = conditions
+    holds, fails = (_chosen(_where(e, first, fact), more) for fact in (True, False))
+    return holds if holds == fails else ufl.conditional(first, holds, fails)
+
+
+def _where(e: Any, condition: Any, holds: bool) -> Any:
+    """The expression where a condition holds, or where it fails."""
+    operands = [_where(each, condition, holds) for each in e.ufl_operands]
+    if isinstance(e, classes.Conditional) and e.ufl_operands[0] == condition:
+        return operands[1 if holds else 2]
+    same = all(a is b for a, b in zip(operands, e.ufl_operands, strict=True))
+    return e if same else e._ufl_expr_reconstruct_(*operands)
+
+
 def values(expression: Any, points: Boxes) -> FloatArray:
     """Values of a lowered expression, not enclosed, at points that are given as boxes, shape (n,).
 
@@ -224,11 +262,12 @@ class Enclosure:
         order: Up to which order.
         inner: A lower bound of the barycentric coordinates of all points that matter: conditions
             may then be decided up to slices of triangles that are too thin to hold one.
+        rounding: What a conditional may jump by on a facet and still count as continuous.
     """
 
-    def __init__(self, boxes: Boxes, order: int = ORDER, inner: float = 0.0):
+    def __init__(self, boxes: Boxes, order: int = ORDER, inner: float = 0.0, rounding: float = 0.0):
         """Begin with nothing known."""
-        self.boxes, self.order, self.inner = boxes, order, inner
+        self.boxes, self.order, self.inner, self.rounding = boxes, order, inner, rounding
         self._strips, self._slices = np.zeros((2, *boxes.low.shape[1:]))
         self._known: dict[Any, Jet] = {}
 
@@ -488,26 +527,32 @@ class Enclosure:
 
     # ---- choices
 
-    def _choose(self, take: BoolArray, either: BoolArray, a: Jet, b: Jet, smooth: int) -> Jet:
-        """`a` where take, else b; the hull of both where either, known up to the order smooth.
+    def _choose(
+        self, take: BoolArray, either: BoolArray, a: Jet, b: Jet, joined: BoolArray = ALWAYS
+    ) -> Jet:
+        """`a` where take, else b; the hull of both where either may be.
 
-        Above the order smooth the coefficients are infinite where either may be.
+        There coefficients are infinite from the second order on, and where they are not joined
+        continuously, from the first.
         """
         low, high = np.where(take, a.low, b.low), np.where(take, a.high, b.high)
         rows, undecided = union(a.rest.rows, b.rest.rows), np.any(either)
-        known = len(indices(self.boxes.variables, min(smooth, self.order)))
+        first = len(indices(self.boxes.variables, min(1, self.order)))
         if undecided:
             low = np.where(either, np.minimum(a.low, b.low), low)
             high = np.where(either, np.maximum(a.high, b.high), high)
-            rows = union(rows, self._every[known - 1 :])
+            continuous = bool(np.all(joined | ~either))
+            rows = union(rows, self._every[first - 1 :] if continuous else self._every)
         (m, r), (n, s) = a.rest.on(rows), b.rest.on(rows)
         mid, rad = np.where(take, m, n), np.where(take, r, s)
         if undecided:
             hull = middle(np.minimum(m - r, n - s), np.maximum(m + r, n + s))
-            above = sum(row < known for row in rows)
-            for array, ends in zip(hull, (0.0, np.inf), strict=True):
-                array[above:] = ends
-            mid, rad = (np.where(either, h, x) for h, x in zip(hull, (mid, rad), strict=True))
+            above = sum(row < first for row in rows)
+            found = []
+            for array, unknown, x in zip(hull, (0.0, np.inf), (mid, rad), strict=True):
+                array[above:] = unknown
+                found.append(np.where(either, np.where(joined, array, unknown), x))
+            mid, rad = found
         return Jet(low, high, Balls(rows, mid, rad))
 
     @property
@@ -522,7 +567,7 @@ class Enclosure:
         if self.boxes.along is None and self.order >= 2:
             low, high = self._by_slopes(low, high, e, classes.Zero())
         above, below = low >= 0, high <= 0
-        jet = self._choose(above, ~(above | below), a, Jet(-a.high, -a.low, -a.rest), 1)
+        jet = self._choose(above, ~(above | below), a, Jet(-a.high, -a.low, -a.rest))
         return replace(jet, low=np.maximum(jet.low, 0.0))
 
     def _order(self, a: Jet, b: Jet) -> tuple[BoolArray, BoolArray]:
@@ -532,12 +577,12 @@ class Enclosure:
 
     def _maximum(self, a: Jet, b: Jet) -> Jet:
         above, below = self._order(a, b)
-        jet = self._choose(above, ~(above | below), a, b, 1)
+        jet = self._choose(above, ~(above | below), a, b)
         return replace(jet, low=np.maximum(a.low, b.low), high=np.maximum(a.high, b.high))
 
     def _minimum(self, a: Jet, b: Jet) -> Jet:
         above, below = self._order(a, b)
-        jet = self._choose(below, ~(above | below), a, b, 1)
+        jet = self._choose(below, ~(above | below), a, b)
         return replace(jet, low=np.minimum(a.low, b.low), high=np.minimum(a.high, b.high))
 
     def _conditional(self, e: Any) -> Jet:
@@ -546,12 +591,69 @@ class Enclosure:
         a, b = self(first), self(second)
         either = can_hold & can_fail
         agree = bool(np.any(either)) and _agree(condition, first, second)
-        jet = self._choose(can_hold, either, a, b, 1 if agree else 0)
+        joined = ALWAYS if agree else ~either
+        if not agree and self.rounding > 0.0 and np.any(either):
+            joined = self._joined(condition, first, second, either)
+        jet = self._choose(can_hold, either, a, b, joined)
         if agree and _is_extreme(condition, first, second):
             rule = self._maximum if _is_maximum(condition, first) else self._minimum
             extreme = rule(a, b)
             return replace(jet, low=extreme.low, high=extreme.high)
         return jet
+
+    def _joined(self, condition: Any, first: Any, second: Any, either: BoolArray) -> BoolArray:
+        """Tell on which pieces of facets branches differ by rounding where a condition changes.
+
+        A condition that compares changes at the roots of a difference. Where the latter's slope
+        has one sign, there is one at most: within |C|/|C'| of any point, where the branches differ
+        by no more than at that point, and by their difference's slope times this.
+        """
+        box, corners = self.boxes, self.boxes.corners
+        joined = ~np.broadcast_to(either, box.low.shape[1:])
+        if corners is None or box.along is None or len(corners) != 2 or not self.order:
+            return joined
+        nodes = ufl.corealg.traversal.unique_pre_traversal(condition)
+        comparisons = [e for e in nodes if isinstance(e, _COMPARISONS)]
+        if not all(isinstance(e, _ORDERED) for e in comparisons):
+            return joined
+        which = np.flatnonzero(~joined)
+        apart = first - second
+        off = np.zeros(len(which))
+        for each in comparisons:
+            can_hold, can_fail = self.truth(each)
+            here = np.broadcast_to(can_hold & can_fail, joined.shape)[which]
+            off = np.maximum(off, np.where(here, self._at_root(each, apart, which), 0.0))
+        joined[which] = off <= self.rounding
+        return joined
+
+    def _at_root(self, comparison: Any, e: Any, which: IndexArray) -> FloatArray:
+        """Bound |e| on some pieces of facets where both sides of a comparison are equal."""
+        box, n = self.boxes, len(self._strips)
+        assert box.corners is not None and box.along is not None
+        left, right = comparison.ufl_operands
+        way, ends = box.along[0][:, which], box.corners[..., which]
+        center = ends.mean(axis=0)
+        reach = np.abs(np.sum(way * (ends[1] - center), axis=0)) / np.sum(way**2, axis=0)
+
+        def slopes(jet: Jet) -> tuple[FloatArray, FloatArray]:
+            mid, rad = (np.broadcast_to(x[0], n)[which] for x in jet.rest.on(self._every))
+            return mid, rad
+
+        def size(jet: Jet) -> FloatArray:
+            return np.maximum(np.abs(jet.low), np.abs(jet.high))
+
+        def at(along: FloatArray) -> Enclosure:
+            point = center + along * way
+            return Enclosure(replace(box.whole(which), low=point, high=point), order=0)
+
+        (mid, rad), (other, more) = slopes(self(left - right)), slopes(self(e))
+        along: FloatArray = np.zeros(len(which))
+        for _ in range(STEPS):
+            jet = at(along)(left - right)
+            along = np.clip(along - 0.5 * (jet.low + jet.high) / mid, -reach, reach)
+        there, least = at(along), np.maximum(np.abs(mid) - rad, 0.0)
+        found = size(there(e)) + size(there(left - right)) * (np.abs(other) + more) / least
+        return np.fmin(found, np.broadcast_to(size(self(e)), n)[which])  # fmin: not NaN
 
     def truth(self, e: Any) -> Truth:
         """Tell where in the boxes a condition can hold and can fail, but for null sets."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -17,7 +18,7 @@ from mpi4py import MPI
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
 from ..data.cutting import refine
-from ..data.jets import Enclosure, Jet, Unknown
+from ..data.jets import Enclosure, Jet, Unknown, choices_first
 from ..data.moments import OnParts, Trace
 from ..data.pieces import Pieces
 from ..fem.cells import BoundaryFacets, Cells, corner_points
@@ -155,12 +156,25 @@ def lift(
     if trace.constant is not None:
         return Lift.none(np.full(n, trace.constant))
     seen = _Triangles.of(cells, side)
-    length, height = seen.length, seen.height
+
+    def lifted(expression: Any) -> Lift:
+        found = _enclosed(cells, side, expression, base, v, scale, goal, obstacle, ratio, seen)
+        return _lifted(found, seen, n, ROUGH.format(name))
+
+    expression = trace.deviation.expression
     try:
-        found = _enclosed(cells, side, trace, base, v, scale, goal, obstacle, ratio, seen)
+        found = lifted(expression)
+        if cells.comm.allreduce(found.reason is not None, op=MPI.LOR):
+            other = choices_first(expression)
+            found = found if other is expression else lifted(other)
     except Unknown as error:
         return Lift.none(np.zeros(n), NO_RANGE.format(name, error))
-    pieces = found.pieces
+    return found
+
+
+def _lifted(found: _Enclosed, seen: _Triangles, n: int, rough: str) -> Lift:
+    """Bound the lifting; `rough` is the reason where that can't be."""
+    pieces, length, height = found.pieces, seen.length, seen.height
 
     def mean(values: FloatArray) -> FloatArray:
         sums = np.bincount(pieces.parent, pieces.part * values, minlength=n)
@@ -171,14 +185,14 @@ def lift(
         one, k, two, beyond, norm = (np.where(found.clear, 0.0, mean(row)) for row in rows)
         power = np.clip(np.nan_to_num(np.sqrt(one / two), nan=1.0), *POWERS)
         squares = one / power + k + power * two
-    rough = not np.isfinite(squares).all() or (found.jumps & ~found.clear).any()
+    fine = np.isfinite(squares).all() and not (found.jumps & ~found.clear).any()
     return Lift(
         np.sqrt(0.5 * height * length * squares),
         np.sqrt(height * length * norm / (2.0 * power + 2.0)),
         beyond * length,
         mean(found.least),
         np.sqrt(length * norm),
-        ROUGH.format(name) if rough else None,
+        None if fine else rough,
     )
 
 
@@ -242,7 +256,7 @@ class _Enclosed:
 def _enclosed(
     cells: Cells,
     side: BoundaryFacets,
-    trace: Trace,
+    expression: Any,
     base: Cubic | None,
     v: Cubic,
     scale: float,
@@ -254,9 +268,9 @@ def _enclosed(
     """Enclose δ piece by piece, as finely as `goal` asks for; collective.
 
     Args:
-        cells: As for `lift`, and so are the next eight.
+        cells: As for `lift`, and so are all but the next but one and the last.
         side: The facets.
-        trace: The data.
+        expression: The data.
         base: α_I.
         v: The companion.
         scale: Size of the values.
@@ -271,10 +285,10 @@ def _enclosed(
     n, polynomial, whole = len(side.cells), base or v, Pieces.of_facets(cells, side)
 
     def steepness(pieces: Pieces) -> FloatArray:
-        size, steep, least = _bounds(trace, pieces, polynomial, cells, seen.length, scale)
+        size, steep, least = _bounds(expression, pieces, polynomial, cells, seen.length, scale)
         if obstacle and base is None:
             # δ is a positive part, and 0 where the difference is shown to be negative
-            signed = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0]
+            signed = _bounds(expression, pieces, v, cells, seen.length, scale, signed=True)[0]
             size = np.fmin(size, np.maximum(signed, 0.0))
             steep = np.where(signed <= 0.0, 0.0, steep)
         square = seen.parts(pieces, size, steep).sum(axis=0)
@@ -288,12 +302,12 @@ def _enclosed(
         pieces = pieces.halves()
     room = 8 * cells.comm.allreduce(n) + 1000
     pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
-    jumps = _jump_at_ends(trace, whole, polynomial, cells, JUMP * scale, obstacle)
+    jumps = _jump_at_ends(expression, whole, polynomial, cells, JUMP * scale, obstacle)
     clear = np.zeros(n, dtype=bool)
     if obstacle:
         below = size <= 0.0
         if base is not None:
-            below = _bounds(trace, pieces, v, cells, seen.length, scale, signed=True)[0] <= 0
+            below = _bounds(expression, pieces, v, cells, seen.length, scale, signed=True)[0] <= 0
         clear = np.bincount(pieces.parent, ~below, minlength=n) == 0
     return _Enclosed(pieces, size, steep, least, jumps, clear)
 
@@ -331,7 +345,8 @@ def gaps(
         else:
             length = _Triangles.of(cells, side).length
             try:
-                above = _bounds(trace, pieces, own, cells, length, 1.0, signed=True)[0]
+                e = trace.deviation.expression
+                above = _bounds(e, pieces, own, cells, length, 0.0, signed=True)[0]
             except Unknown:
                 above = np.full(pieces.parent.shape, np.inf)
         found.append(np.full(len(side.cells), np.inf))
@@ -351,10 +366,11 @@ def below(cells: Cells, side: BoundaryFacets, trace: Trace, scale: float) -> boo
     none = np.zeros(len(side.cells))
     length, zero = _Triangles.of(cells, side).length, Cubic(np.stack([none, none]), none, none)
     pieces, room = Pieces.of_facets(cells, side), 8 * len(none) + 1000
+    expression = trace.deviation.expression
     shown = False
     try:
         for _ in range(HALVINGS):
-            most = _bounds(trace, pieces, zero, cells, length, scale, signed=True)[0]
+            most = _bounds(expression, pieces, zero, cells, length, scale, signed=True)[0]
             open_ = ~(most <= JUMP * scale)
             shown = not open_.any()
             if shown or np.count_nonzero(open_) > room:
@@ -366,7 +382,7 @@ def below(cells: Cells, side: BoundaryFacets, trace: Trace, scale: float) -> boo
 
 
 def _bounds(
-    trace: Trace,
+    expression: Any,
     pieces: Pieces,
     base: Cubic,
     cells: Cells,
@@ -380,10 +396,10 @@ def _bounds(
     the best. With `signed` the first is an upper bound of δ itself.
     """
     boxes = pieces.boxes(cells, decide=True)
-    over = Enclosure(boxes)(trace.deviation.expression)
+    over = Enclosure(boxes, rounding=ROUNDING * scale)(expression)
     at, s = pieces.parent, pieces.hats[:, 1].mean(axis=0)
     e = 0.5 * length[at] * pieces.part
-    there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(trace.deviation.expression)
+    there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(expression)
     c, m = _balls(over, len(at)), _balls(there, len(at))
     slope = base.slope(at, s) / length[at]
     bend = base.bend(at, s) / length[at] ** 2
@@ -429,7 +445,7 @@ def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def _jump_at_ends(
-    trace: Trace, whole: Pieces, base: Cubic, cells: Cells, jump: float, obstacle: bool
+    expression: Any, whole: Pieces, base: Cubic, cells: Cells, jump: float, obstacle: bool
 ) -> BoolArray:
     """Tell where δ does not vanish at a facet's end: the data's limit is not the value there."""
     found = np.zeros(len(whole.parent), dtype=bool)
@@ -437,7 +453,7 @@ def _jump_at_ends(
         corners = whole.corners.copy()
         corners[1 - end] = corners[end] + END * (whole.corners[1 - end] - corners[end])
         near = Pieces(whole.parent, corners, whole.hats, whole.part, whole.frame)
-        jet = Enclosure(near.boxes(cells, decide=True))(trace.deviation.expression)
+        jet = Enclosure(near.boxes(cells, decide=True))(expression)
         found |= jet.low > base.ends[end] + jump
         if not obstacle:
             found |= jet.high < base.ends[end] - jump

@@ -271,6 +271,63 @@ def test_a_spot_between_all_quadrature_points():
     holds(solution, error, energy)
 
 
+def ramp(x):
+    """0 up to 0.2, 1 from 0.6 on."""
+    return ufl.conditional(x < 0.2, 0, ufl.conditional(x > 0.6, 1, (x - 0.2) / 0.4))
+
+
+def step(condition):
+    return ufl.conditional(condition, 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("choice", "same"),
+    [
+        (lambda x: ramp(x[0]), lambda x: ufl.min_value(ufl.max_value((x[0] - 0.2) / 0.4, 0), 1)),
+        (
+            lambda x: ufl.conditional(x[0] > 0.3, 1.1 + 2 * x[0] + x[1], 0.8 + 3 * x[0] + x[1]),
+            lambda x: ufl.min_value(1.1 + 2 * x[0], 0.8 + 3 * x[0]) + x[1],
+        ),
+        (
+            lambda x: ufl.conditional(
+                ufl.And(x[0] > 0.2, x[0] < 0.6), (x[0] - 0.2) * (0.6 - x[0]), 0
+            ),
+            lambda x: ufl.max_value((x[0] - 0.2) * (0.6 - x[0]), 0),
+        ),
+        (
+            lambda x: ufl.conditional(x[0] ** 2 + x[1] > 1.3, ufl.exp(x[0] ** 2 + x[1] - 1.3), 1),
+            lambda x: ufl.max_value(ufl.exp(x[0] ** 2 + x[1] - 1.3), 1),
+        ),
+        (lambda x: step(x[0] > 0.3) * (x[0] - 0.3), lambda x: ufl.max_value(x[0] - 0.3, 0)),
+    ],
+    ids=["ramp", "two lines", "between", "curved", "a step times what vanishes"],
+)
+def test_choices_that_are_continuous(choice, same):
+    """Bounds are those with max and min in their place; u_D above, α on a part with contact."""
+    domain = square("squares", ("contact", "neumann", "dirichlet", "neumann"))
+    bounds = []
+    for data in (choice, same):
+        problem = Problem(f=-3.0, dirichlet=data, obstacle=lambda x, data=data: data(x) - 0.5)
+        solution = solve(problem, domain)
+        assert 0 < solution.contact.number_active
+        assert solution.certificate.reason is None
+        bounds.append(solution.certificate.bound_h1)
+    assert bounds[0] == pytest.approx(bounds[1], rel=0.01)
+
+
+@pytest.mark.parametrize("jump", [1e-8, -1e-8])
+def test_choices_that_are_not_continuous(jump):
+    """A jump within facets that is below what data are checked for by their values."""
+    domain = square("squares", ("contact", "neumann", "dirichlet", "neumann"))
+    for data in (
+        lambda x: ufl.conditional(x[0] > 0.3, 1.1 + 2 * x[0], 0.8 + 3 * x[0] + jump),
+        lambda x: step(x[0] > 0.3) * (x[0] - 0.3 + jump),
+    ):
+        certificate = solve(Problem(f=-3.0, dirichlet=data, obstacle=-0.5), domain).certificate
+        assert certificate.bound_h1 is None
+        assert "u_D jumps on a boundary facet" in certificate.reason
+
+
 @pytest.mark.parametrize("kind", ["squares", "gmsh"])
 def test_data_that_jump_across_an_oblique_line(kind):
     """u = −s/κ with κ 1:10 at s = 0: κ jumps, u_D and α have kinks inside facets."""
