@@ -510,6 +510,16 @@ class OnFacets:
         return self.trace.weights @ self.inside
 
     @property
+    def rest(self) -> FloatArray:
+        """What is left of `inside` without the quadratic through the three others, shape (q, n)."""
+        ends, middle = self.ends, self.middle
+        s = self.trace.hats[:, 1][:, None]
+        straight = (1.0 - s) * ends[0] + s * ends[1]
+        bump = 4.0 * s * (1.0 - s) * (middle - ends.mean(axis=0))
+        rest: FloatArray = self.inside - straight - bump
+        return rest
+
+    @property
     def imposed(self) -> Imposed:
         """The same for the one unknown of each facet."""
         only = np.zeros(1, dtype=np.int32)

@@ -18,7 +18,6 @@ from ..data.moments import OnFacets
 from ..fem.cells import Cells, blocks, dot_rows, pick
 from .companion import Companion
 from .flux import Flux
-from .lifting import Cubic
 from .shapes import best_heights, local_thirds, quadrature, third_slopes
 
 TOUCHING = 1e-12
@@ -74,16 +73,13 @@ def with_thirds(cells: Cells, v: fem.Function, thirds: FloatArray) -> fem.Functi
 
 def _of_data(data: OnFacets) -> FloatArray:
     """Heights of c_F in the data, as seen from the facets' cells, shape (n,)."""
-    trace, ends, middle, inside = data.trace, data.ends, data.middle, data.inside
-    n = len(middle)
-    quadratic = Cubic(ends, middle - ends.mean(axis=0), np.zeros(n))
+    trace = data.trace
     first, second = trace.hats.T
     cubic = first * second * (first - second)
     size = trace.weights @ cubic**2
     if not size > 0.0:
-        return np.zeros(n)
-    rest = inside - np.stack([quadratic.at(np.arange(n), np.full(n, s)) for s in second])
-    return np.asarray((trace.weights * cubic) @ rest / size)
+        return np.zeros(len(data.middle))
+    return np.asarray((trace.weights * cubic) @ data.rest / size)
 
 
 def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> FloatArray:

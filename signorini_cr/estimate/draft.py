@@ -7,9 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from ..data.moments import OnParts
+from ..data.moments import OnFacets, OnParts
 from ..fem.cells import BoundaryFacets, Cells
 from .functional import Masses
+
+KINK = 0.05
+"""What α is off its interpolant, in parts of this one's bump: an eighth at a kink, else O(h)."""
+NOISE = 1e-9
+"""Part of α below which that is rounding."""
 
 
 @dataclass(eq=False)
@@ -40,9 +45,10 @@ class Floors:
         middle: At their midpoints, shape (n,).
         at_vertices: The values of s, and for each the largest bound at each vertex, −∞ for none:
             where parts with obstacles of their own meet, the higher one counts.
-        strong: Where v is drawn to t/b, as near to u as α is: there s v is not below α at the
-            middle, either, and no more is asked for, shape (n,).
         facets: Number of facets.
+        kinked: Where α has a kink, see `kinked`, shape (n,).
+        at_middle: Where s v is not to be below α at the middle either, and no more is asked for:
+            at kinks, and where v is drawn to t/b, as near to u as α is, shape (n,).
     """
 
     side: BoundaryFacets
@@ -50,8 +56,9 @@ class Floors:
     ends: FloatArray
     middle: FloatArray
     at_vertices: tuple[tuple[int, FloatArray], ...]
-    strong: BoolArray
     facets: int
+    kinked: BoolArray
+    at_middle: BoolArray
 
     @classmethod
     def of(cls, cells: Cells, bounds: OnParts, masses: Masses) -> Floors:
@@ -61,12 +68,14 @@ class Floors:
         for sign in sorted({each.sign for each in bounds.parts}, reverse=True):
             here = signs == sign
             limits.append((sign, cells.largest_at_vertices(side.ends[:, here], ends[:, here])))
-        strong = np.zeros(len(cells.exterior), dtype=bool)
+        n, none = len(cells.exterior), np.empty(0, dtype=bool)
+        bent = np.concatenate([none, *map(kinked, bounds.parts)])
+        strong = np.zeros(n, dtype=bool)
         strong[masses.side.dofs] = masses.strong
         # to a bound that is a number no lifting brings v
         curved = [np.full(len(p.middle), p.trace.constant is None) for p in bounds.parts]
-        strong = strong[side.dofs] & np.concatenate([np.empty(0, dtype=bool), *curved])
-        return cls(side, signs, ends, bounds.middle, tuple(limits), strong, len(cells.exterior))
+        at_middle = bent | strong[side.dofs] & np.concatenate([none, *curved])
+        return cls(side, signs, ends, bounds.middle, tuple(limits), n, bent, at_middle)
 
     def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The least and the largest heights of bumps that they allow for, by facet dof.
@@ -76,7 +85,7 @@ class Floors:
         """
         above = self.signs * v[self.side.ends]
         least = np.where(
-            self.strong,
+            self.at_middle,
             self.middle - above.mean(axis=0),
             _lowest(above, self.ends, self.middle),
         )
@@ -97,3 +106,13 @@ def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArr
     """
     room: FloatArray = np.sqrt(np.maximum(v - obstacle, 0.0)).sum(axis=0) ** 2 / 4
     return middle - obstacle.mean(axis=0) - room
+
+
+def kinked(data: OnFacets) -> BoolArray:
+    """Tell where α has a kink, so that its quadratic interpolant is far above it; shape (n,)."""
+    if data.trace.constant is not None or len(data.ends) != 2:
+        return np.zeros(len(data.middle), dtype=bool)
+    bump = np.abs(data.middle - data.ends.mean(axis=0))
+    size = np.abs(data.inside).max(axis=0, initial=0.0)
+    rest = np.abs(data.rest).max(axis=0, initial=0.0)
+    return np.asarray(rest > KINK * bump + NOISE * size)

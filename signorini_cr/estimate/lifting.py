@@ -111,9 +111,16 @@ def joined(lifts: Sequence[Lift]) -> Lift:
 
 
 def cheaper(one: Lift, other: Lift) -> Lift:
-    """Take of two ways to bring v above α the one that costs less, facet by facet."""
-    if one.reason or other.reason:
-        return one if other.reason else other
+    """Take of two ways to bring v above α the one that costs less, facet by facet.
+
+    Args:
+        one: The first; of infinite cost where it is none.
+        other: The second.
+    """
+    if one.reason or (other.reason and not np.isfinite(one.steep).all()):
+        return other
+    if other.reason:
+        return one
     better = other.steep < one.steep
     steep, area, beyond, least, edge = (
         np.where(better, theirs, own)

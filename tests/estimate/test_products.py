@@ -21,7 +21,7 @@ from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing,
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.companion import Companion, _at_vertices
 from signorini_cr.estimate.curl import _pull
-from signorini_cr.estimate.draft import Floors
+from signorini_cr.estimate.draft import Floors, kinked
 from signorini_cr.estimate.functional import Functional, Masses
 from signorini_cr.estimate.lifting import Lift, affine, gaps
 from signorini_cr.estimate.sums import Sums, Totals
@@ -940,7 +940,11 @@ def test_values_at_vertices_to_begin_with(kind):
     functional = Functional(cells, w, kappa, np.array(True), masses)
     u_D = SimpleNamespace(side=none, ends=np.zeros((2, 0)))
     floors = SimpleNamespace(
-        side=none, signs=np.zeros(0), at_vertices=(), facets=len(cells.exterior)
+        side=none,
+        signs=np.zeros(0),
+        at_vertices=(),
+        facets=len(cells.exterior),
+        kinked=np.zeros(0, dtype=bool),
     )
     y = SimpleNamespace(touching=np.zeros(0, dtype=bool), contact=np.zeros(0))
     found, _ = _at_vertices(functional, u_D, floors, y)
@@ -961,9 +965,9 @@ def test_values_at_vertices_to_begin_with(kind):
 def test_what_bounds_ask_of_v():
     """v is nowhere below the quadratic through α's three values, or not at the middle, and no more.
 
-    The latter is so where v is drawn to t/b.
+    The latter is so where v is drawn to t/b, and at kinks.
     """
-    problem = Problem(f=1.0, obstacle=lambda x: ufl.sin(5 * x[0]))
+    problem = Problem(f=1.0, obstacle=lambda x: ufl.sin(x[0]))
     level = solve(problem, square(3)).level
     data = diffusion(level.data)
     cells, rng = data.cells, np.random.default_rng(33)
@@ -971,14 +975,15 @@ def test_what_bounds_ask_of_v():
     side, strong = bounds.side, np.array([True, False, True])
     masses = Masses(True, np.array(0.0), side, np.ones(3), np.zeros((3, 3)), strong)
     floors = Floors.of(cells, bounds, masses)
-    assert np.array_equal(floors.strong, strong) and floors.facets == len(cells.exterior)
+    assert np.array_equal(floors.at_middle, strong) and not floors.kinked.any()
+    assert floors.facets == len(cells.exterior)
     ((sign, limit),) = floors.at_vertices
     x = cells.domain.mesh.geometry.x
     nodes = cells.domain.mesh.geometry.dofmap
     of_vertex = np.zeros(len(limit), dtype=int)
     of_vertex[cells.vertices] = nodes[: cells.number].T
     below = x[of_vertex, 1] < 1e-9
-    assert sign == 1 and np.allclose(limit[below], np.sin(5 * x[of_vertex, 0])[below])
+    assert sign == 1 and np.allclose(limit[below], np.sin(x[of_vertex, 0])[below])
     assert np.all(np.isneginf(limit[~below])) and below.sum() == 4
     v = np.where(below, limit, 0.0) + rng.uniform(size=len(limit))
     low, high = floors.heights(v)
@@ -992,6 +997,19 @@ def test_what_bounds_ask_of_v():
         assert np.isclose(above[2000] if strong[i] else above.min(), 0.0, atol=1e-6)
     others = np.delete(np.arange(floors.facets), side.dofs)
     assert np.all(np.isposinf(high)) and np.all(np.isneginf(low[others]))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("place", [0.34, 0.4, 0.5, 0.6, 0.66])
+@pytest.mark.parametrize("size", [1e-3, 1.0])
+def test_kinks_are_seen(place, size):
+    """Of an obstacle that is straight but for one, wherever in its facet this is."""
+    problem = Problem(f=1.0, obstacle=lambda x: size * (2 + x[0] - abs(x[0] - place)))
+    data = diffusion(solve(problem, square(3)).level.data)
+    bounds = OnParts.of(data.alpha, data.cells)
+    (part,) = bounds.parts
+    there = np.abs(part.middle - part.ends.mean(axis=0)) > 1e-6 * size  # elsewhere it is straight
+    assert np.array_equal(kinked(part), there) and there.sum() == 1
 
 
 @pytest.mark.serial

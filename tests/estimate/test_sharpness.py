@@ -398,6 +398,62 @@ def test_obstacle_with_a_kink_where_contact_ends(n, flat):
     assert 1.0 <= effectivity(solution, gradient) <= (1.1 if flat == 1.0 else 1.45)
 
 
+@pytest.mark.parametrize("n", [16, 32])
+@pytest.mark.parametrize("width", [1e-3, 0.05])
+@pytest.mark.parametrize("flat", [1.0, 10.0, 50.0])
+def test_obstacle_that_drops_where_contact_ends(n, width, flat):
+    """The same u; α drops by 0.3 within a facet, where its quadratic is far above α and u."""
+
+    def gradient(x, _):
+        return np.stack([0.0 * x[:, 0] + 0.01, 2.0 * x[:, 1] - 0.5], axis=1)
+
+    def u(x):
+        return x[1] ** 2 - 0.5 * x[1] + 0.01 * x[0]
+
+    def beyond(x):
+        return ufl.min_value(ufl.max_value((x[0] - 0.5483) / width, 0.0), 1.0)
+
+    conditions = {
+        "below": Contact(
+            lambda x: u(x) - 0.3 * beyond(x), g=lambda x: 0.5 - ufl.max_value(0.5483 - x[0], 0.0)
+        ),
+        "rest": Dirichlet(u),
+    }
+    squashed = lambda x, y: (x, y / flat)  # noqa: E731
+    domain = rectangle((0, 0), (1, 1), n, n, below, squashed, below=1, rest=2)
+    solution = solve(Problem(f=-2.0, conditions=conditions), domain)
+    assert 1.0 <= effectivity(solution, gradient) <= (1.1 if flat == 1.0 else 1.4)
+
+
+@pytest.mark.parametrize(("n", "frequency", "phase"), [(32, 7, 1), (16, 9, 0.3), (128, 9, 0.3)])
+def test_facets_in_contact_with_a_kink(n, frequency, phase):
+    """u_h is α in the mean where u is α on a part only, and well above it on the rest."""
+
+    def gradient(x, _):
+        a, b = x.T
+        along = 2.0 * np.cos(2.0 * a) * np.cos(b) + b
+        return np.stack([along, a - np.sin(2.0 * a) * np.sin(b)], axis=1)
+
+    def u(x):
+        return ufl.sin(2.0 * x[0]) * ufl.cos(x[1]) + x[0] * x[1]
+
+    def wave(x):
+        return ufl.sin(frequency * x[0] + phase)
+
+    conditions = {
+        "below": Contact(
+            lambda x: u(x) - ufl.max_value(-wave(x), 0.0),
+            g=lambda x: -x[0] - ufl.max_value(wave(x), 0.0),
+        ),
+        "rest": Dirichlet(u),
+    }
+    domain = rectangle((0, 0), (1, 1), n, n, below, below=1, rest=2)
+    f = lambda x: 5.0 * ufl.sin(2.0 * x[0]) * ufl.cos(x[1])  # noqa: E731
+    solution = solve(Problem(f=f, conditions=conditions), domain)
+    assert 0.1 < solution.contact.length < 0.9
+    assert 1.0 <= effectivity(solution, gradient) <= 1.1
+
+
 @pytest.mark.parametrize("n", [8, 32])
 @pytest.mark.parametrize("power", [1, 2])
 def test_contact_where_there_is_none_on_sheared_cells(n, power):
