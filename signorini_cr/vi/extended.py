@@ -23,7 +23,7 @@ from ..multigrid.constrained import ConstrainedMatrix
 from .active import ActiveSet
 from .bounds import Bounds
 from .reduced import ReducedSolver
-from .stopping import FORCES, LOST, TOUCHING, Stiffness
+from .stopping import FORCES, LEVEL, LEVELS, LOST, TOUCHING, Stiffness
 from .system import DATUM, Vectors
 
 SETS = 40
@@ -41,6 +41,10 @@ GAIN = 0.5
 REMAINDER = 1e-9
 """Forces below this part of the loads on their rows, with which others nearly cancel, are measured
 against it."""
+
+BOTTOM = 10.0 ** -(LEVEL * (LEVELS - 1))
+"""What forces are measured against at least, in parts of what the rows on Γ1 are made of: where the
+last of their levels begins. Where u falls off by many orders of magnitude there is no end below."""
 
 SAMPLES = 3
 """Times that data are changed; the largest answer counts."""
@@ -127,7 +131,7 @@ class Extended:
             (errors <= loose * TOUCHING * made_of)
             | (errors * len(errors) <= loose * FORCES * total)
         )
-        sizes = np.maximum(forces, self._stiffness.least)
+        sizes = self._sizes()
         sizes[none] = np.maximum(made_of, total)[none]
         # each class is solved for itself; what data leave open is measured against all forces
         solved = 2.0 * left / np.maximum(sizes, 1e-300)
@@ -141,12 +145,16 @@ class Extended:
         release(self._remainder, self._work, self._nothing)
 
     def _find_set(self, share: float) -> FloatArray:
-        """Go from active set to active set; return what is left wrong with the last's forces."""
+        """Go from active set to active set; return what is left wrong with the last's forces.
+
+        That is an active set of its own solution, but for dofs whose forces are nothing.
+        """
         for _ in range(SETS):
             left = self._refine(share)
             mask = self._wanted()
-            if not self._stiffness.comm.allreduce(int((mask != self.active.mask).sum())):
-                return left
+            wrong = self._misclassified(mask)
+            if (wrong <= share * self._sizes()).all():
+                return left + wrong
             self.active = ActiveSet(self.active.bounded, mask)
         raise NotConverged(f"no active set is that of its own solution, of {SETS} tried")
 
@@ -168,7 +176,7 @@ class Extended:
             changed = self._stiffness.totals(
                 np.where(self.active.mask, forces, self._could_touch(moved))
             )
-            sizes = np.maximum(self._stiffness.totals(self._forces()), self._stiffness.least)
+            sizes = self._sizes()
             if (changed <= KNOWN * share * sizes).all() or changed.sum() > GAIN * last.sum():
                 break
         return changed
@@ -206,6 +214,19 @@ class Extended:
         wanted: BoolArray = np.where(self.active.mask, self._pushes() > 0.0, self._gap() < 0.0)
         return wanted
 
+    def _misclassified(self, wanted: BoolArray) -> FloatArray:
+        """The forces that are to go, or to come, with another active set, by class; collective."""
+        pulls = np.maximum(-self._pushes(), 0.0)
+        missing = self._operator.diagonal * np.maximum(-self._gap(), 0.0)
+        wrong = np.where(self.active.mask, pulls, missing)
+        return self._stiffness.totals(np.where(wanted != self.active.mask, wrong, 0.0))
+
+    def _sizes(self) -> FloatArray:
+        """What errors of the forces are measured against, by class; collective."""
+        forces, bottom = self._forces(), BOTTOM * self._stiffness.made_of.max()
+        sizes = np.maximum(self._stiffness.totals(forces), self._stiffness.least)
+        return np.asarray(np.maximum(sizes, bottom))
+
     def _could_touch(self, moved: FloatArray) -> FloatArray:
         """The forces that dofs off the obstacle would have if they moved once more, shape (n,)."""
         return self._operator.diagonal * np.maximum(2.0 * moved - np.abs(self._gap()), 0.0)
@@ -235,7 +256,9 @@ class Extended:
         """Leave forces that are none out, and dofs without force off the obstacle."""
         bounded, mask = self.active.bounded, self.active.mask
         x, residual = self._vectors.x, self.residual
-        residual.array[bounded[mask & none[self._stiffness.bounded]]] = 0.0
+        lost = self._pushes() <= FORCES * BOTTOM * self._stiffness.made_of.max()
+        nothing = none[self._stiffness.bounded] | lost
+        residual.array[bounded[mask & nothing]] = 0.0
         at = x.array_r[bounded]
         side = self._bounds.side(at)
         off = np.nextafter(self._bounds.on(side), side * np.inf)

@@ -590,3 +590,51 @@ def test_what_a_loss_has_in_rows_and_their_neighbours():
     assert len(side.cells) == 2 and np.allclose(found, expected, atol=1e-12)
     plain = Problem(f=1.0, conditions=conditions | {"right": Dirichlet()})
     assert solve(plain, SQUARE.mesh(0.5, MPI.COMM_SELF)).level.system.masses() is None
+
+
+# ---- where u falls off by many orders of magnitude
+
+FALLS = {
+    "presses": lambda x: ufl.conditional(x[0] < 1.3, 0.0, -1.0),
+    "lifts": lambda x: ufl.conditional(x[0] < 1.3, 0.0, 1.0),
+    "both": lambda x: ufl.conditional(x[0] < 1.3, 0.0, ufl.sin(9.0 * x[0])),
+    "ramp": lambda x: ufl.max_value(x[0] - 1.3, 0.0),
+}
+
+
+def fin(f: Function, c: float, comm: MPI.Comm) -> list[Solution]:
+    """u is at rest on α = 0 but where f is, and like exp(−√c s) at the distance s from there."""
+    sides = ("floor", "right", "top", "left")
+    polygon = Polygon([[0, 0], [3, 0], [3, 1], [0, 1]], sides, names=sides)
+    conditions = {"floor": Contact(0.0), **dict.fromkeys(sides[1:], Neumann())}
+    problem = Problem(f=f, reaction=c, conditions=conditions)
+    return list(solve_levels(problem, polygon.mesh(0.25, comm), 3))
+
+
+@pytest.mark.parametrize("c", [1e4, 1e6, 1e8])
+@pytest.mark.parametrize("name", FALLS)
+def test_forces_that_fall_off_without_end(name, c):
+    """Against a direct primal-dual active set method; what is below 1e-20 of the most is nothing."""
+    for solution, alone in zip(
+        fin(FALLS[name], c, MPI.COMM_WORLD), fin(FALLS[name], c, MPI.COMM_SELF), strict=True
+    ):
+        system, V = alone.level.system, alone.u.function_space
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        form = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx + c * u * v * ufl.dx
+        A, b, bounded = fem.assemble_matrix(fem.form(form)).to_scipy(), system.chi, system.bounded
+        active = np.zeros(len(b), dtype=bool)
+        for _ in range(40):
+            free, x = ~active, np.zeros(len(b))
+            x[free] = scipy.sparse.linalg.spsolve(A[free][:, free].tocsc(), b[free])
+            push = A @ x - b
+            wanted = np.zeros_like(active)
+            wanted[bounded] = np.where(active, push > 0.0, x < 0.0)[bounded]
+            if (wanted == active).all():
+                break
+            active = wanted
+        forces = np.where(active, push, 0.0)[bounded]
+        most = (abs(A) @ np.abs(x)).max()
+        assert (wanted == active).all() or np.abs(forces).max() < 1e-12 * most
+        assert solution.contact.force == pytest.approx(forces.sum(), rel=1e-6, abs=1e-20 * most)
+        assert solution.contact.number_active >= np.count_nonzero(forces > 1e-12 * most)
+        assert solution.contact.kkt.force_error < 1e-6
