@@ -27,6 +27,7 @@ from .estimate.settled import Settled, in_p1, left_by
 from .fem.cells import measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin
 from .fem.problem import Problem
+from .mesh.domain import named
 
 __all__ = ["Interval", "flux", "force_bounds"]
 
@@ -45,30 +46,32 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     return _interval(solution, diffusion(made_of(solution).level.data).forms.bounded)[1:]
 
 
-def flux(solution: Certified, *parts: str, weight: Data | None = None) -> Interval:
+def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> Interval:
     """Put what flows into Ω through parts of the boundary between two numbers; collective.
 
     On a Dirichlet part that is ∫ κ∂ₙu, on a contact part the contact force, as in `force_bounds`.
 
     Args:
         solution: One with a certified bound.
-        *parts: Names of Dirichlet or contact parts; without a weight they must touch no others of
-            these.
+        *parts: Names or facet values of Dirichlet or contact parts; without a weight they must
+            touch no others of these.
         weight: What is integrated with it, as ∫ λ ω, continuous on the parts and 0 where they touch
             others; None for 1.
 
     Raises:
         InputError: There is no such part, or there is no bound; the message says why.
     """
-    forms = diffusion(made_of(solution).level.data).forms
+    level = made_of(solution).level
+    forms = diffusion(level.data).forms
     known = {c.part: c for c in (*forms.fixed, *forms.bounded)}
-    for part in parts:
+    names = [named(level.domain.parts, part) for part in parts]
+    for part in names:
         if part not in known:
             raise InputError(
                 f"{part!r} is no Dirichlet or contact part of the boundary; there are"
                 f" {', '.join(known)}"
             )
-    conditions = [known[part] for part in parts]
+    conditions = [known[part] for part in names]
     if weight is not None:
         return interval(solution, conditions, weight)
     return _interval(solution, conditions)

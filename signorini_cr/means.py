@@ -21,7 +21,7 @@ from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Material, Problem
 from .fem.space import function_space, shared_sum
-from .mesh.domain import Domain
+from .mesh.domain import Domain, named
 
 DOMAIN = "domain"
 """The place that all of Ω is, unless u has a mean on something else that is called so."""
@@ -32,13 +32,15 @@ ROUNDING = 1e-14
 """What rounding may do to an integral, in parts of that of |ψ u|."""
 
 
-def mean(solution: Certified, where: str | None = None, weight: Data | None = None) -> Interval:
+def mean(
+    solution: Certified, where: str | int | None = None, weight: Data | None = None
+) -> Interval:
     """Bound the mean of u; collective.
 
     Args:
         solution: One with a certified bound.
-        where: Name of a part of the boundary on which u is not set, or else of a material; None or
-            "domain" for all of the domain.
+        where: Name or facet value of a part of the boundary on which u is not set, or name of a
+            material; None or "domain" for all of the domain.
         weight: ψ, for the weighted mean ∫ ψ u / ∫ ψ; None for 1.
 
     Raises:
@@ -54,7 +56,9 @@ def mean(solution: Certified, where: str | None = None, weight: Data | None = No
     return Interval(found.value / known.total, min(ends), max(ends))
 
 
-def integral(solution: Certified, where: str | None = None, weight: Data | None = None) -> Interval:
+def integral(
+    solution: Certified, where: str | int | None = None, weight: Data | None = None
+) -> Interval:
     """Bound ∫ ψ u; collective.
 
     It is that of the companion, corrected by what a linear problem with ψ for its load says of the
@@ -64,8 +68,8 @@ def integral(solution: Certified, where: str | None = None, weight: Data | None 
 
     Args:
         solution: One with a certified bound.
-        where: Name of a part of the boundary on which u is not set, or else of a material; None or
-            "domain" for all of the domain.
+        where: Name or facet value of a part of the boundary on which u is not set, or name of a
+            material; None or "domain" for all of the domain.
         weight: ψ, of either sign; None for 1.
 
     Raises:
@@ -75,33 +79,33 @@ def integral(solution: Certified, where: str | None = None, weight: Data | None 
 
 
 def _bounded(
-    solution: Certified, where: str | None, weight: Data | None
+    solution: Certified, where: str | int | None, weight: Data | None
 ) -> tuple[Pairing, Interval]:
     """What is known of ψ, and ∫ ψ u between two numbers; collective."""
     certificate, level = solution.certificate, solution.level
     forms = diffusion(level.data).forms
-    where = _place(forms, level.domain, where)
+    place = _place(forms, level.domain, where)
     made, bound = certificate._made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
     if made.on_contact_alone:
         raise InputError(f"{NO_MEAN}: {AFLOAT}")
     cells = made.cells()
-    _insist_on_extent(cells, where)
-    z = solved(_dual(forms, where, 1.0 if weight is None else scalar(weight, forms)), level)
+    _insist_on_extent(cells, place)
+    z = solved(_dual(forms, place, 1.0 if weight is None else scalar(weight, forms)), level)
     dual = certify(z, sweeps=0)
     if dual.energy is None or dual.bound_companion is None:
         z.level.tidy()
         _insist_on_weight(dual.reason)
     assert dual.energy is not None and dual.bound_companion is not None
-    known = _paired(z, made, cells, where, bound * dual.bound_companion)
+    known = _paired(z, made, cells, place, bound * dual.bound_companion)
     z.level.tidy()
     # with the energy norm, that of the functional is the dual solution's, its square −2 J(z)
     norm = np.sqrt(max(-2.0 * dual.energy[0], 0.0))
     shifts = [
         (0.0, float(norm * bound)),
         *_corrected(made, cells, bound, dual),
-        *_settled(made, cells, bound, dual, where, weight),
+        *_settled(made, cells, bound, dual, place, weight),
     ]
     loose = known.unsure + ROUNDING * known.scale
     return known, Interval(
@@ -111,8 +115,9 @@ def _bounded(
     )
 
 
-def _place(forms: Forms, domain: Domain, where: str | None) -> str | None:
+def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
     """A part or a material, None for all of the domain; refuse others, and where u is a datum."""
+    where = None if where is None else named(domain.parts, where)
     materials = list(domain.materials.numbers)
     own = [c.part for c in forms.conditions if c.fixed is None] + materials
     if where in domain.parts and where in materials:

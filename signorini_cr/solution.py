@@ -126,7 +126,7 @@ class Solution:
         with self._quantity():
             return force.force_bounds(self)
 
-    def flux(self, *parts: str, weight: Data | None = None) -> Interval:
+    def flux(self, *parts: str | int, weight: Data | None = None) -> Interval:
         """What flows into Ω through Dirichlet or contact parts, as an interval; collective.
 
         See :func:`signorini_cr.force.flux`.
@@ -134,7 +134,7 @@ class Solution:
         with self._quantity():
             return force.flux(self, *parts, weight=weight)
 
-    def mean(self, where: str | None = None, weight: Data | None = None) -> Interval:
+    def mean(self, where: str | int | None = None, weight: Data | None = None) -> Interval:
         """The mean of u over a part, a material or all of Ω, as an interval; collective.
 
         See :func:`signorini_cr.means.mean`.
@@ -142,7 +142,7 @@ class Solution:
         with self._quantity():
             return means.mean(self, where, weight)
 
-    def integral(self, where: str | None = None, weight: Data | None = None) -> Interval:
+    def integral(self, where: str | int | None = None, weight: Data | None = None) -> Interval:
         """∫ ψ u over a part, a material or all of Ω, as an interval; collective.
 
         See :func:`signorini_cr.means.integral`.

@@ -535,13 +535,15 @@ def _crossing(
     finite = np.abs(value[np.isfinite(value)]).max(initial=0.0)
     scale = max(float(finite), *comm.allgather(float(np.abs(top).max(initial=0.0))))
     wrong = np.flatnonzero(top - below > TOLERANCE * scale + less + more)
+    bound = "the obstacle"
+    if sign < 0:
+        bound, label = "the upper bound", f"{label.removesuffix('.obstacle')}.upper"
     return [
         (
             where := place(contact.x[meets][i], mesh),
-            f"{label}: at {shown(where)}, where contact and {other} meet, the obstacle is"
+            f"{label}: at {shown(where)}, where contact and {other} meet, {bound} is"
             f" {sign * top[i]:.10g} but {value_of} is {'only ' if sign > 0 else ''}"
-            f"{sign * below[i]:.10g}; the obstacle must not be {'above' if sign > 0 else 'below'}"
-            " it",
+            f"{sign * below[i]:.10g}; {bound} must not be {'above' if sign > 0 else 'below'} it",
         )
         for i in wrong
     ]

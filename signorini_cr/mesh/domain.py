@@ -85,6 +85,13 @@ class Parts(dict[str, int]):
         self.called = dict(called)
 
 
+def named(parts: Mapping[str, int], key: str | int) -> str:
+    """Return the name of the part that a name or a facet value stands for, whether it exists."""
+    if isinstance(key, str):
+        return key
+    return parts.called.get(key, str(key)) if isinstance(parts, Parts) else str(key)
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
     """A mesh whose exterior facets are sorted into Γ0, Γ1, Γg and other parts.

@@ -17,9 +17,10 @@ one more Newton step in the same active set, which refines u_h with its true res
 forces by what was wrong with them before. Where rounding does not allow for 2., or u_h is so near
 the obstacle that rounding decides whether it touches, the solver goes on to twice the digits (see
 `extended`); 1e-6 is enough then, and what is known less well is an error, but for what is nothing
-beside all else: forces are measured against 1e-15 of what the rows on Γ1 are made of, at least. What the rounding of data
-leaves open counts as well: of loads, u_D and bounds, and of the matrix's entries, of which those
-that c and b have a part in are off by a rounding of the largest in their cell.
+beside all else: forces are measured against 1e-15 of what the rows on Γ1 are made of, at least.
+What the rounding of data leaves open counts as well: of loads, u_D and bounds, and of the matrix's
+entries, of which those that c and b have a part in are off by a rounding of the largest in their
+cell.
 """
 
 from __future__ import annotations

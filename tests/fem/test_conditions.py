@@ -245,6 +245,10 @@ def test_parts_of_the_users_own_by_tags():
         assert again.contact.force == pytest.approx(
             solve(Problem(f=-9.0, obstacle=-0.1), usual).contact.force
         )
+        name = "floor" if "floor" in facets else "7"
+        assert again.mean(7) == again.mean(name)
+        top = again.flux(name, weight=lambda x: x[0] * (1.0 - x[0]))
+        assert again.flux(7, weight=lambda x: x[0] * (1.0 - x[0])) == top
     said = r"stands for the facet value 8 alone; there are contact, dirichlet, neumann, 7 \(7\)"
     with pytest.raises(InputError, match=said):
         solve(Problem(conditions={7: Contact(), 8: Dirichlet()}), domain)

@@ -271,7 +271,11 @@ def test_pieces_that_an_upper_bound_holds():
     ("condition", "said"),
     [
         (Contact(0.2, upper=0.1), r"floor.obstacle: at \(.*\) it is 0.1 above the upper bound"),
-        (Contact(upper=-0.5), "the obstacle is -0.5 but the dirichlet value is 0; .* not be below"),
+        (
+            Contact(upper=-0.5),
+            r"^\S+.upper: .* the upper bound is -0.5 but the dirichlet value is 0; the upper "
+            "bound must not be below it",
+        ),
         (Contact(0.5, upper=1.0), "the obstacle is 0.5 but the dirichlet value is only 0"),
         (Contact(-0.1), r"at \(1, 0\), where .*is -0.1 but the other part's bound is only -0.2"),
     ],

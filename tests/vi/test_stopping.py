@@ -614,7 +614,7 @@ def fin(f: Function, c: float, comm: MPI.Comm) -> list[Solution]:
 @pytest.mark.parametrize("c", [1e4, 1e6, 1e8])
 @pytest.mark.parametrize("name", FALLS)
 def test_forces_that_fall_off_without_end(name, c):
-    """Against a direct primal-dual active set method; what is below 1e-20 of the most is nothing."""
+    """Against a direct active set method; what is below 1e-20 of the most is nothing."""
     for solution, alone in zip(
         fin(FALLS[name], c, MPI.COMM_WORLD), fin(FALLS[name], c, MPI.COMM_SELF), strict=True
     ):
