@@ -55,7 +55,7 @@ class OnMesh(Protocol):
 
     @property
     def a(self) -> fem.Form:
-        """a_h."""
+        """a_h, which is symmetric, and positive definite where something holds u."""
 
     @property
     def fixed(self) -> tuple[Imposed, ...]:
