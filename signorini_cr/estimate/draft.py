@@ -13,8 +13,11 @@ from .functional import Masses
 
 KINK = 0.05
 """What α is off its interpolant, in parts of this one's bump: an eighth at a kink, else O(h)."""
+SLIGHT = 1e-3
+"""What it is off at a kink that counts, in parts of what α differs by on the facet. Where α is a
+wave and its second derivative 0, it is a 78th of (ωh)² for the frequency ω."""
 NOISE = 1e-9
-"""Part of α below which that is rounding."""
+"""Part of α below which it is rounding."""
 
 
 @dataclass(eq=False)
@@ -113,6 +116,6 @@ def kinked(data: OnFacets) -> BoolArray:
     if data.trace.constant is not None or len(data.ends) != 2:
         return np.zeros(len(data.middle), dtype=bool)
     bump = np.abs(data.middle - data.ends.mean(axis=0))
-    size = np.abs(data.inside).max(axis=0, initial=0.0)
-    rest = np.abs(data.rest).max(axis=0, initial=0.0)
-    return np.asarray(rest > KINK * bump + NOISE * size)
+    values = np.concatenate([data.ends, data.middle[None], data.inside])
+    least = np.maximum(SLIGHT * np.ptp(values, axis=0), NOISE * np.abs(values).max(axis=0))
+    return np.asarray(np.abs(data.rest).max(axis=0, initial=0.0) > np.maximum(KINK * bump, least))

@@ -967,7 +967,7 @@ def test_what_bounds_ask_of_v():
 
     The latter is so where v is drawn to t/b, and at kinks.
     """
-    problem = Problem(f=1.0, obstacle=lambda x: ufl.sin(x[0]))
+    problem = Problem(f=1.0, obstacle=lambda x: ufl.sin(x[0] / 2))
     level = solve(problem, square(3)).level
     data = diffusion(level.data)
     cells, rng = data.cells, np.random.default_rng(33)
@@ -983,7 +983,7 @@ def test_what_bounds_ask_of_v():
     of_vertex = np.zeros(len(limit), dtype=int)
     of_vertex[cells.vertices] = nodes[: cells.number].T
     below = x[of_vertex, 1] < 1e-9
-    assert sign == 1 and np.allclose(limit[below], np.sin(x[of_vertex, 0])[below])
+    assert sign == 1 and np.allclose(limit[below], np.sin(x[of_vertex, 0] / 2)[below])
     assert np.all(np.isneginf(limit[~below])) and below.sum() == 4
     v = np.where(below, limit, 0.0) + rng.uniform(size=len(limit))
     low, high = floors.heights(v)
