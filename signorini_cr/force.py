@@ -65,13 +65,13 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
     forms = diffusion(level.data).forms
     known = {c.part: c for c in (*forms.fixed, *forms.bounded)}
     names = [named(level.domain.parts, part) for part in parts]
-    for part in names:
-        if part not in known:
+    for part, name in zip(parts, names, strict=True):
+        if name not in known:
             raise InputError(
                 f"{part!r} is no Dirichlet or contact part of the boundary; there are"
                 f" {', '.join(known)}"
             )
-    conditions = [known[part] for part in names]
+    conditions = [known[name] for name in names]
     if weight is not None:
         return interval(solution, conditions, weight)
     return _interval(solution, conditions)

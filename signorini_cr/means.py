@@ -117,16 +117,16 @@ def _bounded(
 
 def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
     """A part or a material, None for all of the domain; refuse others, and where u is a datum."""
-    where = None if where is None else named(domain.parts, where)
+    place = None if where is None else named(domain.parts, where)
     materials = list(domain.materials.numbers)
     own = [c.part for c in forms.conditions if c.fixed is None] + materials
-    if where in domain.parts and where in materials:
+    if place in domain.parts and place in materials:
         raise InputError(f"{where!r} is a part and a material: one of them needs another name")
-    if where is None or where in own:
-        return where
-    if where == DOMAIN:
+    if place is None or place in own:
+        return place
+    if place == DOMAIN:
         return None
-    if where in domain.parts:
+    if place in domain.parts:
         raise InputError(f"{NO_MEAN}: u is set on {where!r}, where its mean is that of a datum")
     there = ", ".join([*own, DOMAIN])
     raise InputError(f"{where!r} is no part of the boundary and no material; there are {there}")

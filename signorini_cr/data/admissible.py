@@ -110,15 +110,18 @@ def check_data(forms: Forms, domain: Domain) -> None:
     for contact in forms.bounded:
         bounded = _Facets.of(domain, contact.number)
         for sign, bound in contact.bounds:
-            limit = _Values(bound, domain)
+            limit, label = (
+                _Values(bound, domain),
+                contact.called("obstacle" if sign > 0 else "upper"),
+            )
             for u_D, facets in fixed:
-                complaints = _crossing(u_D, facets, limit, bounded, contact.label, sign)
+                complaints = _crossing(u_D, facets, limit, bounded, label, sign)
                 _raise_first(comm, complaints)
             for other in forms.bounded:
                 for _, rival in (b for b in other.bounds if b[0] != sign and other is not contact):
                     edge = _Values(negative(rival) if sign > 0 else rival, domain)
                     there = edge, _Facets.of(domain, other.number), limit, bounded
-                    _raise_first(comm, _crossing(*there, contact.label, sign, "contact"))
+                    _raise_first(comm, _crossing(*there, label, sign, "contact"))
         if len(contact.bounds) == 2:
             (_, lower), (_, upper) = contact.bounds
             _raise_first(comm, _crossed(lower, upper, domain, bounded, contact.label))
@@ -535,9 +538,7 @@ def _crossing(
     finite = np.abs(value[np.isfinite(value)]).max(initial=0.0)
     scale = max(float(finite), *comm.allgather(float(np.abs(top).max(initial=0.0))))
     wrong = np.flatnonzero(top - below > TOLERANCE * scale + less + more)
-    bound = "the obstacle"
-    if sign < 0:
-        bound, label = "the upper bound", f"{label.removesuffix('.obstacle')}.upper"
+    bound = "the obstacle" if sign > 0 else "the upper bound"
     return [
         (
             where := place(contact.x[meets][i], mesh),

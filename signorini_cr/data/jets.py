@@ -121,6 +121,7 @@ STEPS = 6
 """To where a condition changes, by a fixed slope: on small pieces a step leaves little."""
 
 ALWAYS = np.array(True)
+"""Branches that are joined continuously wherever they meet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,17 +212,15 @@ def _chosen(e: Any, conditions: Sequence[Any]) -> Any:
     if not conditions:
         return e
     first, *more = conditions
-    holds, fails = (_chosen(_where(e, first, fact), more) for fact in (True, False))
+    nodes = ufl.corealg.traversal.unique_pre_traversal(e)
+    choices = [
+        n for n in nodes if isinstance(n, classes.Conditional) and n.ufl_operands[0] == first
+    ]
+    holds, fails = (
+        _chosen(ufl.replace(e, {each: each.ufl_operands[i] for each in choices}), more)
+        for i in (1, 2)
+    )
     return holds if holds == fails else ufl.conditional(first, holds, fails)
-
-
-def _where(e: Any, condition: Any, holds: bool) -> Any:
-    """The expression where a condition holds, or where it fails."""
-    operands = [_where(each, condition, holds) for each in e.ufl_operands]
-    if isinstance(e, classes.Conditional) and e.ufl_operands[0] == condition:
-        return operands[1 if holds else 2]
-    same = all(a is b for a, b in zip(operands, e.ufl_operands, strict=True))
-    return e if same else e._ufl_expr_reconstruct_(*operands)
 
 
 def values(expression: Any, points: Boxes) -> FloatArray:
@@ -591,9 +590,7 @@ class Enclosure:
         a, b = self(first), self(second)
         either = can_hold & can_fail
         agree = bool(np.any(either)) and _agree(condition, first, second)
-        joined = ALWAYS if agree else ~either
-        if not agree and self.rounding > 0.0 and np.any(either):
-            joined = self._joined(condition, first, second, either)
+        joined = ALWAYS if agree else self._joined(condition, first, second, either)
         jet = self._choose(can_hold, either, a, b, joined)
         if agree and _is_extreme(condition, first, second):
             rule = self._maximum if _is_maximum(condition, first) else self._minimum
@@ -610,7 +607,8 @@ class Enclosure:
         """
         box, corners = self.boxes, self.boxes.corners
         joined = ~np.broadcast_to(either, box.low.shape[1:])
-        if corners is None or box.along is None or len(corners) != 2 or not self.order:
+        on_facets = corners is not None and box.along is not None and len(corners) == 2
+        if self.rounding == 0.0 or self.order == 0 or not on_facets or joined.all():
             return joined
         nodes = ufl.corealg.traversal.unique_pre_traversal(condition)
         comparisons = [e for e in nodes if isinstance(e, _COMPARISONS)]

@@ -143,10 +143,12 @@ class Condition:
     @property
     def data(self) -> dict[str, Any]:
         """All its data by what they are called in messages."""
-        first, *others = self.names()
-        called = {first: self.label, **{name: f"boundary.{self.part}.{name}" for name in others}}
-        values = {called[name]: getattr(self, name) for name in self.names()}
+        values = {self.called(name): getattr(self, name) for name in self.names()}
         return {name: value for name, value in values.items() if value is not None}
+
+    def called(self, name: str) -> str:
+        """Say what one of its data is called in messages."""
+        return self.label if name == self.names()[0] else f"boundary.{self.part}.{name}"
 
     @property
     def fixed(self) -> Any:

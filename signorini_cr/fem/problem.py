@@ -30,7 +30,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 from ..arrays import Int32Array
 from ..errors import InputError
 from ..jit import compiled
-from ..mesh.domain import PARTS, Domain, Parts
+from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials
 from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, is_by_cells, number
 from .moment import Moment
@@ -629,7 +629,7 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
     called = parts.called if isinstance(parts, Parts) else {}
     own: dict[str, Condition] = {}
     for key, condition in problem.conditions.items():
-        name = called.get(key, "") if isinstance(key, int | np.integer) else key
+        name = named(parts, key)
         if name not in parts:
             values = {part: f" ({value})" for value, part in called.items()}
             there = ", ".join(part + values.get(part, "") for part in parts)

@@ -86,10 +86,10 @@ class Parts(dict[str, int]):
 
 
 def named(parts: Mapping[str, int], key: str | int) -> str:
-    """Return the name of the part that a name or a facet value stands for, whether it exists."""
-    if isinstance(key, str):
+    """Return the name of the part that a name or a facet value stands for; "" for no such value."""
+    if not isinstance(key, int | np.integer):
         return key
-    return parts.called.get(key, str(key)) if isinstance(parts, Parts) else str(key)
+    return parts.called.get(key, "") if isinstance(parts, Parts) else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,7 +131,7 @@ class Extended:
             (errors <= loose * TOUCHING * made_of)
             | (errors * len(errors) <= loose * FORCES * total)
         )
-        sizes = self._sizes()
+        sizes = self._sizes(forces)
         sizes[none] = np.maximum(made_of, total)[none]
         # each class is solved for itself; what data leave open is measured against all forces
         solved = 2.0 * left / np.maximum(sizes, 1e-300)
@@ -153,7 +153,7 @@ class Extended:
             left = self._refine(share)
             mask = self._wanted()
             wrong = self._misclassified(mask)
-            if (wrong <= share * self._sizes()).all():
+            if wrong.sum() <= share * self._bottom:
                 return left + wrong
             self.active = ActiveSet(self.active.bounded, mask)
         raise NotConverged(f"no active set is that of its own solution, of {SETS} tried")
@@ -176,7 +176,7 @@ class Extended:
             changed = self._stiffness.totals(
                 np.where(self.active.mask, forces, self._could_touch(moved))
             )
-            sizes = self._sizes()
+            sizes = self._sizes(self._stiffness.totals(self._forces()))
             if (changed <= KNOWN * share * sizes).all() or changed.sum() > GAIN * last.sum():
                 break
         return changed
@@ -221,11 +221,15 @@ class Extended:
         wrong = np.where(self.active.mask, pulls, missing)
         return self._stiffness.totals(np.where(wanted != self.active.mask, wrong, 0.0))
 
-    def _sizes(self) -> FloatArray:
-        """What errors of the forces are measured against, by class; collective."""
-        forces, bottom = self._forces(), BOTTOM * self._stiffness.made_of.max()
-        sizes = np.maximum(self._stiffness.totals(forces), self._stiffness.least)
-        return np.asarray(np.maximum(sizes, bottom))
+    @property
+    def _bottom(self) -> float:
+        """What forces are measured against at least."""
+        return float(BOTTOM * self._stiffness.made_of.max())
+
+    def _sizes(self, forces: FloatArray) -> FloatArray:
+        """What errors of the forces are measured against, by class, from the sums of these."""
+        sizes: FloatArray = np.maximum(np.maximum(forces, self._stiffness.least), self._bottom)
+        return sizes
 
     def _could_touch(self, moved: FloatArray) -> FloatArray:
         """The forces that dofs off the obstacle would have if they moved once more, shape (n,)."""
@@ -256,8 +260,7 @@ class Extended:
         """Leave forces that are none out, and dofs without force off the obstacle."""
         bounded, mask = self.active.bounded, self.active.mask
         x, residual = self._vectors.x, self.residual
-        lost = self._pushes() <= FORCES * BOTTOM * self._stiffness.made_of.max()
-        nothing = none[self._stiffness.bounded] | lost
+        nothing = none[self._stiffness.bounded] | (self._pushes() <= FORCES * self._bottom)
         residual.array[bounded[mask & nothing]] = 0.0
         at = x.array_r[bounded]
         side = self._bounds.side(at)
