@@ -63,6 +63,7 @@ class Side:
         external: u_ext.
         wave: Amplitude, frequency and phase of s along the edge.
         bounds: Of a contact part: "lower", "upper" or "both".
+        pressed: What λ has beyond the wave, in parts of its amplitude; not between two bounds.
     """
 
     kind: str
@@ -70,11 +71,12 @@ class Side:
     external: float
     wave: tuple[float, float, float]
     bounds: str = "lower"
+    pressed: float = 0.0
 
     @property
     def middle(self) -> float:
         """Where λ = 0 between the bounds."""
-        return BETWEEN * self.wave[0] if self.bounds == "both" else 0.0
+        return (BETWEEN if self.bounds == "both" else -self.pressed) * self.wave[0]
 
     def pressure(self, s: Any, largest: Callable[[Any, Any], Any] = np.maximum) -> Any:
         """λ."""
@@ -89,6 +91,9 @@ class Case:
     Args:
         rng: What it is drawn by.
     """
+
+    height = 1.0
+    """Of the domain, which is 1 wide."""
 
     def __init__(self, rng: np.random.Generator):
         self.amplitudes, self.phases = rng.uniform(-1, 1, 3), rng.uniform(0, 6, 3)
@@ -176,15 +181,19 @@ class Case:
         """B on an edge, for a Problem."""
         return self.sides[i].b
 
+    def along(self, i: int, t: Any, sin: Any = np.sin) -> Any:
+        """S on an edge."""
+        amplitude, frequency, phase = self.sides[i].wave
+        return amplitude * sin(frequency * t + phase)
+
     def problem(self) -> Problem:
         """All data, none derived from u."""
 
         def on(i: int) -> Any:
             side = self.sides[i]
-            amplitude, frequency, phase = side.wave
 
             def wave(x: Any) -> Any:
-                return amplitude * ufl.sin(frequency * x[i % 2] + phase)
+                return self.along(i, x[i % 2], ufl.sin)
 
             def g(x: Any) -> Any:
                 return self.known(i, x[0], x[1], ufl.sin, ufl.cos)
@@ -223,27 +232,30 @@ class Case:
     def energy(self) -> float:
         """J(u), by Gauss's rules on the square and on the edges between the zeros of s."""
         t, weights = _gauss(np.linspace(0.0, 1.0, 9))
-        x, y = np.meshgrid(t, t)
+        x, y = np.meshgrid(t, self.height * t)
         a, b = self.slope(x, y)
         u = self.u(x, y)
         rest = self.f(x, y) - self.mass(x, y) * u  # smooth
         total = float(weights @ (0.5 * self.squares(a, b, x, y) - rest * u) @ weights)
+        total *= self.height
         total -= 0.5 * self.mass_of_square()
         for i, side in enumerate(self.sides):
             if side.kind == "dirichlet":
                 continue
             amplitude, frequency, phase = side.wave
-            turns, level = np.arange(-5, 12) * np.pi, np.arcsin(side.middle / amplitude)
+            level = np.arcsin(np.clip(side.middle / amplitude, -1.0, 1.0))
+            turns = np.arange(-5, 12) * np.pi
             zeros = np.concatenate([turns - level, turns + level]) - phase
             zeros = np.unique(zeros / frequency)
-            cuts = np.linspace(0.0, 1.0, 9)
+            length = self.height if i % 2 else 1.0
+            cuts = np.linspace(0.0, length, 9)
             if side.kind == "contact":
-                cuts = np.unique([*cuts, *zeros[(zeros > 0) & (zeros < 1)]])
+                cuts = np.unique([*cuts, *zeros[(zeros > 0) & (zeros < length)]])
             t, weights = _gauss(cuts)
-            x, y = edge(i, t)
+            x, y = edge(i, t, self.height)
             u, g = self.u(x, y), self.known(i, x, y)
             if side.kind == "contact":
-                g = g - side.pressure(amplitude * np.sin(frequency * t + phase))
+                g = g - side.pressure(self.along(i, t))
             b = self.loss(i, x, y)
             total += float(weights @ (0.5 * b * u**2 - (g + b * side.external) * u))
         return total
@@ -485,6 +497,63 @@ class OneHolds(Layered):
         ]
 
 
+class Flat(Case):
+    """No reaction and no loss, in a strip of one to three layers of cells that are wide and low.
+
+    In half of the cases v is all but known: one layer; u is a cubic, touches the floor all along,
+    with a cubic for a pressure, and is given on the other sides.
+
+    Args:
+        rng: What it is drawn by.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        super().__init__(rng)
+        self.c, self.held = 0.0, bool(rng.random() < 0.5)
+        self.columns = int(rng.integers(1, 5) if self.held else rng.integers(2, 9))
+        self.layers, self.levels = (1, 1) if self.held else map(int, rng.integers(1, (4, 3)))
+        self.height = self.layers / self.columns / float(rng.uniform(8, 60))
+        self.cubic = rng.uniform(-1, 1, 5)
+        kinds = ["neumann" if side.kind == "robin" else side.kind for side in self.sides]
+        if self.held:
+            kinds[1:] = 3 * ["dirichlet"]
+        elif "dirichlet" not in kinds:
+            kinds[2] = "dirichlet"
+        self.sides = [
+            replace(side, kind=kind, b=0.0) for side, kind in zip(self.sides, kinds, strict=True)
+        ]
+        if self.held:
+            bounds = str(rng.choice(["lower", "upper"]))
+            self.sides[0] = replace(self.sides[0], pressed=33.0, bounds=bounds)
+
+    def along(self, i: int, t: Any, sin: Any = np.sin) -> Any:
+        """S on an edge: a cubic below."""
+        if not self.held or i:
+            return super().along(i, t, sin)
+        z = 2.0 * t - 1.0
+        return 30.0 * self.sides[0].wave[0] * z * (4.0 * z**2 - 3.0)
+
+    def u(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """U."""
+        if not self.held:
+            return super().u(x, y, sin)
+        a, b, c, d, e = map(float, self.cubic)
+        return a + x * (b + x * (c + d * x)) + e * y
+
+    def slope(self, x: Any, y: Any, cos: Callable[[Any], Any] = np.cos) -> tuple[Any, Any]:
+        """∇u."""
+        if not self.held:
+            return super().slope(x, y, cos)
+        _, b, c, d, e = map(float, self.cubic)
+        return b + x * (2.0 * c + 3.0 * d * x), e + 0.0 * y
+
+    def f(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """−κΔu."""
+        if not self.held:
+            return super().f(x, y, sin)
+        return -self.kappa * (2.0 * float(self.cubic[2]) + 6.0 * float(self.cubic[3]) * x)
+
+
 EAST = [[0.5, 0.0], [1.0, 0.0], [1.0, 1.0], [0.5, 1.0]]
 
 
@@ -521,6 +590,7 @@ def distances(solution: Solution, case: Case) -> tuple[float, float]:
     for i, side in enumerate(case.sides):
         if side.b == 0.0:
             continue
+        assert case.height == 1.0
         here = np.abs(corner @ NORMALS[i] - (NORMALS[i].sum() > 0)) < 1e-9
         for j in range(3):
             on = np.flatnonzero(here[:, (j + 1) % 3] & here[:, (j + 2) % 3])
@@ -551,6 +621,13 @@ def judge(solution: Solution, case: Case) -> Outcome:
 
 def solved(case: Case, rng: np.random.Generator) -> Solution:
     """On one of several kinds of meshes; collective."""
+    if isinstance(case, Flat):
+        shape = np.array([1.0, case.layers / case.columns])
+        squares = Polygon(np.array(CORNERS) * shape, SIDES, names=SIDES)
+        domain = families.structured(squares, case.columns, COMM)
+        domain.mesh.geometry.x[:, 1] *= case.height / shape[1]
+        *_, solution = solve_levels(case.problem(), domain, case.levels)
+        return solution
     layered = isinstance(case, Layered)
     polygon = Polygon(CORNERS, SIDES, names=SIDES, materials={"east": EAST} if layered else {})
     kind, levels = str(rng.choice(["structured", "gmsh", "adaptive"])), int(rng.integers(1, 4))
@@ -588,20 +665,19 @@ def smooth(c: float, b: float, bounds: str | None = None) -> Case:
     return case
 
 
-def edge(i: int, t: Any) -> tuple[Any, Any]:
-    """Points of an edge, t from 0 to 1."""
-    ends = [np.zeros_like(t), np.ones_like(t)]
-    return ((t, ends[0]), (ends[1], t), (t, ends[1]), (ends[0], t))[i]
+def edge(i: int, t: Any, height: float = 1.0) -> tuple[Any, Any]:
+    """Points of an edge, t from 0 to its length."""
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    return ((t, zero), (one, t), (t, height * one), (zero, t))[i]
 
 
 def exact_flux(case: Case, i: int, weight: Callable[[Any], Any] = np.ones_like) -> float:
     """∫ λ w on a contact edge, ∫ κ∂ₙu w on another, so finely that kinks do not count."""
     side = case.sides[i]
-    amplitude, frequency, phase = side.wave
     t, weights = _gauss(np.linspace(0.0, 1.0, 4001))
     weights = weights * weight(t)
     if side.kind == "contact":
-        return float(weights @ side.pressure(amplitude * np.sin(frequency * t + phase)))
+        return float(weights @ side.pressure(case.along(i, t)))
     return float(weights @ case.through(i, *edge(i, t)))
 
 
@@ -640,6 +716,7 @@ TENSORS = "the same with κ a tensor, its eigenvalues up to 1 : 10⁴, in two fi
 
 ALONE = "contact alone holds u, on one to four edges"
 ONE_HOLDS = "a reaction in one half, up to 1e8, and no Γ0"
+FLAT = "no c, no b: strips of cells 8 to 60 times as wide as high"
 FLUXES = "Forces and fluxes of parts, c and b up to 1e8, contact anywhere"
 SETTLED = "Forces and fluxes of parts, c and b up to 1e8, contact everywhere or nowhere"
 WEIGHTED = "The same with weights of either sign, also where contact and Dirichlet parts meet"
@@ -849,6 +926,7 @@ def terms(seed: int, quick: bool) -> Group:
             told(_drawn(seed, 1 if quick else 60, Leaky, LEAKY)),
             told(_drawn(seed, 2 if quick else 60, Alone, ALONE)),
             told(_drawn(seed, 2 if quick else 60, OneHolds, ONE_HOLDS)),
+            told(_drawn(seed, 2 if quick else 100, Flat, FLAT)),
             *(
                 told(_smooth(1 if quick else 4, bounds))
                 for bounds in (None, "lower", "upper", "both")

@@ -735,16 +735,25 @@ class Segments:
         found[:, at] = self.most, norm + self.rough, np.sqrt(area) * (ends + bump)
         return found[0], found[1], found[2]
 
-    def change(self, vertices: FloatArray, bumps: FloatArray) -> float:
-        """Bound |∫_Γg (g − q) v|, v by vertices and bumps; this rank's share."""
+    def change(
+        self, vertices: FloatArray, bumps: FloatArray, thirds: FloatArray | None = None
+    ) -> float:
+        """Bound |∫_Γg (g − q) v|, v by vertices, bumps and cubics; this rank's share.
+
+        The rule is exact for quadratics times cubics.
+        """
         ends = vertices[self.facets.ends]
         area = np.bincount(self.place, self.measure, minlength=len(self.through))
         bump = np.abs(bumps[self.facets.dofs]) if len(ends) == 2 else 0.0
         mean = np.abs(ends.mean(axis=0)) + bump
         swing = np.ptp(ends, axis=0) + 2.0 * bump
+        if thirds is not None:  # their means are 0
+            swing = swing + THIRD * np.abs(thirds[self.facets.dofs])
         return float(np.sum(mean * self.missed + swing * np.sqrt(area) * self.rough))
 
 
+THIRD = 0.1
+"""No λ_j λ_k (λ_j − λ_k) is larger."""
 G_UNBOUNDED = "g is not bounded on the mesh, or not known to be"
 
 

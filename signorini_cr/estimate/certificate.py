@@ -463,7 +463,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     )
     totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
     totals.energy_slack += more_energy
-    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps)
+    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
     of_edge = segments.measure @ (segments.weights @ (segments.values * on_edge))
     totals.energy -= float(of_edge)
     if known.square is not None:
@@ -709,7 +709,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
     at, sizes = segments.beyond()
     on_edge = np.sum(sizes**2 / pick(kappa.low, at))
-    change += segments.change(v.vertices, v.bumps)
+    change += segments.change(v.vertices, v.bumps, v.thirds)
     square, on_edge, of_loss, change = cells.total(
         square, on_edge, np.sum(segments.beyond_loss), change
     )

@@ -348,7 +348,12 @@ def bend_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
 
 
 def on_facet(
-    cells: Cells, side: BoundaryFacets, hats: FloatArray, v: FloatArray, bumps: FloatArray
+    cells: Cells,
+    side: BoundaryFacets,
+    hats: FloatArray,
+    v: FloatArray,
+    bumps: FloatArray,
+    thirds: FloatArray | None = None,
 ) -> FloatArray:
     """Values of v at points of facets, shape (q, n).
 
@@ -358,11 +363,16 @@ def on_facet(
         hats: Barycentric coordinates, shape (q, d) or (q, d, n).
         v: v at the vertices.
         bumps: Heights of v's bumps.
+        thirds: Those of its cubics; None where it has none.
     """
     hats = hats if hats.ndim == 3 else hats[:, :, None]
     values = (hats * v[side.ends]).sum(axis=1)
     if cells.tdim == 2:
-        values = values + 4.0 * hats.prod(axis=1) * bumps[side.dofs]
+        height, product = 4.0 * bumps[side.dofs], hats.prod(axis=1)
+        if thirds is not None:
+            third = cells.ways_between(*side.ends) * thirds[side.dofs]
+            height = height + third * (hats[:, 0] - hats[:, 1])
+        values = values + product * height
     return values
 
 

@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from ..arrays import FloatArray
-from ..data.loads import Certain, Segments, trace_of
+from ..data.loads import THIRD, Certain, Segments, trace_of
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
 from .certificate import Made
 from .companion import on_facet
@@ -16,8 +16,6 @@ CUSP = 0.5
 """No cusp of the height 1 is larger: t^s − t for s = ½ and ¼."""
 ROUNDING = 1e-14
 """What rounding may do to ∫ ψ, in parts of ∫ |ψ|."""
-THIRD = 0.1
-"""No cubic function of a facet with the height 1 is larger."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +115,13 @@ def on_side(made: Made, cells: Cells, psi: Segments) -> Pairing:
         sums = np.bincount(psi.place, psi.measure * (psi.weights @ values), minlength=len(length))
         return sums.astype(np.float64)
 
-    v = on_facet(cells, psi.side, psi.hats, made.vertices, made.bumps)
+    own_v = made.vertices, made.bumps, made.thirds
+    v = on_facet(cells, psi.side, psi.hats, *own_v)
     u = np.einsum("qdn,dn->qn", psi.hats, trace_of(cells, facets, made.w)[:, psi.place])
     own = np.zeros(len(cells.exterior))
     np.add.at(own, made.bounded, made.lift[3])
     norm = np.sqrt(over(psi.values**2)) + psi.rough
-    unsure = psi.change(made.vertices, made.bumps) + norm @ own[facets.dofs]
-    if made.thirds is not None:
-        beyond = np.sqrt(psi.squares) / np.sqrt(210.0) + THIRD * psi.rough
-        unsure += np.abs(made.thirds[facets.dofs]) * np.sqrt(length) @ beyond
+    unsure = psi.change(*own_v) + norm @ own[facets.dofs]
     return Pairing(
         float(np.sum(length)),
         float(np.sum(psi.through)),

@@ -39,6 +39,7 @@ from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.fem.cells import Cells
 from signorini_cr.force import flux, force_bounds
 from signorini_cr.means import mean
+from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
 
@@ -64,7 +65,44 @@ def energy_of(problem, domain):
     return integral(0.5 * ufl.inner(ufl.grad(u), ufl.grad(u)) - f * u, domain.mesh)
 
 
+def low_cells(n, height, pressure):
+    """u = x³ above x³ on one layer of low cells; the pressure is 21/20 + P₃ on each facet."""
+    corners = np.array([[0, 0], [1, 0], [1, 1 / n], [0, 1 / n]])
+    polygon = Polygon(corners, ["floor", *3 * ["sides"]], names=["floor", "sides"])
+    domain = structured(polygon, n, WORLD)
+    domain.mesh.geometry.x[:, 1] *= height * n
+
+    def g(x):
+        along = 2 * n * x[0] - 1
+        for i in range(1, n):
+            along = ufl.conditional(ufl.lt(x[0], i / n), along, 2 * (n * x[0] - i) - 1)
+        return -pressure * (1.05 + (5 * along**3 - 3 * along) / 2)
+
+    def u(x):
+        return x[0] ** 3
+
+    conditions = {"floor": Contact(u, g=g), "sides": Dirichlet(u)}
+    return Problem(f=lambda x: -6 * x[0], conditions=conditions), domain
+
+
 # ---- the bound holds and is sharp
+
+
+@pytest.mark.parametrize("n, height, pressure", [(2, 1 / 28, 5), (4, 1 / 56, 1), (2, 1 / 28, 50)])
+def test_energy_where_cubics_meet_a_flux(n, height, pressure):
+    """J(u) by hand: ½ · 9/5 H + 6/5 H and ∫ λ x³, with ∫ P₃ x³ = 1/(140 n³) in all."""
+    problem, domain = low_cells(n, height, pressure)
+    solution = solve(problem, domain)
+    low, high = solution.certificate.energy
+    energy = 2.1 * height + pressure * (1.05 / 4 + 1 / (140 * n**3))
+    assert low <= energy <= high
+    v = solution.certificate.companion
+    assert v.function_space.element.basix_element.degree == 3
+    x = ufl.SpatialCoordinate(domain.mesh)
+    of_v = integral(0.5 * ufl.inner(ufl.grad(v), ufl.grad(v)) + 6 * x[0] * v, domain.mesh)
+    floor = ufl.Measure("ds", subdomain_data=domain.tags, subdomain_id=domain.parts["floor"])
+    of_v -= integral(problem.conditions["floor"].g(x) * v, domain.mesh, floor)
+    assert high == pytest.approx(of_v, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["S1", "A", "B", "C", "I", "S1_NEUMANN", "S1_RAISED"])

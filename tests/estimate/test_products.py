@@ -280,7 +280,7 @@ def test_a_weight_on_sides():
     assert np.isclose(
         pairing.on_side(made, cells, replace(edge, missed=missed)).missed, missed.sum()
     )
-    # ‖ψ‖_F ‖ℓ‖_F, where ℓ may come twice; ‖ψ − ψ_F‖ ‖c_F‖ for cubics, ‖ψ − q‖ for both
+    # ‖ψ‖_F ‖ℓ‖_F, where ℓ may come twice
     twice = edge.facets.dofs[[0, 3, 3]]
     made.bounded, made.lift = twice, (None, None, None, np.array([0.2, 0.3, 0.1]))
     norms = np.sqrt(on.integral(weight**2))
@@ -291,13 +291,14 @@ def test_a_weight_on_sides():
     assert np.isclose(extra, (norms + rough)[[0, 3]] @ [0.2, 0.4], rtol=1e-5)
     made.lift = (None, None, None, np.zeros(3))
     made.thirds = rng.normal(size=len(cells.exterior))
-    cubic = np.abs(made.thirds[edge.facets.dofs, None]) * (on.s * (1 - on.s) * (1 - 2 * on.s))
-    off = np.sqrt(on.integral((weight - (weight @ on.weights)[:, None]) ** 2))
-    size = np.sqrt(on.integral(cubic**2))
-    assert np.isclose(pairing.on_side(made, cells, edge).unsure, off @ size, rtol=1e-5)
+    ways = cells.ways_between(*edge.facets.ends) * made.thirds[edge.facets.dofs]
+    cubic = ways[:, None] * (on.s * (1 - on.s) * (1 - 2 * on.s))
+    found = pairing.on_side(made, cells, edge)
+    assert np.isclose(found.of_v, on.integral(weight * (v + cubic)).sum(), rtol=1e-5)
+    assert found.unsure == 0.0
     extra = pairing.on_side(made, cells, rougher).unsure - edge_change(rougher, made)
     largest = np.abs(cubic).max(axis=1) * np.sqrt(on.length)
-    assert off @ size + largest @ rough <= extra <= off @ size + 1.06 * largest @ rough
+    assert largest @ rough <= extra <= 1.06 * largest @ rough
 
 
 def edge_change(edge, made):
