@@ -378,6 +378,23 @@ def _even_load_f(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
     return p[1] + 0.0 * x
 
 
+# Three waves that cross the domain aslant, less 0.5 y: amplitudes, wave numbers by x and y, phases.
+
+
+def _waves_u(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return sum(a * m.sin(k * x + q * y + s) for a, k, q, s in np.reshape(p, (3, 4))) - 0.5 * y
+
+
+def _waves_gradient(m: Any, x: Any, y: Any, p: Sequence[Any]) -> tuple[Any, Any]:
+    rows = [(k, q, a * m.cos(k * x + q * y + s)) for a, k, q, s in np.reshape(p, (3, 4))]
+    return sum(k * each for k, _, each in rows), sum(q * each for _, q, each in rows) - 0.5
+
+
+def _waves_f(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    rows = np.reshape(p, (3, 4))
+    return sum((k**2 + q**2) * a * m.sin(k * x + q * y + s) for a, k, q, s in rows)
+
+
 SHEAR = 50.0
 
 
@@ -643,6 +660,13 @@ def _parallelograms(quick: bool) -> list[Row]:
             ([1, 0], [SHEAR, 1]),
             quick,
             open_side=True,
+        ),
+        _thin(
+            "squares sheared 1 : 50, three waves along them",
+            (_waves_u, _waves_gradient, _waves_f),
+            (0.5, 0.05, 0.03, 1.0, 0.4, -0.04, 0.05, 2.0, 0.8, 0.1, -0.06, 5.0),
+            ([1, 0], [-SHEAR, 1]),
+            quick,
         ),
         _thin(
             "squares sheared 1 : 50, u sheared as well",

@@ -588,13 +588,18 @@ class Segments:
         area = np.bincount(self.place, self.measure, minlength=n)
         return self.values - (self.through / area)[self.place]
 
-    def _by_cell(self, norms: FloatArray) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg, and the sum of c_F ‖·‖_F over their facets."""
+    def _by_cell(self, sizes: FloatArray) -> tuple[IndexArray, FloatArray]:
+        """Cells at Γg, and the sums over their facets."""
         at, place = np.unique(self.facets.cells, return_inverse=True)
-        sizes = np.bincount(
-            place, _trace_constant(self.cells, self.facets) * norms, minlength=len(at)
-        )
-        return at, sizes.astype(np.float64)
+        return at, np.bincount(place, sizes, minlength=len(at)).astype(np.float64)
+
+    @cached_property
+    def _constant(self) -> FloatArray:
+        """C with |∫_F ϱ e| ≤ C ‖ϱ‖_F ‖∇e‖_T where ∫_F ϱ = 0, shape (facets,)."""
+        if self.cells.tdim != 2:
+            return _trace_constant(self.cells, self.facets)
+        found = _Triangles.of(self.cells, self.facets)
+        return np.minimum(found.constant(), found.nearer().constant())
 
     @cached_property
     def slope(self) -> FloatArray:
@@ -609,8 +614,7 @@ class Segments:
     @cached_property
     def given(self) -> BoolArray:
         """Where b takes up q − g_F more cheaply than a field in the cell does, shape (facets,)."""
-        low, constant = pick(self.low, self.facets.cells), _trace_constant(self.cells, self.facets)
-        return self.loss * constant**2 > low
+        return self.loss * self._constant**2 > pick(self.low, self.facets.cells)
 
     @cached_property
     def squares(self) -> FloatArray:
@@ -688,28 +692,29 @@ class Segments:
     def oscillation(self, carried: bool) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F ‖σ‖_T for each, where b does not take up q − g_F.
 
-        That is c_F ‖q − g_F‖_F at most, or for d = 2 what a quadratic part has of its own, and c_F
-        times what is left.
+        That is C ‖q − g_F‖_F at most, or for d = 2 what a quadratic part has of its own, and C
+        times what is left: σ may vanish outside of a triangle in the cell.
 
         Args:
             carried: Whether y carries q's affine part, and what is left of q − g_F is meant.
         """
         squares = np.where(self.given, 0.0, self.squares)
         if self.cells.tdim != 2:
-            return self._by_cell(np.sqrt(squares))
+            return self._by_cell(self._constant * np.sqrt(squares))
         area = self._over_facets(self.measure)
         a, c = (np.where(self.given, 0.0, each) for each in (self.slope, self.bend))
         if carried:
             squares, a = squares - area * a**2 / 3.0, np.zeros_like(a)
         rest = squares - area * (a**2 / 3.0 + c**2 / 5.0)
-        known = _of_quadratic(self.cells, self.facets, a, c)
-        known = known / _trace_constant(self.cells, self.facets)
-        rest, squares = np.maximum(rest, 0.0), np.maximum(squares, 0.0)
-        return self._by_cell(np.minimum(np.sqrt(squares), known + np.sqrt(rest)))
+        own = _Triangles.of(self.cells, self.facets)
+        known = np.minimum(own.quadratic(a, c), own.nearer().quadratic(a, c))
+        known += self._constant * np.sqrt(np.maximum(rest, 0.0))
+        return self._by_cell(np.minimum(self._constant * np.sqrt(np.maximum(squares, 0.0)), known))
 
     def beyond(self) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each, where b does not take up g − q."""
-        return self._by_cell(np.where(self.given, 0.0, self.rough))
+        constant = _trace_constant(self.cells, self.facets)
+        return self._by_cell(constant * np.where(self.given, 0.0, self.rough))
 
     @property
     def beyond_loss(self) -> FloatArray:
@@ -767,27 +772,64 @@ def _trace_constant(cells: Cells, side: BoundaryFacets) -> FloatArray:
     return np.sqrt(measures(cells, side) / cells.volume[side.cells] * c * (c + 2.0 * h / d))
 
 
-def _of_quadratic(cells: Cells, side: BoundaryFacets, a: FloatArray, c: FloatArray) -> FloatArray:
-    """Bound ‖σ‖_T of the gradient σ with σ·n = a (λ_j − λ_k) + c (6 λ_j λ_k − 1), shape (n,).
+@dataclass(frozen=True, eq=False)
+class _Triangles:
+    """Triangles that have boundary facets for a side, d = 2.
 
-    d = 2, j and k are the ends of F, and on the other facets σ·n = 0. No field without divergence
-    and with these fluxes is smaller, and curl ψ is one, for
-    ψ = |F| λ_j λ_k (a (1 + β λ_i) + c (λ_k − λ_j)), with the best β for c = 0.
+    Attributes:
+        measure: |F|, shape (n,).
+        squares: Squared lengths of F, and of the ways from its ends j and k to the apex, as the
+            cells measure lengths, shape (3, n).
+        area: Shape (n,).
     """
-    at = side.cells
-    s = np.zeros((3, 3, len(at)))
-    for (p, q), each in zip(cells.pairs, cells.stiffness[:, at], strict=True):
-        s[p, q], s[q, p] = each, each
-        s[p, p] -= each
-        s[q, q] -= each
-    j, k = cells.others[side.local].T
-    row = np.arange(len(at))
-    jj, kk, jk = s[j, j, row], s[k, k, row], s[j, k, row]
-    trace = s[0, 0] + s[1, 1] + s[2, 2]
-    square = a**2 * (trace / 12.0 - jk**2 / (5.0 * trace))
-    square += a * c * (jj - kk) * (1.0 / 15.0 + 2.0 * jk / (15.0 * trace))
-    square += c**2 * (2.0 * (jj + kk) + jk) / 45.0
-    return np.asarray(measures(cells, side) * np.sqrt(np.maximum(square, 0.0)))
+
+    measure: FloatArray
+    squares: FloatArray
+    area: FloatArray
+
+    @classmethod
+    def of(cls, cells: Cells, side: BoundaryFacets) -> _Triangles:
+        """The facets' cells."""
+        between = dict(zip(cells.pairs, cells.lengths[:, side.cells], strict=True))
+        rows = np.stack([between[1, 2], between[0, 2], between[0, 1]])  # by the opposite vertex
+        n, (j, k) = np.arange(len(side.cells)), cells.others[side.local].T
+        squares = np.stack([rows[side.local, n], rows[k, n], rows[j, n]])
+        return cls(measures(cells, side), squares, cells.volume[side.cells])
+
+    def nearer(self) -> _Triangles:
+        """Triangles in them that are about as high as wide, aslant or not, or themselves.
+
+        The apex is as far from the point of F that was nearest to it as F is long, or nearer.
+        """
+        base, first, second = self.squares
+        length = np.sqrt(base)
+        along, height = (base + first - second) / (2.0 * length), 2.0 * self.area / length
+        foot = np.clip(along, 0.0, length)
+        part = np.minimum(1.0, length / np.hypot(along - foot, height))
+        along, up = foot + part * (along - foot), (part * height) ** 2
+        squares = np.stack([base, along**2 + up, (length - along) ** 2 + up])
+        return _Triangles(self.measure, squares, part * self.area)
+
+    def constant(self) -> FloatArray:
+        """C with ‖e − e_T‖_F ≤ C ‖∇e‖_T, see `_trace_constant`, shape (n,)."""
+        h = np.sqrt(self.squares.max(axis=0))
+        c = poincare(2) * h
+        return np.asarray(np.sqrt(self.measure / self.area * c * (c + h)))
+
+    def quadratic(self, a: FloatArray, c: FloatArray) -> FloatArray:
+        """Bound ‖σ‖ of the gradient σ with σ·n = a (λ_j − λ_k) + c (6 λ_j λ_k − 1), shape (n,).
+
+        σ·n = 0 on the other sides. No field without divergence and with these fluxes is smaller,
+        and curl ψ is one, for ψ = |F| λ_j λ_k (a (1 + β λ_i) + c (λ_k − λ_j)), with the best β for
+        c = 0.
+        """
+        base, first, second = self.squares
+        jj, kk, jk = second, first, 0.5 * (base - first - second)
+        jj, kk, jk, trace = (x / (4.0 * self.area) for x in (jj, kk, jk, base + first + second))
+        square = a**2 * (trace / 12.0 - jk**2 / (5.0 * trace))
+        square += a * c * (jj - kk) * (1.0 / 15.0 + 2.0 * jk / (15.0 * trace))
+        square += c**2 * (2.0 * (jj + kk) + jk) / 45.0
+        return np.asarray(self.measure * np.sqrt(np.maximum(square, 0.0)))
 
 
 def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> FloatArray:

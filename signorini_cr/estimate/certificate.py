@@ -8,7 +8,7 @@ what neither of them knows about u. Both come from u_h at linear cost, see `flux
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ from ..jit import compiled
 from ..rounding import at_most, interval
 from .beyond import Beyond
 from .companion import Companion, Lifted, companion, on_facet
-from .cubic import cubed, with_thirds
+from .cubic import cubed, with_cubics
 from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
@@ -141,7 +141,9 @@ class Certificate:
             middle = (values.sum(axis=0) - values) / 2 + made.bumps[cells.facets]
             v.x.array[dofs[:, 3:]] = middle.T
         v.x.scatter_forward()
-        return v if made.thirds is None else with_thirds(cells, v, made.thirds)
+        if made.thirds is None or made.bubbles is None:
+            return v
+        return with_cubics(cells, v, made.thirds, made.bubbles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +175,7 @@ class Made:
     segments: Segments
     beyond: Beyond | None
     thirds: FloatArray | None
+    bubbles: FloatArray | None
     cusps: Cusps | None
     varies: bool
     reaction: FloatArray
@@ -229,8 +232,7 @@ def certify(solution: Found, sweeps: int = 2, flux_from: Found | None = None) ->
     try:
         with base.level.as_made():
             known = _equilibrated(solution, base)
-            v, sums = _companion(solution, known, sweeps)
-            certificate = _added_up(known, v, sums)
+            certificate = _best(known, _companions(solution, known, sweeps))
     except _NoBound as why:
         certificate = Certificate(reason=str(why))
     return replace(certificate, seconds=time.perf_counter() - began)
@@ -410,9 +412,12 @@ def _seen_from(
     return own
 
 
-def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, Sums]:
-    """Make v, improve y where that promises much, and integrate the gap; collective."""
-    cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
+def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[tuple[Companion, Sums]]:
+    """Make v, on thin cells in other ways as well, and y with it; integrate the gaps; collective.
+
+    y is changed when the next way is asked for.
+    """
+    cells, kappa, flux = known.cells, known.kappa, known.flux
     if solution.element != "CR":
         sweeps = 0  # v is the solution itself
     data = diffusion(known.level.data)
@@ -420,19 +425,54 @@ def _companion(solution: Found, known: _Known, sweeps: int) -> tuple[Companion, 
     plain = data.forms.of_one is None
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
-    v = companion(_functional(known, plain), flux, u_D, alpha, sweeps, goal, highest)
+    functional = _functional(known, plain)
+    for touching in (False, True):
+        v = companion(functional, flux, u_D, alpha, sweeps, goal, highest, touching)
+        flux.beyond = None
+        sums = _integrated(known, v)
+        of_y, of_alpha = promising(cells, kappa.mean, flux, v, sums)
+        yield v, sums
+        ways = []
+        if of_y and (v.cusps is not None or not plain or kappa.values is not None):
+            ways.append(v)
+        if of_y and plain and kappa.values is None:
+            ways.append(cubed(cells, kappa.mean, flux, replace(v, cusps=None)))
+        for way in ways:
+            improve(cells, kappa, known.certain.load, known.segments, flux, way, known.c.low)
+            yield way, _integrated(known, way)
+        if not of_alpha:
+            return
+
+
+def _integrated(known: _Known, v: Companion) -> Sums:
+    """Integrate the gap between y and v."""
+    cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
-    if promising(cells, kappa.mean, flux, sums):
-        if plain and kappa.values is None and v.cusps is None:
-            v = cubed(cells, kappa.mean, flux, v)
-        improve(cells, kappa, load, known.segments, flux, v, known.c.low)
-        sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
     if v.cusps is not None:
         sums.totals.energy_slack += v.cusps.add(
             cells, known.w, load, kappa.low, flux, known.c.low, (v.excess, v.bumps), sums
         )
-    np.add.at(sums.indicators, alpha.side.cells, v.contact)
-    return v, sums
+    np.add.at(sums.indicators, v.boundary.alpha.side.cells, v.contact)
+    return sums
+
+
+def _best(known: _Known, ways: Iterator[tuple[Companion, Sums]]) -> Certificate:
+    """Take the way with the least bound, and of all what they know of J(u); collective.
+
+    Raises:
+        _NoBound: With the first one's reason.
+    """
+    found, reasons = [], []
+    for v, sums in ways:
+        try:
+            found.append(_added_up(known, v, sums))
+        except _NoBound as why:
+            reasons.append(why)
+    if not found:
+        raise reasons[0]
+    lows, highs = zip(*(each.energy for each in found if each.energy), strict=True)
+    best = min(found, key=lambda each: each.bound_energy_norm or 0.0)
+    return replace(best, energy=(max(lows), min(highs)))
 
 
 def _functional(known: _Known, plain: bool) -> Functional:
@@ -589,6 +629,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         vertices=v.vertices,
         bumps=v.bumps,
         thirds=v.thirds,
+        bubbles=v.bubbles,
         cusps=v.cusps,
         reaction=known.c.low,
         left=flux.left,
@@ -702,6 +743,8 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
             if cells.tdim == 2:
                 means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3
+            if v.bubbles is not None:
+                means += np.abs(v.bubbles[part]) / 60
             steep = np.sqrt(np.maximum(sums.steepness[part], 0.0))
             change += float(means @ missed[part] + by_slope @ steep)
             square += float(rough @ rough)

@@ -30,7 +30,7 @@ from .flux import Flux
 from .functional import Functional, Masses
 from .heights import promise_of_vertices, sweep
 from .lifting import Cubic, Lift, affine, cheaper, joined, lift
-from .shapes import bump_slopes, local_thirds, third_slopes
+from .shapes import bubble_slopes, bump_slopes, local_thirds, third_slopes
 
 Lifted = tuple[IndexArray, FloatArray, FloatArray, FloatArray]
 
@@ -68,6 +68,7 @@ class Companion:
         boundary: What v has to be on Γ0 and above on Γ1.
         cusps: What v has beyond vertices and bumps; None if nothing, then on all ranks.
         thirds: Heights of the cubic functions of facets by facet dof, see `cubic`; or None.
+        bubbles: Those of the cells' λ_1 λ_2 λ_3, shape (cells,); or None.
     """
 
     vertices: FloatArray
@@ -79,6 +80,7 @@ class Companion:
     boundary: Boundary
     cusps: Cusps | None = None
     thirds: FloatArray | None = None
+    bubbles: FloatArray | None = None
 
     def slopes(self, cells: Cells, where: slice | IndexArray) -> Callable[[FloatArray], FloatArray]:
         """∇(v − u_h) without cusps, as γ_i with ∇(v − u_h) = Σ γ_i ∇λ_i, as a function.
@@ -91,15 +93,19 @@ class Companion:
             A function of a point's barycentric coordinates, shape (d + 1, 1) or (d + 1, n); its
             values are of shape (d + 1, n).
         """
-        excess, height, third = self.excess[:, where], None, None
+        excess, height, third, bubble = self.excess[:, where], None, None, None
         if cells.tdim == 2:
             height = self.bumps[cells.facets[:, where]]
         if self.thirds is not None:
             third = local_thirds(cells, self.thirds, where)
+        if self.bubbles is not None:
+            bubble = self.bubbles[where]
 
         def at(hat: FloatArray) -> FloatArray:
             gamma = excess if height is None else excess + bump_slopes(cells, height, hat)
-            return gamma if third is None else gamma + third_slopes(cells, third, hat)
+            if third is not None:
+                gamma = gamma + third_slopes(cells, third, hat)
+            return gamma if bubble is None else gamma + bubble * bubble_slopes(hat)
 
         return at
 
@@ -112,6 +118,7 @@ def companion(
     sweeps: int,
     goal: float,
     highest: float,
+    touching: bool = False,
 ) -> Companion:
     """Make v; collective.
 
@@ -123,9 +130,10 @@ def companion(
         sweeps: How often the bumps are improved.
         goal: What ‖∇ℓ‖ need not be known better than.
         highest: The largest κ.
+        touching: Whether v is α wherever y says that there is contact, whatever that costs.
     """
     cells, floors = functional.cells, Floors.of(functional.cells, alpha, functional.masses)
-    draft = _started(functional, u_D, floors, flux)
+    draft = _started(functional, u_D, floors, flux, touching)
     largest = max(1e-300, float(np.abs(draft.vertices).max(initial=0.0)))
     scale = max(cells.comm.allgather(largest))
     boundary = Boundary(u_D, alpha, scale, goal, highest, functional.masses)
@@ -144,7 +152,9 @@ def companion(
     return Companion(draft.vertices, draft.bumps, excess, above, lifts, reason, boundary, cusps)
 
 
-def _started(functional: Functional, u_D: OnParts, floors: Floors, flux: Flux) -> Draft:
+def _started(
+    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, touching: bool
+) -> Draft:
     """Make a v that is admissible, with bumps where data ask for them; collective.
 
     Args:
@@ -152,19 +162,20 @@ def _started(functional: Functional, u_D: OnParts, floors: Floors, flux: Flux) -
         u_D: Values on Γ0, seen from the cells.
         floors: What the bounds ask of v.
         flux: y, which knows where there is contact.
+        touching: As in `companion`.
     """
     cells, fixed, contact = functional.cells, u_D.side, floors.side
-    v, touching = _at_vertices(functional, u_D, floors, flux)
+    v, at_bound = _at_vertices(functional, u_D, floors, flux, touching)
     held = np.zeros(len(v))
-    held[fixed.ends] = held[contact.ends[:, touching]] = 1.0
+    held[fixed.ends] = held[contact.ends[:, at_bound]] = 1.0
     bumps, taken = np.zeros((2, floors.facets))
     if cells.tdim == 2:
         low, high = (limit[contact.dofs] for limit in floors.heights(v))
         bumps[contact.dofs] = np.clip(0.0, low, high)
         bumps[fixed.dofs] = u_D.middle - v[fixed.ends].mean(axis=0)
         ends = np.where(floors.signs > 0.0, low, high)
-        bumps[contact.dofs[touching]] = ends[touching]
-        taken[fixed.dofs] = taken[contact.dofs[touching]] = 1.0
+        bumps[contact.dofs[at_bound]] = ends[at_bound]
+        taken[fixed.dofs] = taken[contact.dofs[at_bound]] = 1.0
         # a facet's values reach the ranks that share it
         cells.share(bumps)
     return Draft(v, bumps, cells.share(held, 0) == 0.0, cells.share(taken) == 0.0)
@@ -261,7 +272,7 @@ class Boundary:
 
 
 def _at_vertices(
-    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux
+    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, touching: bool
 ) -> tuple[FloatArray, BoolArray]:
     """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D.
 
@@ -289,12 +300,12 @@ def _at_vertices(
         v /= np.maximum(collect(flat, None), 1.0)
     at_bound, loss = flux.touching.copy(), np.zeros(floors.facets)
     loss[masses.side.dofs] = masses.loss
-    moving = _moving(functional, floors)
+    moving = None if touching else _moving(functional, floors)
     for sign, limit in floors.at_vertices:
         here = flux.touching & (floors.signs == sign)
         there = floors.side.ends[:, here]
         held = collect(there.ravel(), None) > 0
-        if masses.some or moving is not None:
+        if not touching and (masses.some or moving is not None):
             # what leaving t/b and u_h for α costs in ‖p − b‖², and what not doing so costs in 4C
             costs, of_force = (
                 collect(there.ravel(), np.tile(each[here], len(there)))

@@ -1,9 +1,10 @@
-"""Cubic functions of facets for v on thin cells.
+"""Cubic functions for v on thin cells.
 
 What u_D and α have beyond quadratics has to fall off within a cell's height, which is dear where
-cells are thin. There v gets a function c_F = λ_j λ_k (λ_j − λ_k) for each facet. On Γ0 and Γ1 their
-heights are those of the data's best cubics, on Γg they are 0; the others are what brings ∇v nearest
-to ∇u_h, by conjugate gradients.
+cells are thin. There v gets a function c_F = λ_j λ_k (λ_j − λ_k) for each facet, and λ_1 λ_2 λ_3
+for each cell: without the latter a cubic on the boundary would bend v in the cells next to it. On
+Γ0 and Γ1 the facets' heights are those of the data's best cubics, on Γg they are 0; the others are
+what brings ∇v nearest to ∇u_h, by conjugate gradients.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ..data.moments import OnFacets
 from ..fem.cells import Cells, blocks, dot_rows, pick
 from .companion import Companion
 from .flux import Flux
-from .shapes import best_heights, local_thirds, quadrature, third_slopes
+from .shapes import best_heights, bubble_slopes, local_thirds, quadrature, third_slopes
 
 TOUCHING = 1e-12
 """How far v is from α in the middle of a facet where it is meant to be α, in parts of the data."""
@@ -45,15 +46,19 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
             own = np.where(apart <= TOUCHING * boundary.scale, own, 0.0)
         thirds[side.dofs] = own
     cells.share(thirds)
-    thirds += _fitted(cells, kappa, replace(v, thirds=thirds))
+    heights, bubbles = _fitted(cells, kappa, replace(v, thirds=thirds))
+    thirds += heights
     contact, lift, reasons = boundary.lifted(cells, flux, v.vertices, v.bumps, thirds)
     words = [word for rank in cells.comm.allgather(reasons) for word in rank if word]
     reason = v.reason or (words[0] if words else None)
-    return replace(v, thirds=thirds, contact=contact, lift=lift, reason=reason)
+    lifted = replace(v, contact=contact, lift=lift, reason=reason)
+    return replace(lifted, thirds=thirds, bubbles=bubbles)
 
 
-def with_thirds(cells: Cells, v: fem.Function, thirds: FloatArray) -> fem.Function:
-    """A function of degree 2 plus the cubic functions with some heights; collective."""
+def with_cubics(
+    cells: Cells, v: fem.Function, thirds: FloatArray, bubbles: FloatArray
+) -> fem.Function:
+    """A function of degree 2 plus cubic functions with some heights; collective."""
     mesh = cells.domain.mesh
     pieces = fem.Function(fem.functionspace(mesh, ("DG", 3)))
     pieces.interpolate(v)
@@ -65,6 +70,7 @@ def with_thirds(cells: Cells, v: fem.Function, thirds: FloatArray) -> fem.Functi
     )
     dofs = pieces.function_space.dofmap.list[: cells.number]
     pieces.x.array[dofs] += local_thirds(cells, thirds, slice(0, cells.number)).T @ values
+    pieces.x.array[dofs] += np.outer(bubbles, hats.prod(axis=1))
     pieces.x.scatter_forward()
     cubic = fem.Function(fem.functionspace(mesh, ("Lagrange", 3)))
     cubic.interpolate(pieces)
@@ -82,18 +88,28 @@ def _of_data(data: OnFacets) -> FloatArray:
     return np.asarray((trace.weights * cubic) @ data.rest / size)
 
 
-def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> FloatArray:
-    """Find what brings ∇v nearest to ∇u_h, to be added to inner facets' heights; collective."""
+def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> tuple[FloatArray, FloatArray]:
+    """Find the cubics that bring ∇v nearest to ∇u_h; collective.
+
+    Those of cells have no product with another cell's, and are eliminated.
+
+    Returns:
+        What is to be added to inner facets' heights, and the cells' heights.
+    """
     hats, weights = quadrature()
-    matrix, pull = np.zeros((3, 3, cells.number)), np.zeros((3, cells.number))
+    matrix, pull = np.zeros((4, 4, cells.number)), np.zeros((4, cells.number))
     for part in blocks(cells.number):
         slopes, signs = v.slopes(cells, part), cells.ways[:, part]
         for hat, weight in zip(hats[:, :, None], weights, strict=True):
             off = slopes(hat)
             each = [third_slopes(cells, signs * row[:, None], hat) for row in np.eye(3)]
+            each.append(np.broadcast_to(bubble_slopes(hat), off.shape))
             for i, own in enumerate(each):
                 flow = weight * pick(kappa, part) * cells.apply(own, part)
                 pull[i, part] -= dot_rows(flow, off)
                 for j, other in enumerate(each):
                     matrix[i, j, part] += dot_rows(flow, other)
-    return best_heights(cells, matrix, pull, ~cells.exterior)
+    alone, joint = matrix[3, 3], matrix[:3, 3]
+    reduced = matrix[:3, :3] - joint[:, None] * joint / alone
+    heights = best_heights(cells, reduced, pull[:3] - joint * pull[3] / alone, ~cells.exterior)
+    return heights, (pull[3] - dot_rows(joint, heights[cells.facets])) / alone

@@ -25,25 +25,40 @@ from .nearest import nearest
 from .shapes import quadrature
 from .sums import Sums
 
-HELD = 0.1
-"""Part of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖² that ‖p‖² on thin cells must make up."""
+WORTH = 0.05
+"""Part of the bound's square that something on thin cells must make up to be worth a try."""
 
 
-def promising(cells: Cells, kappa: FloatArray, flux: Flux, sums: Sums) -> bool:
-    """Tell whether y on thin cells makes up much of the bound; collective.
+def promising(
+    cells: Cells, kappa: FloatArray, flux: Flux, v: Companion, sums: Sums
+) -> tuple[bool, bool]:
+    """Tell what makes up much of the bound on thin cells; collective.
 
     Args:
         cells: The mesh.
         kappa: Mean of κ, shape (cells,) or ().
         flux: y.
-        sums: The parts of the bound with y as it is.
+        v: v.
+        sums: The parts of the bound with both as they are, but for ℓ's.
+
+    Returns:
+        Whether y or ℓ does, and whether it does that v is above α where there is contact.
     """
     if cells.tdim != 2:
-        return False
-    thin = np.flatnonzero(cells.diameter2 > THIN * cells.volume)
-    squares = field_squares(cells, flux.excess[:, thin], thin) / pick(kappa, thin)
-    there, whole = cells.total(np.sum(squares), np.sum(sums.indicators))
-    return bool(there > HELD * whole)
+        return False, False
+    thin = cells.diameter2 > THIN * cells.volume
+    squares = np.where(thin, field_squares(cells, flux.excess) / kappa, 0.0)
+    at, slope, *_ = v.lift
+    lifted = pick(kappa, at) * slope**2
+    side = v.boundary.alpha.side
+    *parts, whole = cells.total(
+        np.sum(squares),
+        np.sum(lifted[thin[at]]),
+        np.sum(v.contact[thin[side.cells]]),
+        np.sum(sums.indicators) + np.sum(lifted),
+    )
+    of_y, of_lift, of_alpha = (bool(part > WORTH * whole) for part in parts)
+    return of_y or of_lift, of_alpha
 
 
 def improve(

@@ -283,6 +283,8 @@ class _Gap:
         fv = load.mean[part] * (sum_rows(self.v.excess[:, part]) + sum_rows(W)) / (d + 1)
         if height is not None:
             fv += load.mean[part] * sum_rows(height) / 3
+        if self.v.bubbles is not None:
+            fv += load.mean[part] * self.v.bubbles[part] / 60
         if moment is not None and load.hats is not None:
             hats = load.hats[:, part]
             fv += dot_rows(hats, W)
@@ -292,10 +294,12 @@ class _Gap:
                 rise = 12.0 / 180.0 * np.stack([hats[j] - hats[k] for j, k in cells.others])
                 fv += dot_rows(third, rise)
                 # ∫_T c_F² = |T|/840, for what f has beyond its affine part
+                size = sum_rows(np.abs(third)) / np.sqrt(840.0)
+                if self.v.bubbles is not None:
+                    size += np.abs(self.v.bubbles[part]) / np.sqrt(2520.0)
                 left = load.variance if self.flux.beyond is None else load.rest
                 assert left is not None
-                off = volume * np.sqrt(left[part] / 840.0) * sum_rows(np.abs(third))
-                totals.energy_slack += float(np.sum(off))
+                totals.energy_slack += float(np.sum(volume * np.sqrt(left[part]) * size))
         totals.energy += float(np.sum(0.5 * vv - volume * fv))
 
 

@@ -48,8 +48,8 @@ class Pairing:
 def in_cells(made: Made, cells: Cells, psi: Certain, there: FloatArray) -> Pairing:
     """Integrate over cells; this rank's share.
 
-    Bumps have the means ⅓, cubics 0, and cusps known ones. What ψ has beyond its mean meets cubics
-    and cusps by its norm only.
+    Bumps have the means ⅓, facets' cubics 0, cells' 1/60, and cusps known ones. What ψ has beyond
+    its mean meets cubics and cusps by its norm only.
 
     Args:
         made: v and u_h.
@@ -74,6 +74,9 @@ def in_cells(made: Made, cells: Cells, psi: Certain, there: FloatArray) -> Pairi
     if made.thirds is not None:
         heights = sum_rows(np.abs(made.thirds[cells.facets]))
         odd, swing = odd + heights / np.sqrt(840.0), swing + THIRD * heights
+    if made.bubbles is not None:
+        means, heights = means + made.bubbles / 60.0, np.abs(made.bubbles)
+        odd, swing = odd + heights / np.sqrt(2520.0), swing + heights / 27.0
     if made.cusps is not None:
         means[made.cusps.at] += made.cusps.means
         heights = np.abs(made.cusps.heights).sum(axis=0)

@@ -1,4 +1,4 @@
-"""Functions of facets on triangles: bumps b_F = 4 λ_j λ_k, and c_F = λ_j λ_k (λ_j − λ_k)."""
+"""Functions on triangles: bumps b_F = 4 λ_j λ_k, c_F = λ_j λ_k (λ_j − λ_k), and λ_1 λ_2 λ_3."""
 
 from __future__ import annotations
 
@@ -32,6 +32,11 @@ def third_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArra
         gamma[j] += (both - hat[k] ** 2) * height[i]
         gamma[k] += (hat[j] ** 2 - both) * height[i]
     return gamma
+
+
+def bubble_slopes(hat: FloatArray) -> FloatArray:
+    """Numbers γ_k with ∇ λ_1 λ_2 λ_3 = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    return np.stack([hat[1] * hat[2], hat[2] * hat[0], hat[0] * hat[1]])
 
 
 def local_thirds(cells: Cells, thirds: FloatArray, where: slice | IndexArray) -> FloatArray:

@@ -685,7 +685,9 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     bumps = rng.normal(size=len(cells.exterior))
     vertices = rng.normal(size=cells.vertices.max() + 1)
     at, means = np.array([2, 5]), np.array([0.3, -0.4])
-    v = SimpleNamespace(vertices=vertices, bumps=bumps, cusps=SimpleNamespace(at=at, means=means))
+    thirds, bubbles = rng.normal(size=len(bumps)), rng.normal(size=number)
+    cusps = SimpleNamespace(at=at, means=means)
+    v = SimpleNamespace(vertices=vertices, bumps=bumps, thirds=thirds, bubbles=bubbles, cusps=cusps)
     sums = SimpleNamespace(steepness=steepness)
     known = SimpleNamespace(
         flux=SimpleNamespace(carried=None),
@@ -706,7 +708,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
         taken_up = np.inf if reaction == 0.0 else reaction**-0.5 * of_cells[1]
         squares = np.sum(np.minimum(left, taken_up) ** 2)
         mean = np.abs(vertices[cells.vertices].mean(axis=0))
-        mean += np.abs(bumps[cells.facets]).sum(axis=0) / 3
+        mean += np.abs(bumps[cells.facets]).sum(axis=0) / 3 + np.abs(bubbles) / 60
         mean[at] += np.abs(means)
         energy += np.sum(mean * of_cells[0] + left * np.sqrt(steepness))
     by_cell = {}
@@ -718,7 +720,8 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
         a, b = vertices[cells.vertices[cells.others[local], cell]]
         bump = abs(bumps[cells.facets[local, cell]])
         energy += (abs(a + b) / 2 + bump) * missed[facet]
-        energy += (abs(a - b) + 2 * bump) * np.sqrt(edge.measure[facet]) * rough[facet]
+        swing = abs(a - b) + 2 * bump + 0.1 * abs(thirds[cells.facets[local, cell]])
+        energy += swing * np.sqrt(edge.measure[facet]) * rough[facet]
     of_edge = np.sqrt(sum(value**2 / kappa.low[cell] for cell, value in by_cell.items()))
     in_all = unbalanced(level, cells, total, kappa.low, 0.0)
     if reaction:
@@ -901,7 +904,7 @@ def test_energy_of_a_function_of_degree_two():
 
 @pytest.mark.serial
 def test_cubic_functions_fit_best():
-    """No height of an inner facet can be changed for the better."""
+    """No height of an inner facet or of a cell can be changed for the better."""
     domain = square(3, comm=MPI.COMM_SELF)
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
     rng = np.random.default_rng(6)
@@ -912,20 +915,22 @@ def test_cubic_functions_fit_best():
     )  # fmt: skip
     hats, weights = quadrature()
 
-    def energy(thirds):
-        slopes = replace(v, thirds=thirds).slopes(cells, slice(0, cells.number))
+    def energy(thirds, bubbles):
+        more = {"thirds": thirds, "bubbles": bubbles}
+        slopes = replace(v, **more).slopes(cells, slice(0, cells.number))
         rows = [slopes(hat) for hat in hats[:, :, None]]
         squares = [(row * cells.apply(row, slice(0, cells.number))).sum(axis=0) for row in rows]
         return np.sum(kappa * (weights @ squares))
 
     found = cubic._fitted(cells, kappa, v)
-    least = energy(found)
-    assert least < energy(0 * found) and not found[cells.exterior].any()
-    for facet in np.flatnonzero(~cells.exterior):
+    least = energy(*found)
+    assert least < energy(0 * found[0], 0 * found[1]) and not found[0][cells.exterior].any()
+    free = np.flatnonzero(~cells.exterior), np.arange(cells.number)
+    for kind, place in ((kind, place) for kind in (0, 1) for place in free[kind]):
         for step in (1e-3, -1e-3):
-            moved = found.copy()
-            moved[facet] += step
-            assert energy(moved) > least
+            moved = [each.copy() for each in found]
+            moved[kind][place] += step
+            assert energy(*moved) > least
 
 
 @pytest.mark.serial
@@ -987,11 +992,12 @@ def test_what_the_gap_is_made_of_at_points(more):
     cells, rng, kappa, _ = some_cells(9)
     P, w, excess, rise = rng.normal(size=(4, 3, cells.number))
     bumps, thirds, heights = rng.normal(size=(3, len(cells.exterior)))
+    bubbles = rng.normal(size=cells.number)
     rise -= rise.mean(axis=0)
     beyond = Beyond(heights, rise) if more else None
-    v = companion.Companion(
-        None, bumps, excess, None, None, None, None, None, thirds if more else None
-    )
+    v = companion.Companion(None, bumps, excess, None, None, None, None)
+    if more:
+        v.thirds, v.bubbles = thirds, bubbles
     y = SimpleNamespace(excess=P, beyond=beyond)
     k = rng.uniform(1, 2, size=(4, cells.number))
     hats, weights = rng.dirichlet(np.ones(3), 4), rng.dirichlet(np.ones(4))
@@ -1019,6 +1025,7 @@ def test_what_the_gap_is_made_of_at_points(more):
                         gradients[a] - gradients[b]
                     )
                     dv = dv + cells.ways[i, cell] * thirds[facet] * cubic_
+                    dv = dv + bubbles[cell] * hat[a] * hat[b] * gradients[i]
                     edge = (rise[b, cell] - rise[a, cell]) * (x[cell, b] - x[cell, a])
                     field = field + edge * hat[a] * hat[b] / 3
             p, b = field - at * du, at * (dv - du)
@@ -1280,6 +1287,7 @@ def test_what_oscillates_on_thin_cells():
         None, rng.normal(size=len(cells.exterior)), rng.normal(size=(3, number)),
         None, None, None, None, None, rng.normal(size=len(cells.exterior)),
     )  # fmt: skip
+    v.bubbles = rng.normal(size=number)
     fluxes = SimpleNamespace(excess=excess, beyond=Beyond(0 * v.bumps, None))
     hats = rng.normal(size=(3, number))
     load = SimpleNamespace(
@@ -1303,6 +1311,9 @@ def test_what_oscillates_on_thin_cells():
     # ∫ c_F² = |T|/840
     thirds = np.abs(v.thirds[cells.facets]).sum(axis=0)
     slack = np.sum(np.sqrt(cells.volume * load.rest) * thirds * np.sqrt(cells.volume / 840))
+    # and of the bubble |T|/2520
+    bubbles = np.abs(v.bubbles) * np.sqrt(cells.volume / 2520)
+    slack += np.sum(np.sqrt(cells.volume * load.rest) * bubbles)
     assert np.isclose(sums.totals.energy_slack, slack)
 
 
@@ -1333,20 +1344,36 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
 
 
 @pytest.mark.serial
-def test_size_of_the_field_that_carries_a_quadratic_flux():
-    """Not below the norm of the gradient with these fluxes, by polynomials of degree 8, nor far."""
+@pytest.mark.parametrize("shear", [0.0, 20.0])
+def test_size_of_the_field_that_carries_a_quadratic_flux(shear):
+    """Not below the norm of the gradient with these fluxes, by polynomials of degree 8, nor far.
+
+    On sheared cells it is far, and fields in a part of the cell are nearer.
+    """
     rng = np.random.default_rng(21)
     points, weights = basix.make_quadrature(basix.CellType.triangle, 16)
     t, gauss = np.polynomial.legendre.leggauss(9)
     powers = [(i, j) for i in range(9) for j in range(9 - i)]
     domain = square(2, comm=MPI.COMM_SELF)
     domain.mesh.geometry.x[:, :2] += rng.uniform(-0.15, 0.15, (len(domain.mesh.geometry.x), 2))
+    domain.mesh.geometry.x[:, 0] += shear * domain.mesh.geometry.x[:, 1]
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    smaller = []
     for side in cells.sides.values():
         n = len(side.cells)
         a, c = rng.normal(size=(2, n))
-        bounds = loads._of_quadratic(cells, side, a, c)
-        affine = loads._of_quadratic(cells, side, a, 0.0 * c)
+        triangles = loads._Triangles.of(cells, side)
+        bounds, affine = triangles.quadratic(a, c), triangles.quadratic(a, 0.0 * c)
+        part = triangles.nearer()
+        assert np.all(part.area <= triangles.area * (1 + 1e-12))
+        squares = triangles.measure * (a**2 / 3 + c**2 / 5)
+        others = np.stack(
+            [
+                part.quadratic(a, c),
+                *(np.sqrt(squares) * each.constant() for each in (triangles, part)),
+            ]
+        )
+        smaller += list(others.min(axis=0) / bounds)
         apex, (first, last) = corner_points(cells, side)
         for i in range(n):
             edges = np.column_stack([last[i] - first[i], apex[i] - first[i]])
@@ -1363,7 +1390,10 @@ def test_size_of_the_field_that_carries_a_quadratic_flux():
                 flux = parts[0] * (1 - 2 * s) + parts[1] * (6 * s * (1 - s) - 1)
                 load = [length * (gauss / 2) @ (flux * s**p) * (q == 0) for p, q in powers]
                 least = np.sqrt(load @ np.linalg.lstsq(matrix, load, rcond=1e-11)[0])
-                assert least <= bound * (1 + 1e-9) and bound <= 1.5 * least
+                assert least <= bound * (1 + 1e-9) and (shear or bound <= 1.5 * least)
+                if parts[1]:
+                    assert least <= others[:, i].min() * (1 + 1e-9)
+    assert min(smaller) < 0.6 if shear else min(smaller) > 0.9
 
 
 @pytest.mark.serial
