@@ -267,7 +267,7 @@ def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     sections = {name: _section(table, name) for name in SECTIONS}
     if "domain" not in table:
         raise InputError(f"the section [domain] is missing; {_SECTIONS_NEEDED}")
-    if "data" not in table and "exact" not in table:
+    if not {"data", "exact", "boundary"} & set(table):
         raise InputError(f"the section [data] is missing; {_SECTIONS_NEEDED}")
     if "exact" in table and not table["exact"]:
         raise InputError("exact.u: this key is missing; an expression in x and y is needed")
@@ -372,7 +372,9 @@ def _words(sections: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, st
     return {key: word(f"{name}.{key}", value) for key, value in sections[name].items()}
 
 
-_SECTIONS_NEEDED = "[domain] and [data] (or [exact]) are needed, the others are optional"
+_SECTIONS_NEEDED = (
+    "[domain] and [data], [exact] or [boundary.NAME] are needed, the others are optional"
+)
 
 
 def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:

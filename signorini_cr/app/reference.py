@@ -24,7 +24,7 @@ class Key(NamedTuple):
         about: What it does.
         example: A line of TOML.
         argument: How it is read, if it is nothing but an argument of `solve_adaptive` by the same
-            name; `problemfile` hands it on.
+            name; it is a key of [refine] then, and `problemfile` hands it on.
         used_on: The part of the boundary that an expression of [data] is used on; "" for all of the
             domain.
     """
@@ -213,7 +213,8 @@ ABOUT = {
     MATERIAL: "Optional, one section for each material that has a name. Its cells, on the coarsest "
     "mesh and when they are refined, have its data in the place of those in [data], which are for "
     "cells without material, and for what is left out here.",
-    "data": "What is left out is 0. An expression stands between quotes.",
+    "data": "What is left out is 0; all of it may be where there are sections `[boundary.NAME]`. "
+    "An expression stands between quotes.",
     "exact": "Optional.",
     "refine": "Optional.",
     "time": "Optional: capacity ∂u/∂t − ∇·(κ∇u) + c u = f, step by step. `t` may then stand in "

@@ -96,8 +96,8 @@ def _equation(said: Mapping[str, Any], own: Collection[str], kappa: str) -> str:
         kappa: What stands before ∂ₙu.
     """
     gain = " + c u" if "reaction" in own else ""
-    if "data.reaction" in said:
-        gain = f" + {as_factor(_short(said['data.reaction']))} u"
+    if (reaction := said.get("data.reaction", 0)) not in (0, "0"):
+        gain = f" + {as_factor(_short(reaction))} u"
     load = _short(said.get("data.f", "f from exact.u" if "exact.u" in said else "0"))
     if not kappa:
         return f"−Δu{gain} = {load}"

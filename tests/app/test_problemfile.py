@@ -11,6 +11,7 @@ from helpers import MESHES
 from mpi4py import MPI
 
 from signorini_cr.app.problemfile import ProblemFile, load
+from signorini_cr.app.reference import KEYS
 from signorini_cr.errors import InputError
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
@@ -215,6 +216,28 @@ def test_no_dirichlet_part_where_something_else_holds_the_solution(read) -> None
     case = read(text)
     with pytest.raises(InputError, match="there is no Dirichlet facet, no loss of heat, no rea"):
         solve(case.problem, case.mesh())
+
+
+def test_parts_may_say_it_all(read) -> None:
+    """u = 2x + y again, κ = 1, no section [data]: ∂u/∂y = 1 on the roof, and λ = 0 on the floor."""
+    text = PARTS.split("[boundary.floor]")[0] + (
+        '[boundary.floor]\ntype = "contact"\nobstacle = "2*x + y - 1"\ng = -1\n'
+        '[boundary.roof]\ntype = "neumann"\ng = 1\n'
+        + "".join(
+            f'[boundary.{name}]\ntype = "dirichlet"\nvalue = "2*x + y"\n'
+            for name in ("air", "wall")
+        )
+    )
+    case = read(text)
+    domain = case.mesh()
+    solution = solve(case.problem, domain)
+    x = solution.u.function_space.tabulate_dof_coordinates()
+    assert np.allclose(solution.u.x.array, 2 * x[:, 0] + x[:, 1], atol=1e-9)
+    assert solution.contact.force == pytest.approx(0.0, abs=1e-9)
+
+
+def test_arguments_of_adaptive_refinement_are_keys_of_one_section() -> None:
+    assert {key.section for key in KEYS if key.argument is not None} == {"refine"}
 
 
 def test_the_fraction_decides_what_is_refined(read) -> None:
