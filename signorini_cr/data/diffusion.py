@@ -15,6 +15,7 @@ from ufl.core.expr import Expr
 
 from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
+from ..errors import InputError
 from ..fem.cells import Cells, measures, vertex_rows
 from ..fem.conditions import Condition, is_by_cells, number
 from ..fem.physics import Imposed, OnMesh
@@ -396,6 +397,13 @@ class DiffusionOnMesh:
 
 
 def diffusion(data: OnMesh) -> DiffusionOnMesh:
-    """Narrow to the physics that the certificate is proved for."""
-    assert isinstance(data, DiffusionOnMesh)
+    """Narrow to the physics that the certificate is proved for.
+
+    Raises:
+        InputError: It is another one.
+    """
+    if not isinstance(data, DiffusionOnMesh):
+        raise InputError(
+            "certificates, forces, fluxes and means in intervals are those of diffusion"
+        )
     return data

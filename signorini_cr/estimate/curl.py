@@ -47,7 +47,8 @@ def promising(
     if cells.tdim != 2:
         return False, False
     thin = cells.diameter2 > THIN * cells.volume
-    squares = np.where(thin, field_squares(cells, flux.excess) / kappa, 0.0)
+    which = np.flatnonzero(thin)
+    squares = field_squares(cells, flux.excess[:, which], which) / pick(kappa, which)
     at, slope, *_ = v.lift
     lifted = pick(kappa, at) * slope**2
     side = v.boundary.alpha.side
