@@ -18,6 +18,7 @@ from .jets import Boxes, Enclosure, Unknown
 from .moments import LOAD_DEGREE, OnFacets, Volume
 from .pieces import Pieces
 from .ranges import errors_on, range_on
+from .triangles import Triangles, trace_constant
 
 NOTHING = np.array(0.0)
 """A reaction that is none."""
@@ -503,7 +504,7 @@ class Segments:
                 return np.stack([cubic, quadratic**2])
 
             here, goal = pick(low, facets.cells), SHARE * size
-            most = _trace_constant(cells, facets) ** 2 / here
+            most = trace_constant(cells, facets) ** 2 / here
             inverse = np.divide(1.0, edge.loss, out=np.full(n, np.inf), where=edge.loss > 0.0)
             scales = np.stack(
                 [
@@ -597,9 +598,14 @@ class Segments:
     def _constant(self) -> FloatArray:
         """C with |∫_F ϱ e| ≤ C ‖ϱ‖_F ‖∇e‖_T where ∫_F ϱ = 0, shape (facets,)."""
         if self.cells.tdim != 2:
-            return _trace_constant(self.cells, self.facets)
-        found = _Triangles.of(self.cells, self.facets)
-        return np.minimum(found.constant(), found.nearer().constant())
+            return trace_constant(self.cells, self.facets)
+        measure, own = measures(self.cells, self.facets), self._triangles
+        return np.minimum(own.constant(measure), own.nearer().constant(measure))
+
+    @cached_property
+    def _triangles(self) -> Triangles:
+        """The facets' cells, d = 2."""
+        return Triangles.stretched(self.cells, self.facets)
 
     @cached_property
     def slope(self) -> FloatArray:
@@ -706,14 +712,14 @@ class Segments:
         if carried:
             squares, a = squares - area * a**2 / 3.0, np.zeros_like(a)
         rest = squares - area * (a**2 / 3.0 + c**2 / 5.0)
-        own = _Triangles.of(self.cells, self.facets)
-        known = np.minimum(own.quadratic(a, c), own.nearer().quadratic(a, c))
+        measure, own = measures(self.cells, self.facets), self._triangles
+        known = np.minimum(own.quadratic(measure, a, c), own.nearer().quadratic(measure, a, c))
         known += self._constant * np.sqrt(np.maximum(rest, 0.0))
         return self._by_cell(np.minimum(self._constant * np.sqrt(np.maximum(squares, 0.0)), known))
 
     def beyond(self) -> tuple[IndexArray, FloatArray]:
         """Cells at Γg and Σ_F c_F ‖g − q‖_F for each, where b does not take up g − q."""
-        constant = _trace_constant(self.cells, self.facets)
+        constant = trace_constant(self.cells, self.facets)
         return self._by_cell(constant * np.where(self.given, 0.0, self.rough))
 
     @property
@@ -760,76 +766,6 @@ class Segments:
 THIRD = 0.1
 """No λ_j λ_k (λ_j − λ_k) is larger."""
 G_UNBOUNDED = "g is not bounded on the mesh, or not known to be"
-
-
-def _trace_constant(cells: Cells, side: BoundaryFacets) -> FloatArray:
-    """c_F with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, shape (n,).
-
-    |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F.
-    """
-    d, h = cells.tdim, np.sqrt(cells.diameter2[side.cells])
-    c = poincare(d) * h
-    return np.sqrt(measures(cells, side) / cells.volume[side.cells] * c * (c + 2.0 * h / d))
-
-
-@dataclass(frozen=True, eq=False)
-class _Triangles:
-    """Triangles that have boundary facets for a side, d = 2.
-
-    Attributes:
-        measure: |F|, shape (n,).
-        squares: Squared lengths of F, and of the ways from its ends j and k to the apex, as the
-            cells measure lengths, shape (3, n).
-        area: Shape (n,).
-    """
-
-    measure: FloatArray
-    squares: FloatArray
-    area: FloatArray
-
-    @classmethod
-    def of(cls, cells: Cells, side: BoundaryFacets) -> _Triangles:
-        """The facets' cells."""
-        between = dict(zip(cells.pairs, cells.lengths[:, side.cells], strict=True))
-        rows = np.stack([between[1, 2], between[0, 2], between[0, 1]])  # by the opposite vertex
-        n, (j, k) = np.arange(len(side.cells)), cells.others[side.local].T
-        squares = np.stack([rows[side.local, n], rows[k, n], rows[j, n]])
-        return cls(measures(cells, side), squares, cells.volume[side.cells])
-
-    def nearer(self) -> _Triangles:
-        """Triangles in them that are about as high as wide, aslant or not, or themselves.
-
-        The apex is as far from the point of F that was nearest to it as F is long, or nearer.
-        """
-        base, first, second = self.squares
-        length = np.sqrt(base)
-        along, height = (base + first - second) / (2.0 * length), 2.0 * self.area / length
-        foot = np.clip(along, 0.0, length)
-        part = np.minimum(1.0, length / np.hypot(along - foot, height))
-        along, up = foot + part * (along - foot), (part * height) ** 2
-        squares = np.stack([base, along**2 + up, (length - along) ** 2 + up])
-        return _Triangles(self.measure, squares, part * self.area)
-
-    def constant(self) -> FloatArray:
-        """C with ‖e − e_T‖_F ≤ C ‖∇e‖_T, see `_trace_constant`, shape (n,)."""
-        h = np.sqrt(self.squares.max(axis=0))
-        c = poincare(2) * h
-        return np.asarray(np.sqrt(self.measure / self.area * c * (c + h)))
-
-    def quadratic(self, a: FloatArray, c: FloatArray) -> FloatArray:
-        """Bound ‖σ‖ of the gradient σ with σ·n = a (λ_j − λ_k) + c (6 λ_j λ_k − 1), shape (n,).
-
-        σ·n = 0 on the other sides. No field without divergence and with these fluxes is smaller,
-        and curl ψ is one, for ψ = |F| λ_j λ_k (a (1 + β λ_i) + c (λ_k − λ_j)), with the best β for
-        c = 0.
-        """
-        base, first, second = self.squares
-        jj, kk, jk = second, first, 0.5 * (base - first - second)
-        jj, kk, jk, trace = (x / (4.0 * self.area) for x in (jj, kk, jk, base + first + second))
-        square = a**2 * (trace / 12.0 - jk**2 / (5.0 * trace))
-        square += a * c * (jj - kk) * (1.0 / 15.0 + 2.0 * jk / (15.0 * trace))
-        square += c**2 * (2.0 * (jj + kk) + jk) / 45.0
-        return np.asarray(self.measure * np.sqrt(np.maximum(square, 0.0)))
 
 
 def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> FloatArray:

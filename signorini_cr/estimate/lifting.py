@@ -21,7 +21,8 @@ from ..data.cutting import refine
 from ..data.jets import Enclosure, Jet, Unknown, choices_first
 from ..data.moments import OnParts, Trace
 from ..data.pieces import Pieces
-from ..fem.cells import BoundaryFacets, Cells, corner_points
+from ..data.triangles import Triangles
+from ..fem.cells import BoundaryFacets, Cells
 
 ROUGH = "{} jumps on a boundary facet, or its derivative is not known to be bounded there"
 NO_RANGE = "{} holds an operator that has no enclosure: {}"
@@ -162,7 +163,7 @@ def lift(
     n, name = len(side.cells), "α" if obstacle else "u_D"
     if trace.constant is not None:
         return Lift.none(np.full(n, trace.constant))
-    seen = _Triangles.of(cells, side)
+    seen = Triangles.of(cells, side)
 
     def lifted(expression: Any) -> Lift:
         found = _enclosed(cells, side, expression, base, v, scale, goal, obstacle, ratio, seen)
@@ -179,7 +180,7 @@ def lift(
     return found
 
 
-def _lifted(found: _Enclosed, seen: _Triangles, n: int, rough: str) -> Lift:
+def _lifted(found: _Enclosed, seen: Triangles, n: int, rough: str) -> Lift:
     """Bound the lifting; `rough` is the reason where that can't be."""
     pieces, length, height = found.pieces, seen.length, seen.height
 
@@ -201,42 +202,6 @@ def _lifted(found: _Enclosed, seen: _Triangles, n: int, rough: str) -> Lift:
         np.sqrt(length * norm),
         None if fine else rough,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Triangles:
-    """Triangles as they are seen from one of their facets each, of shape (n,).
-
-    Attributes:
-        length: |F|.
-        height: H, P's distance from the facet's line.
-        foot: How far from P's foot on that line the facet begins.
-    """
-
-    length: FloatArray
-    height: FloatArray
-    foot: FloatArray
-
-    @classmethod
-    def of(cls, cells: Cells, side: BoundaryFacets) -> _Triangles:
-        """Measure them."""
-        apex, (a, b) = corner_points(cells, side)
-        length = np.linalg.norm(b - a, axis=1)
-        foot = np.einsum("nk,nk->n", a - apex, b - a) / length
-        return cls(length, 2.0 * cells.volume[side.cells] / length, foot)
-
-    def parts(self, pieces: Pieces, size: FloatArray, steep: FloatArray) -> FloatArray:
-        """Bound |δ'|² + (kδ − sδ')²/H² on pieces of the facets: what goes with 1, k and k².
-
-        Args:
-            pieces: The pieces.
-            size: Bounds of |δ|.
-            steep: Bounds of |δ'|.
-        """
-        at = pieces.parent
-        ends = self.foot[at] + pieces.hats[:, 1] * self.length[at]
-        reach, size = np.maximum(*np.abs(ends)) / self.height[at], size / self.height[at]
-        return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +235,7 @@ def _enclosed(
     goal: float,
     obstacle: bool,
     ratio: float,
-    seen: _Triangles,
+    seen: Triangles,
 ) -> _Enclosed:
     """Enclose δ piece by piece, as finely as `goal` asks for; collective.
 
@@ -350,7 +315,7 @@ def gaps(
             off = trace.constant - ends.min(axis=0) + bend[pieces.parent] * width**2 / 4.0
             above = np.asarray(off)
         else:
-            length = _Triangles.of(cells, side).length
+            length = Triangles.of(cells, side).length
             try:
                 e = trace.deviation.expression
                 above = _bounds(e, pieces, own, cells, length, 0.0, signed=True)[0]
@@ -371,7 +336,7 @@ def below(cells: Cells, side: BoundaryFacets, trace: Trace, scale: float) -> boo
         scale: Size of what they are the difference of, by which rounding is told.
     """
     none = np.zeros(len(side.cells))
-    length, zero = _Triangles.of(cells, side).length, Cubic(np.stack([none, none]), none, none)
+    length, zero = Triangles.of(cells, side).length, Cubic(np.stack([none, none]), none, none)
     pieces, room = Pieces.of_facets(cells, side), 8 * len(none) + 1000
     expression = trace.deviation.expression
     shown = False

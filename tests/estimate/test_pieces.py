@@ -12,10 +12,10 @@ from helpers import of_gradients
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
-from signorini_cr.data import loads
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
 from signorini_cr.data.moments import OnParts
+from signorini_cr.data.triangles import Triangles
 from signorini_cr.estimate import certificate, companion, cubic, draft, flux, gap, lifting, shapes
 from signorini_cr.estimate.best import Promise, solved
 from signorini_cr.estimate.beyond import Beyond
@@ -29,7 +29,7 @@ from signorini_cr.estimate.nearest import nearest
 from signorini_cr.estimate.settled import in_p1
 from signorini_cr.estimate.shapes import best_heights, quadrature
 from signorini_cr.estimate.sums import Sums
-from signorini_cr.fem.cells import Cells, corner_points
+from signorini_cr.fem.cells import Cells, corner_points, measures
 from signorini_cr.mesh.domain import DIRICHLET, NEUMANN
 from signorini_cr.mesh.families import structured
 
@@ -1362,15 +1362,18 @@ def test_size_of_the_field_that_carries_a_quadratic_flux(shear):
     for side in cells.sides.values():
         n = len(side.cells)
         a, c = rng.normal(size=(2, n))
-        triangles = loads._Triangles.of(cells, side)
-        bounds, affine = triangles.quadratic(a, c), triangles.quadratic(a, 0.0 * c)
+        triangles, measure = Triangles.of(cells, side), measures(cells, side)
+        bounds, affine = (
+            triangles.quadratic(measure, a, c),
+            triangles.quadratic(measure, a, 0.0 * c),
+        )
         part = triangles.nearer()
         assert np.all(part.area <= triangles.area * (1 + 1e-12))
-        squares = triangles.measure * (a**2 / 3 + c**2 / 5)
+        squares = measure * (a**2 / 3 + c**2 / 5)
         others = np.stack(
             [
-                part.quadratic(a, c),
-                *(np.sqrt(squares) * each.constant() for each in (triangles, part)),
+                part.quadratic(measure, a, c),
+                *(np.sqrt(squares) * each.constant(measure) for each in (triangles, part)),
             ]
         )
         smaller += list(others.min(axis=0) / bounds)
@@ -1394,6 +1397,26 @@ def test_size_of_the_field_that_carries_a_quadratic_flux(shear):
                 if parts[1]:
                     assert least <= others[:, i].min() * (1 + 1e-9)
     assert min(smaller) < 0.6 if shear else min(smaller) > 0.9
+
+
+@pytest.mark.serial
+def test_triangles_where_lengths_are_stretched():
+    """As those of the stretched corners."""
+    domain, rng = square(2, comm=MPI.COMM_SELF), np.random.default_rng(22)
+    V = fem.functionspace(domain.mesh, ("CR", 1))
+    a = rng.normal(size=(Cells(domain, V).number, 2, 2))
+    stretch = a @ a.swapaxes(1, 2) + np.eye(2)
+    stretch /= np.sqrt(np.linalg.det(stretch))[:, None, None]
+    cells = Cells(domain, V, stretch=stretch)
+    for side in cells.sides.values():
+        found = Triangles.stretched(cells, side)
+        apex, base = corner_points(cells, side)
+        apex, (first, last) = (
+            np.einsum("nij,...nj->...ni", stretch[side.cells], x) for x in (apex, base)
+        )
+        assert np.allclose(found.length, np.linalg.norm(last - first, axis=1))
+        for along, end in ((found.foot, first), (found.foot + found.length, last)):
+            assert np.allclose(np.hypot(along, found.height), np.linalg.norm(end - apex, axis=1))
 
 
 @pytest.mark.serial
