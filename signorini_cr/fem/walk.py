@@ -68,7 +68,7 @@ class Walk:
         """Sort what is found on the facets, and find the transition points; collective.
 
         Args:
-            fields: What `Contact` has of them: obstacle, upper, u, pressure, active and
+            fields: What `Contact` has of them: names, obstacle, upper, u, pressure, active and
                 gap_at_vertices.
 
         Returns:
@@ -109,6 +109,8 @@ def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.N
     names = ["obstacle", "upper"] if np.isfinite(rows["upper"]).any() else ["obstacle"]
     bounds = {name: np.where(np.isfinite(rows[name]), rows[name], np.nan) for name in names}
     given = bounds | {name: rows[name] for name in ("u", "pressure", "active")}
+    if len(np.unique(rows["names"])) > 1:
+        given["name"] = rows["names"]
     return {name: column[order] for name, column in given.items()}
 
 

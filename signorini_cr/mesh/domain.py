@@ -128,6 +128,12 @@ class Domain:
         found = self.tags.find(part)
         return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
 
+    def names_of(self, facets: Int32Array) -> npt.NDArray[Any]:
+        """Names of the parts that some facets of this rank are in, shape (n,)."""
+        names = {value: name for name, value in self.parts.items()}
+        values = self.tags.values[np.searchsorted(self.tags.indices, facets)]
+        return np.array([names[value] for value in values.tolist()], dtype=np.str_)
+
     @cached_property
     def all_facets(self) -> dict[int, Int32Array]:
         """Local indices of the facets of each part, ghosts included, ascending; collective."""

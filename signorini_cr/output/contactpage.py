@@ -21,6 +21,8 @@ Table = Mapping[str, npt.NDArray]
 
 MOST_PARTS = 6
 """Contact parts with panels of their own: the longest ones."""
+LEAST_ROOM = 0.015
+"""Part of a panel's width that a letter takes."""
 
 
 def contact_page(
@@ -48,9 +50,14 @@ def contact_page(
     lines, names = [], _names(table)
     for column, rows, share in zip(panels.T, parts, shares / shares.sum(), strict=True):
         course = _contact_part(column, rows, transitions, names)
+        if "name" in rows:
+            _name_parts(column[0], rows)
         if len(parts) > 1:
             name = f"part {rows['part'][0]}"
-            column[0].set_title(name, fontsize=12)
+            if "name" in rows:
+                name = ", ".join(dict.fromkeys(map(str, rows["name"])))
+            else:
+                column[0].set_title(name, fontsize=12)
             course = f"{name} {course}"
         column[1].locator_params(axis="x", nbins=max(int(9 * share), 1))
         lines.append(course)
@@ -85,6 +92,18 @@ def _names(table: Table) -> dict[str, str]:
         return {"obstacle": r"obstacle $\alpha$"}
     names = {"obstacle": r"lower bound $\alpha$", "upper": r"upper bound $\beta$"}
     return {name: names[name] for name in there}
+
+
+def _name_parts(axes: Axes, rows: Table) -> None:
+    """Write the parts' names above the stretches of the boundary that have room for them."""
+    names, whole = rows["name"], rows["length"].sum()
+    changes = np.flatnonzero(names[1:] != names[:-1]) + 1
+    for here in np.split(np.arange(len(names)), changes):
+        length, name = rows["length"][here], str(names[here[0]])
+        if length.sum() > LEAST_ROOM * len(name) * whole:
+            middle = np.average(rows["arc_length"][here], weights=length)
+            above = axes.get_xaxis_transform(), "offset points"
+            axes.annotate(name, (middle, 1.0), (0.0, 3.0), *above, ha="center", fontsize=12)
 
 
 def _name_curves(axes: Axes, entries: dict[str, Any]) -> None:

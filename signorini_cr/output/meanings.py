@@ -146,6 +146,7 @@ FACET = {
     "u": "u_h at the midpoint.",
     "pressure": "λ_h, constant on the facet; below 0 on the upper bound, 0 without contact.",
     "active": "1 in contact, 0 elsewhere.",
+    "name": "Of its part of the boundary; only if several have contact.",
 }
 """The columns of contact.csv."""
 

@@ -7,6 +7,7 @@ pressure λ_F = r_F / |F|, the piecewise constant ∂ₙu_h that the scheme know
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,6 +58,7 @@ class Contact:
         facets: Local indices of the contact facets this rank owns, shape (n,).
         vertices: Their vertices' coordinates, shape (n, d, 3).
         measure: Their length, shape (n,).
+        names: Names of their parts of the boundary, shape (n,).
         obstacle: Lower bound on the facet, the mean of α for CR; −∞ for none, shape (n,).
         upper: Upper bound on the facet, the mean of β for CR; ∞ for none, shape (n,).
         u: u_h at the facet's midpoint, shape (n,).
@@ -81,6 +83,7 @@ class Contact:
     facets: Int32Array
     vertices: FloatArray
     measure: FloatArray
+    names: npt.NDArray[Any]
     obstacle: FloatArray
     upper: FloatArray
     u: FloatArray
@@ -121,7 +124,8 @@ class Contact:
 
         Columns: part (connected piece of Γ1, from 0), arc_length (of the facet's midpoint, from
         the part's beginning, Ω to the left), x, y, length, obstacle, upper (where any facet has
-        an upper bound), u, pressure, active.
+        an upper bound), u, pressure, active, name (of the part of the boundary, where there are
+        several).
         """
         return self._table
 
@@ -208,6 +212,7 @@ def _at_facets(
     local = data.at_vertices(u, facets)
     means = dofs.shape[1] > 1
     return {
+        "names": data.domain.names_of(facets),
         "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]) + offset,
         "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]) + offset,
         "u": local.mean(axis=1) + offset,

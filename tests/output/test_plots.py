@@ -13,7 +13,7 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, Polygon, Problem, plots, solve
+from signorini_cr import Contact, Dirichlet, Domain, InputError, Polygon, Problem, plots, solve
 from signorini_cr.fem.space import function_space
 from signorini_cr.output import canvas
 from signorini_cr.output.raster import raster
@@ -96,6 +96,20 @@ def test_the_solution_shows_where_it_is_in_contact(shared_tmp_path):
     assert none == 0 < half < every == 16
     assert white == 0.0
     assert 0.2 < some < all_red
+
+
+def test_parts_of_a_piece_are_named_where_they_are(shared_tmp_path):
+    """Two sides of a square and a stretch of 1/16, which has no room for its name."""
+    corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1 / 16], [1.0, 1.0], [0.0, 1.0]]
+    names = ["floor", "step", "wall", "roof", "roof"]
+    domain = Polygon(corners, names, names=names[:4]).mesh(0.1, WORLD)
+    held = dict.fromkeys(names[:3], Contact(0.0)) | {"roof": Dirichlet(0.0)}
+    solution = solve(Problem(f=-1.0, conditions=held), domain)
+    figure = plots.plot_contact(solution)
+    if WORLD.rank == 0:
+        above, _ = figure.axes
+        found = {text.get_text(): text.xy[0] for text in above.texts if text.get_text() in names}
+        assert found == {"floor": pytest.approx(0.5), "wall": pytest.approx(1 + 17 / 32)}
 
 
 @pytest.mark.parametrize("f", [1.0, -1.0, lambda x: x[0]])

@@ -6,7 +6,8 @@ import ufl
 from dolfinx.mesh import GhostMode, create_unit_cube, locate_entities_boundary, meshtags
 from mpi4py import MPI
 
-from signorini_cr import Domain, Polygon, Problem, solve
+from signorini_cr import Contact, Dirichlet, Domain, Polygon, Problem, solve
+from signorini_cr.output.tables import contact_csv
 
 pytestmark = pytest.mark.ranks
 
@@ -78,6 +79,21 @@ def test_table_runs_along_the_boundary(solution):
         assert set(table["part"]) == {0}
     else:
         assert table is None
+
+
+def test_names_of_several_parts():
+    """By where the facets are: below and on the right, one piece of Γ1."""
+    domain = rectangle(0.2, ("floor", "wall", "top", "top"), names=["floor", "wall", "top"])
+    held = {"floor": Contact(0.0), "wall": Contact(-0.1), "top": Dirichlet(0.0)}
+    contact = solve(Problem(f=-1.0, conditions=held), domain).contact
+    assert set(contact.names[contact.midpoints[:, 1] < 1e-9]) <= {"floor"}
+    table = contact.table()
+    if MPI.COMM_WORLD.rank == 0:
+        assert set(table["part"]) == {0} and list(table)[-1] == "name"
+        assert np.array_equal(table["name"] == "floor", table["y"] < 1e-9)
+        assert np.array_equal(table["name"] == "wall", table["x"] > 1.0 - 1e-9)
+        text = contact_csv(table)
+        assert text.splitlines()[0].endswith(",name") and text.splitlines()[-1].endswith(",wall")
 
 
 def test_closed_curves_and_several_parts():
