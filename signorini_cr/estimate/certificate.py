@@ -457,7 +457,7 @@ def _integrated(known: _Known, v: Companion) -> Sums:
 
 
 def _best(known: _Known, ways: Iterator[tuple[Companion, Sums]]) -> Certificate:
-    """Take the way with the least bound, and of all what they know of J(u); collective.
+    """Take the way with the least bound, and of all what they know of J(u) and ∇u; collective.
 
     Raises:
         _NoBound: With the first one's reason.
@@ -470,9 +470,10 @@ def _best(known: _Known, ways: Iterator[tuple[Companion, Sums]]) -> Certificate:
             reasons.append(why)
     if not found:
         raise reasons[0]
-    lows, highs = zip(*(each.energy for each in found if each.energy), strict=True)
     best = min(found, key=lambda each: each.bound_energy_norm or 0.0)
-    return replace(best, energy=(max(lows), min(highs)))
+    lows, highs = zip(*(each.energy for each in found if each.energy), strict=True)
+    bound_h1 = min(each.bound_h1 for each in found if each.bound_h1 is not None)
+    return replace(best, bound_h1=bound_h1, energy=(max(lows), min(highs)))
 
 
 def _functional(known: _Known, plain: bool) -> Functional:
