@@ -416,6 +416,15 @@ KAPPA_SHARE = 1e-2
 """What quadrature may miss of the square of the bound, or thereabouts."""
 
 
+BESIDE = 1e-3, 1e-5
+"""Where on the way from a facet's vertex to its middle it shows whether data have a step there;
+FFCx takes what is nearer for the vertex."""
+STEP = 1e-6
+"""Part of the values on the facet above which they may."""
+STEADY = 0.01
+"""Part of the step that they change by from one of these places to the other, at most."""
+
+
 class Trace:
     """Values of an expression on boundary facets.
 
@@ -437,7 +446,9 @@ class Trace:
         self._corners = len(corners)
         self.constant = number(expression)
         if self.constant is None:
-            at = np.vstack([corners, corners.mean(axis=0), self.points])
+            middle = corners.mean(axis=0)
+            near = [corners + part * (middle - corners) for part in BESIDE]
+            at = np.vstack([corners, *near, middle, self.points])
             self._values = compat.FacetExpression(expression, at, mesh)
 
     @property
@@ -458,6 +469,9 @@ class Trace:
     def at(self, domain: Domain, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values at the vertices, the midpoint and the quadrature points of facets.
 
+        Where the datum has a step at a vertex, what it is like on the facet counts, not at the
+        point.
+
         Args:
             domain: Where.
             entities: Pairs (cell, facet's number in the cell), shape (n, 2).
@@ -470,7 +484,11 @@ class Trace:
             count = len(self.weights)
             return tuple(np.full(s, self.constant) for s in ((k, n), n, (count, n)))  # type: ignore
         values = np.ascontiguousarray(self._values.at(domain.mesh, entities, domain.own)[:, :, 0].T)
-        return values[:k], values[k], values[k + 1 :]
+        at, far, near, middle, inside = np.split(values, [k, 2 * k, 3 * k, 3 * k + 1])
+        step = np.abs(near - at)
+        is_step = (step > STEP * np.abs(values).max(axis=0)) & (np.abs(far - near) < STEADY * step)
+        limit = near + (near - far) * (BESIDE[1] / (BESIDE[0] - BESIDE[1]))
+        return np.where(is_step, limit, at), middle[0], inside
 
 
 @dataclass(frozen=True, eq=False)

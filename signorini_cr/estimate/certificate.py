@@ -206,6 +206,9 @@ class Made:
 STEADY = 1e-12
 """Part of κ by which its bounds on a cell may differ where it is constant there."""
 
+DEAR = 1.0
+"""What may be left of the equation, in parts of the bound, before contact is asked to take it."""
+
 LIFT_SHARE = 1e-2
 """What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
 
@@ -318,9 +321,19 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     flux.excess[edge.side.local, edge.side.cells] += change
     np.add.at(flux.left, edge.side.cells, change)
     left, carried = _closed(level, cells, kappa, c.low, flux, size)
-    if np.isposinf(left):
+    fixed = sum(len(cells.sides[each.number].dofs) for each in data.forms.fixed)
+    if np.isposinf(left) or not cells.total(fixed)[0]:
+        # nothing but contact holds u, or nothing firm does: a weak b or c is a dear way out
         missed = _missed(cells, certain, segments)
-        left = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
+        others = left
+        if np.isfinite(left):
+            others += unbalanced(level, cells, missed, kappa.least, size, c.low)
+        if others > DEAR * size:
+            by_contact = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
+            if by_contact < others or np.isposinf(left):
+                left = by_contact
+            else:
+                flux.carried = None
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     known = level, cells, kappa, c, b, square, squares, certain, segments, flux, w

@@ -8,6 +8,7 @@ cell, save for what the solver left, which is kept as one number per cell and bo
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -510,7 +511,9 @@ def carried_to_contact(
     reaction: FloatArray,
     signed: bool,
 ) -> tuple[float, FloatArray]:
-    """Carry to facets in contact, too, what has no other way; collective.
+    """Carry to facets in contact, too, what has no other way or a dear one; collective.
+
+    There are ways to parts with a b and cells with a c, and ways without: the smaller norm counts.
 
     Args:
         cells: The mesh.
@@ -529,28 +532,36 @@ def carried_to_contact(
     mean = cells.total(float(flux.contact.sum()), float(flux.touching.sum()))
     firm = flux.contact >= 0.5 * mean[0] / max(mean[1], 1.0)
     firm &= flux.touching
+
+    def way(parts: Iterable[int], takers: BoolArray) -> tuple[float, FloatArray]:
+        exits = [*(cells.sides[part].dofs for part in parts), on_contact.dofs[firm]]
+        fluxes, all_reached = _carry(plain, left, plain.layered(exits, takers), int(takers.sum()))
+        change = np.where(firm, np.abs(fluxes[on_contact.local, on_contact.cells]), 0.0)
+        enough = not (change > flux.contact).any()
+        if not (all_reached and cells.comm.allreduce(enough, op=MPI.LAND)):
+            return np.inf, change
+        if signed:
+            squares = field_squares(plain, fluxes)
+        else:  # of a sum of one field for each facet, whatever the signs
+            units = np.eye(len(fluxes))[:, :, None] * np.ones(cells.number)
+            sizes = [np.sqrt(np.maximum(field_squares(plain, unit), 0.0)) for unit in units]
+            squares = dot_rows(np.abs(fluxes), np.stack(sizes)) ** 2
+        square = float(np.sum(squares / kappa_min))
+        for part in set(parts) & set(plain.sinks):
+            side, loss = plain.sides[part], plain.sinks[part]
+            square += float(
+                np.sum(fluxes[side.local, side.cells] ** 2 / (loss * measures(plain, side)))
+            )
+        kept = (left + sum_rows(fluxes))[takers]
+        square += float(np.sum(kept**2 / (reaction * cells.volume)[takers])) if kept.size else 0.0
+        return float(np.sqrt(cells.total(square)[0])), change
+
     takers = np.broadcast_to(reaction > 0.0, cells.number)
-    exits = [*(cells.sides[part].dofs for part in cells.fixed), on_contact.dofs[firm]]
-    fluxes, all_reached = _carry(plain, left, plain.layered(exits, takers), int(takers.sum()))
-    change = np.where(firm, np.abs(fluxes[on_contact.local, on_contact.cells]), 0.0)
-    enough = not (change > flux.contact).any()
-    if not (all_reached and cells.comm.allreduce(enough, op=MPI.LAND)):
-        return np.inf, change
-    if signed:
-        squares = field_squares(plain, fluxes)
-    else:  # of a sum of one field for each facet, whatever the signs
-        units = np.eye(len(fluxes))[:, :, None] * np.ones(cells.number)
-        sizes = [np.sqrt(np.maximum(field_squares(plain, unit), 0.0)) for unit in units]
-        squares = dot_rows(np.abs(fluxes), np.stack(sizes)) ** 2
-    square = float(np.sum(squares / kappa_min))
-    for part, loss in plain.sinks.items():
-        side = plain.sides[part]
-        square += float(
-            np.sum(fluxes[side.local, side.cells] ** 2 / (loss * measures(plain, side)))
-        )
-    kept = (left + sum_rows(fluxes))[takers]
-    square += float(np.sum(kept**2 / (reaction * cells.volume)[takers])) if kept.size else 0.0
-    return float(np.sqrt(cells.total(square)[0])), change
+    found = [way(cells.fixed, takers)]
+    if cells.sinks or cells.comm.allreduce(bool(takers.any()), op=MPI.LOR):
+        none = np.zeros(cells.number, dtype=bool)
+        found.append(way([part for part in cells.fixed if part not in cells.sinks], none))
+    return min(found, key=lambda each: each[0])
 
 
 def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:

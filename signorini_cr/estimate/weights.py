@@ -61,7 +61,7 @@ class Weight:
         parts: Its values on the facets of owned cells.
         values: The P1 function that has ω's values at the parts' vertices, and 0 at others.
         known: Local dofs of the vertices of the parts, Γ0 and Γ1, ghosts included.
-        scale: The largest of the values.
+        scale: The largest of its values at vertices, midpoints and quadrature points.
     """
 
     trace: Trace
@@ -94,7 +94,9 @@ class Weight:
         marks.x.array[:] = 0.0
         marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, others)] = 1.0
         rest = shared_sum(domain.mesh.comm, V.dofmap.index_map, marks.x.array) > 0.0
-        largest = float(np.abs(ends).max(initial=0.0))
+        found = [np.ravel(row) for p in parts.parts for row in (p.ends, p.middle, p.inside)]
+        known = np.concatenate(found or [np.zeros(0)])
+        largest = float(np.abs(known[np.isfinite(known)]).max(initial=0.0))
         scale = max(domain.mesh.comm.allgather(largest if np.isfinite(ends).all() else np.inf))
         if not np.isfinite(scale):
             raise InputError("the weight is not finite at a vertex of the part")

@@ -23,7 +23,7 @@ from ..multigrid.constrained import ConstrainedMatrix
 from .active import ActiveSet
 from .bounds import Bounds
 from .reduced import ReducedSolver
-from .stopping import FORCES, LEVEL, LEVELS, LOST, TOUCHING, Stiffness
+from .stopping import BOTTOM, FORCES, LOST, TOUCHING, Stiffness
 from .system import DATUM, Vectors
 
 SETS = 40
@@ -41,10 +41,6 @@ GAIN = 0.5
 REMAINDER = 1e-9
 """Forces below this part of the loads on their rows, with which others nearly cancel, are measured
 against it."""
-
-BOTTOM = 10.0 ** -(LEVEL * (LEVELS - 1))
-"""What forces are measured against at least, in parts of what the rows on Γ1 are made of: where the
-last of their levels begins. Where u falls off by many orders of magnitude there is no end below."""
 
 SAMPLES = 3
 """Times that data are changed; the largest answer counts."""
@@ -125,14 +121,17 @@ class Extended:
         forces, made_of = self._stiffness.totals(self._forces()), self._stiffness.made_of
         of_loads = self._stiffness.totals(np.where(self.active.mask, np.abs(loads), 0.0)).sum()
         total = max(float(forces.sum()), REMAINDER * float(of_loads))
+        flow = self._flow()
         # what drowns in its errors is no force where these are nothing against what it is made of,
-        # or against all forces
+        # against all forces, or against what flows where the domain is softest: where u touches
+        # without pressing, its own rows may be made of rounding alone
         none = (forces <= LOST * errors) & (
             (errors <= loose * TOUCHING * made_of)
             | (errors * len(errors) <= loose * FORCES * total)
+            | (errors <= loose * TOUCHING * flow)
         )
         sizes = self._sizes(forces)
-        sizes[none] = np.maximum(made_of, total)[none]
+        sizes[none] = np.maximum(made_of, max(total, flow))[none]
         # each class is solved for itself; what data leave open is measured against all forces
         solved = 2.0 * left / np.maximum(sizes, 1e-300)
         given = open_by_data / np.maximum(np.maximum(sizes, total), 1e-300)
@@ -156,6 +155,8 @@ class Extended:
             if wrong.sum() <= share * self._bottom:
                 return left + wrong
             self.active = ActiveSet(self.active.bounded, mask)
+        if wrong.sum() <= TOUCHING * self._flow():
+            return left + wrong
         raise NotConverged(f"no active set is that of its own solution, of {SETS} tried")
 
     def _refine(self, share: float) -> FloatArray:
@@ -220,6 +221,14 @@ class Extended:
         missing = self._operator.diagonal * np.maximum(-self._gap(), 0.0)
         wrong = np.where(self.active.mask, pulls, missing)
         return self._stiffness.totals(np.where(wanted != self.active.mask, wrong, 0.0))
+
+    def _flow(self) -> float:
+        """What the rows are made of where the domain is softest, all together; collective."""
+        x = self._vectors.x
+        found = self._stiffness.flows(x)
+        if self._masses is not None:
+            found += self._masses * (np.abs(x.array_r) + abs(self._offset))
+        return self._stiffness.least_of(found)
 
     @property
     def _bottom(self) -> float:

@@ -51,6 +51,11 @@ WINDOWS = 8
 square and the ones around it: the end of a contact zone, or a corner, where forces fall to 0 is no
 part of its own, on whichever side of a square's edge it lies."""
 
+BOTTOM = 10.0 ** -(LEVEL * (LEVELS - 1))
+"""What forces and residuals are measured against at least, in parts of the most that rows are made
+of: where the last of the levels begins. Where u falls off by many orders of magnitude, or flows are
+what rounding makes of none, there is no end below."""
+
 PART = 1e-2
 """What forces are measured against at least, in parts of what the rows of their class are made of;
 but in the first, which are made of most."""
@@ -74,8 +79,9 @@ LOST = 10.0
 """Forces whose sum is below so many times their rounding are lost in it."""
 
 TOUCHING = 1e-10
-"""Forces that are lost are none where rounding is below this part of what their rows are made of:
-u touches without pressing. Elsewhere there may be contact that rounding hides."""
+"""Forces that are lost are none where rounding is below this part of what their rows are made of,
+or of what flows in the softest part: u touches without pressing. Elsewhere there may be contact
+that rounding hides."""
 
 
 class Stiffness:
@@ -217,16 +223,30 @@ class Stiffness:
             return 0.0
         counted = self._free.copy()
         counted[active] = False
+        made_of = self.flows(x) + np.abs(self._row_sums * x.array_r - b.array_r)
         facts = [
-            np.bincount(self._class[counted], values[counted] ** 2, minlength=self._kinds)
-            for values in (
-                r.array_r,
-                self.flows(x) + np.abs(self._row_sums * x.array_r - b.array_r),
-                NOISE * self._diagonal * x.array_r,
+            np.bincount(self._class[which], values[which] ** 2, minlength=self._kinds)
+            for values, which in (
+                (r.array_r, counted),
+                (made_of, counted),
+                (NOISE * self._diagonal * x.array_r, counted),
+                (made_of, self._free),
             )
         ]
-        left, flow, noise = np.sqrt(summed(self.comm, np.array(facts)))
-        return float(np.max(left / np.maximum(flow, 1e-300), initial=0.0, where=left > noise))
+        left, flow, noise, whole = np.sqrt(summed(self.comm, np.array(facts)))
+        flow = np.maximum(flow, max(BOTTOM * whole.max(), 1e-300))
+        return float(np.max(left / flow, initial=0.0, where=left > noise))
+
+    def least_of(self, sizes: FloatArray) -> float:
+        """Sum up over the dofs of each class of stiffness; the least that is not 0; collective.
+
+        Args:
+            sizes: Of the rows of owned dofs, shape (dofs,).
+        """
+        kinds = self._class if self.varied else np.zeros(len(sizes), np.intp)
+        found = np.bincount(kinds, sizes, minlength=self._kinds).astype(np.float64, copy=False)
+        found = summed(self.comm, found)
+        return float(found[found > 0.0].min()) if found.any() else 0.0
 
     def flows(self, x: PETSc.Vec) -> FloatArray:
         """Sum up |a_ij| |x_j − x_i| over j ≠ i for owned dofs i, from differences; collective."""

@@ -551,6 +551,56 @@ def test_held_by_contact_alone_the_force_is_what_f_and_g_bring():
     assert solution.contact.force == pytest.approx(5.5, rel=1e-7)
 
 
+@pytest.mark.parametrize("b, c", [(1e-4, 0.0), (1e-8, 0.0), (0.0, 1e-6), (0.0, 1e-8)])
+def test_what_holds_weakly_beside_contact_costs_nothing(b, c):
+    """u = 0.1 sin 3x cos 2y, pressed onto the floor by 2 everywhere."""
+    sides = ("floor", "right", "top", "left")
+
+    def u(x):
+        return 0.1 * ufl.sin(3 * x[0]) * ufl.cos(2 * x[1])
+
+    def flow(x):
+        return 0.3 * ufl.cos(3 * x[0]) * ufl.cos(2 * x[1])
+
+    def rise(x):
+        return -0.2 * ufl.sin(3 * x[0]) * ufl.sin(2 * x[1])
+
+    top = Robin(lambda x: rise(x) + b * u(x), coefficient=b) if b else Neumann(rise)
+    conditions = {
+        "floor": Contact(u, g=lambda x: -rise(x) - 2.0),
+        "right": Neumann(flow),
+        "left": Neumann(lambda x: -flow(x)),
+        "top": top,
+    }
+    problem = Problem(f=lambda x: (13 + c) * u(x), reaction=c, conditions=conditions)
+    unit = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides, names=sides)
+    for solution in solve_levels(problem, unit.mesh(0.25, WORLD), 2):
+        x = ufl.SpatialCoordinate(solution.domain.mesh)
+        off = ufl.grad(u(x)) - ufl.grad(solution.u)
+        error = np.sqrt(integral(ufl.inner(off, off), solution.domain.mesh))
+        assert error <= solution.certificate.bound_h1 <= 1.3 * error
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_a_step_of_the_obstacle_at_a_vertex(element):
+    """Nothing hangs on which of both values the vertex has: it has none in L2."""
+    found = []
+    for less, high, low in ((ufl.lt, -0.1, -0.2), (ufl.le, -0.1, -0.2), (ufl.gt, -0.2, -0.1)):
+
+        def alpha(x, less=less, high=high, low=low):
+            return ufl.conditional(less(x[0], 0.5), high, low)
+
+        corners = [[0, 0], [1, 0], [1, 1], [0, 1]]
+        unit = Polygon(corners, ("contact", "neumann", "dirichlet", "neumann"))
+        domain = structured(unit, 8, WORLD)
+        solution = solve(Problem(f=-4.0, obstacle=alpha), domain, element)
+        found.append((solution.contact.force, solution.certificate.bound_h1))
+    (force, bound), *others = found
+    assert all(other == pytest.approx(force, rel=1e-9) for other, _ in others)
+    if element == "CR":
+        assert 0.1 < bound < 0.3 and all(other == pytest.approx(bound) for _, other in others)
+
+
 def test_forces_of_two_parts_add_up_and_have_their_signs():
     """One part pushes up, one down; all that b does not take goes through them."""
     lower, upper = Contact(0.2), Contact(upper=-0.1)

@@ -37,6 +37,7 @@ from signorini_cr import (
     solve_levels,
 )
 from signorini_cr.compat import cell_nodes
+from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.refinement import refine
 
 LONG = np.longdouble
@@ -593,6 +594,37 @@ def test_what_a_loss_has_in_rows_and_their_neighbours():
 
 
 # ---- where u falls off by many orders of magnitude
+
+
+@pytest.mark.parametrize("value, stiff", [(1.0, 100.0), (300.0, 1e6), (0.3, 1e2)])
+def test_a_constant_that_is_pressed(value, stiff):
+    """u is α, whatever κ, and all of −g is force; what flows is rounding."""
+    conditions = {"floor": Contact(value, g=-8.0), "left": Dirichlet(value)}
+    kappa = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), 1.0, stiff)  # noqa: E731
+    conditions |= {"right": Neumann(), "top": Neumann()}
+    problem = Problem(coefficient=kappa, conditions=conditions)
+    for solution in solve_levels(problem, SQUARE.mesh(0.3, MPI.COMM_WORLD), 3):
+        assert np.allclose(solution.u.x.array, value, rtol=1e-9)
+        assert solution.contact.force == pytest.approx(8.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("bounds", [("obstacle",), ("upper",)])
+@pytest.mark.parametrize("value, c", [(0.0, 0.0), (0.3, 0.0), (300.0, 0.0), (0.3, 1.0)])
+def test_what_touches_without_pressing(value, c, bounds):
+    """A plane, or with a reaction a constant: u is the bound below, without a force."""
+
+    def u(x):
+        return value + (0.0 if c else 0.1) * x[0]
+
+    conditions = {"floor": Contact(**dict.fromkeys(bounds, u)), "left": Dirichlet(u)}
+    conditions["right"] = Neumann() if c else Dirichlet(u)
+    conditions["top"] = Robin(u, coefficient=1.0) if c else Neumann()
+    problem = Problem(f=c * value, reaction=c, conditions=conditions)
+    for solution in solve_levels(problem, structured(SQUARE, 4, MPI.COMM_WORLD), 3):
+        x = solution.u.function_space.tabulate_dof_coordinates().T
+        assert np.allclose(solution.u.x.array, u(x), atol=1e-9)
+        assert abs(solution.contact.force) < 1e-12 * max(1.0, value)
+
 
 FALLS = {
     "presses": lambda x: ufl.conditional(x[0] < 1.3, 0.0, -1.0),
