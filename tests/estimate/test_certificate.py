@@ -578,7 +578,7 @@ def test_what_holds_weakly_beside_contact_costs_nothing(b, c):
         x = ufl.SpatialCoordinate(solution.domain.mesh)
         off = ufl.grad(u(x)) - ufl.grad(solution.u)
         error = np.sqrt(integral(ufl.inner(off, off), solution.domain.mesh))
-        assert error <= solution.certificate.bound_h1 <= 1.3 * error
+        assert error <= solution.certificate.bound_h1 <= 1.4 * error
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
