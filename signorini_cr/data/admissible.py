@@ -110,10 +110,8 @@ def check_data(forms: Forms, domain: Domain) -> None:
     for contact in forms.bounded:
         bounded = _Facets.of(domain, contact.number)
         for sign, bound in contact.bounds:
-            limit, label = (
-                _Values(bound, domain),
-                contact.called("obstacle" if sign > 0 else "upper"),
-            )
+            limit = _Values(bound, domain)
+            label = contact.called("obstacle" if sign > 0 else "upper")
             for u_D, facets in fixed:
                 complaints = _crossing(u_D, facets, limit, bounded, label, sign)
                 _raise_first(comm, complaints)

@@ -599,13 +599,14 @@ class Segments:
         """C with |∫_F ϱ e| ≤ C ‖ϱ‖_F ‖∇e‖_T where ∫_F ϱ = 0, shape (facets,)."""
         if self.cells.tdim != 2:
             return trace_constant(self.cells, self.facets)
-        measure, own = measures(self.cells, self.facets), self._triangles
-        return np.minimum(own.constant(measure), own.nearer().constant(measure))
+        measure = measures(self.cells, self.facets)
+        return np.minimum(*(each.constant(measure) for each in self._triangles))
 
     @cached_property
-    def _triangles(self) -> Triangles:
-        """The facets' cells, d = 2."""
-        return Triangles.stretched(self.cells, self.facets)
+    def _triangles(self) -> tuple[Triangles, Triangles]:
+        """The facets' cells, and triangles in them, d = 2."""
+        own = Triangles.of(self.cells, self.facets, stretched=True)
+        return own, own.nearer()
 
     @cached_property
     def slope(self) -> FloatArray:
@@ -712,8 +713,8 @@ class Segments:
         if carried:
             squares, a = squares - area * a**2 / 3.0, np.zeros_like(a)
         rest = squares - area * (a**2 / 3.0 + c**2 / 5.0)
-        measure, own = measures(self.cells, self.facets), self._triangles
-        known = np.minimum(own.quadratic(measure, a, c), own.nearer().quadratic(measure, a, c))
+        measure = measures(self.cells, self.facets)
+        known = np.minimum(*(each.quadratic(measure, a, c) for each in self._triangles))
         known += self._constant * np.sqrt(np.maximum(rest, 0.0))
         return self._by_cell(np.minimum(self._constant * np.sqrt(np.maximum(squares, 0.0)), known))
 

@@ -26,24 +26,11 @@ class Triangles:
     foot: FloatArray
 
     @classmethod
-    def of(cls, cells: Cells, side: BoundaryFacets) -> Triangles:
-        """Measure the facets' cells, d = 2."""
-        apex, (a, b) = corner_points(cells, side)
+    def of(cls, cells: Cells, side: BoundaryFacets, stretched: bool = False) -> Triangles:
+        """Measure the facets' cells, d = 2, as they are or as the cells measure lengths."""
+        apex, (a, b) = corner_points(cells, side, stretched)
         length = np.linalg.norm(b - a, axis=1)
         foot = np.einsum("nk,nk->n", a - apex, b - a) / length
-        return cls(length, 2.0 * cells.volume[side.cells] / length, foot)
-
-    @classmethod
-    def stretched(cls, cells: Cells, side: BoundaryFacets) -> Triangles:
-        """The same as the cells measure lengths, see `Cells`."""
-        if cells.stretch is None:
-            return cls.of(cells, side)
-        between = dict(zip(cells.pairs, cells.lengths[:, side.cells], strict=True))
-        rows = np.stack([between[1, 2], between[0, 2], between[0, 1]])  # by the opposite vertex
-        n, (j, k) = np.arange(len(side.cells)), cells.others[side.local].T
-        base, first, second = rows[side.local, n], rows[k, n], rows[j, n]
-        length = np.sqrt(base)
-        foot = (second - first - base) / (2.0 * length)
         return cls(length, 2.0 * cells.volume[side.cells] / length, foot)
 
     @property

@@ -269,6 +269,8 @@ class _Known:
         w: u_h at the cells' vertices, shape (d + 1, cells).
         size: About how large the bound will be.
         left: What the loose ends of −div y = f add to it.
+        unsure: What quadrature may have missed of integrals of f and g adds, unless contact or b
+            takes it.
         carried: The norm of what was added to y for their sake.
     """
 
@@ -285,6 +287,7 @@ class _Known:
     w: FloatArray
     size: float
     left: float
+    unsure: float
     carried: float
 
 
@@ -322,22 +325,19 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     np.add.at(flux.left, edge.side.cells, change)
     left, carried = _closed(level, cells, kappa, c.low, flux, size)
     fixed = sum(len(cells.sides[each.number].dofs) for each in data.forms.fixed)
-    if np.isposinf(left) or not cells.total(fixed)[0]:
+    unsure = _of_means(level, cells, kappa, c, certain, segments, size) if left < np.inf else 0.0
+    if np.isposinf(left) or (not cells.total(fixed)[0] and left + unsure > DEAR * size):
         # nothing but contact holds u, or nothing firm does: a weak b or c is a dear way out
         missed = _missed(cells, certain, segments)
-        others = left
-        if np.isfinite(left):
-            others += unbalanced(level, cells, missed, kappa.least, size, c.low)
-        if others > DEAR * size:
-            by_contact = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
-            if by_contact < others or np.isposinf(left):
-                left = by_contact
-            else:
-                flux.carried = None
+        by_contact = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
+        if by_contact < left + unsure or np.isposinf(left):
+            left, unsure = by_contact, 0.0
+        else:
+            flux.carried = None
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
     known = level, cells, kappa, c, b, square, squares, certain, segments, flux, w
-    return _Known(*known, size, left, carried)
+    return _Known(*known, size, left, unsure, carried)
 
 
 def _given_to_loss(flux: Flux, segments: Segments, change: FloatArray) -> FloatArray:
@@ -742,10 +742,8 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     terms, they are bounded as if all were the same: by what they are for |e|, which has ∇e's norm.
     Where b is strong, ∫ (g − q) e is at most ‖b^{-1/2}(g − q)‖ ‖b^{1/2} e‖ as a whole.
     """
-    level, cells, kappa, size = known.level, known.cells, known.kappa, known.size
-    certain, segments = known.certain, known.segments
-    counts = certain.missed is not None, bool(segments.missed.any())
-    if not any(cells.total(*counts)):
+    cells, kappa, certain, segments = known.cells, known.kappa, known.certain, known.segments
+    if not _misses(cells, certain, segments):
         return 0.0, 0.0
     square, change = 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
@@ -771,10 +769,28 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         square, on_edge, np.sum(segments.beyond_loss), change
     )
     loose = np.hypot(np.sqrt(square) + np.sqrt(on_edge), np.sqrt(of_loss))
-    if known.flux.carried is None:
-        missed = _missed(cells, certain, segments)
-        loose += unbalanced(level, cells, missed, kappa.least, size, known.c.low)
-    return float(loose), float(change)
+    return float(loose + known.unsure), float(change)
+
+
+def _misses(cells: Cells, certain: Certain, segments: Segments) -> bool:
+    """Whether quadrature may have missed anything of f and g; collective."""
+    return any(cells.total(certain.missed is not None, bool(segments.missed.any())))
+
+
+def _of_means(
+    level: Level,
+    cells: Cells,
+    kappa: Coefficient,
+    c: Reaction,
+    certain: Certain,
+    segments: Segments,
+    size: float,
+) -> float:
+    """Bound what quadrature may have missed of integrals of f and g, see `_missed`; collective."""
+    if not _misses(cells, certain, segments):
+        return 0.0
+    missed = _missed(cells, certain, segments)
+    return unbalanced(level, cells, missed, kappa.least, size, c.low)
 
 
 def _missed(cells: Cells, certain: Certain, segments: Segments) -> FloatArray:

@@ -458,10 +458,7 @@ def _edge_potential(cells: Cells, kappa: Coefficient, edge: Segments, flux: Flux
     side, d = edge.side, cells.tdim
     P = flux.excess[:, side.cells]
     s, row = sum_rows(P), np.arange(len(side.cells))
-    apex, base = corner_points(cells, side)
-    if cells.stretch is not None:
-        stretch = cells.stretch[side.cells]
-        apex, base = (np.einsum("nij,...nj->...ni", stretch, x) for x in (apex, base))
+    apex, base = corner_points(cells, side, stretched=True)
     middle = (apex + base.sum(axis=0)) / (d + 1)
     pull = P[side.local, row][:, None] * (apex - middle)
     pull += np.einsum("in,ink->nk", P[cells.others[side.local].T, row], base - middle)

@@ -484,13 +484,22 @@ def on_cells(mesh: Mesh, values: FloatArray) -> fem.Function:
     return function
 
 
-def corner_points(cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, FloatArray]:
-    """Coordinates of the opposite vertex, shape (n, gdim), and of the ends, shape (d, n, gdim)."""
+def corner_points(
+    cells: Cells, side: BoundaryFacets, stretched: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Coordinates of the opposite vertex, shape (n, gdim), and of the ends, shape (d, n, gdim).
+
+    They are the stretched ones where that is asked for and the cells have a stretch.
+    """
     mesh = cells.domain.mesh
     nodes = compat.cell_nodes(mesh)[side.cells]
     x = mesh.geometry.x[:, : mesh.geometry.dim]
     apex = x[np.take_along_axis(nodes, side.local[:, None], axis=1)[:, 0]]
-    return apex, x[np.take_along_axis(nodes, cells.others[side.local], axis=1).T]
+    ends = x[np.take_along_axis(nodes, cells.others[side.local], axis=1).T]
+    if stretched and cells.stretch is not None:
+        stretch = cells.stretch[side.cells]
+        apex, ends = (np.einsum("nij,...nj->...ni", stretch, points) for points in (apex, ends))
+    return apex, ends
 
 
 def measures(cells: Cells, side: BoundaryFacets) -> FloatArray:

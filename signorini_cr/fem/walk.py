@@ -109,7 +109,7 @@ def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.N
     names = ["obstacle", "upper"] if np.isfinite(rows["upper"]).any() else ["obstacle"]
     bounds = {name: np.where(np.isfinite(rows[name]), rows[name], np.nan) for name in names}
     given = bounds | {name: rows[name] for name in ("u", "pressure", "active")}
-    if len(np.unique(rows["names"])) > 1:
+    if (rows["names"] != rows["names"][:1]).any():
         given["name"] = rows["names"]
     return {name: column[order] for name, column in given.items()}
 

@@ -130,9 +130,10 @@ class Domain:
 
     def names_of(self, facets: Int32Array) -> npt.NDArray[Any]:
         """Names of the parts that some facets of this rank are in, shape (n,)."""
-        names = {value: name for name, value in self.parts.items()}
-        values = self.tags.values[np.searchsorted(self.tags.indices, facets)]
-        return np.array([names[value] for value in values.tolist()], dtype=np.str_)
+        names, values = np.array(list(self.parts)), np.array(list(self.parts.values()))
+        own = self.tags.values[np.searchsorted(self.tags.indices, facets)]
+        order = np.argsort(values)
+        return np.asarray(names[order[np.searchsorted(values, own, sorter=order)]])
 
     @cached_property
     def all_facets(self) -> dict[int, Int32Array]:

@@ -689,15 +689,10 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     cusps = SimpleNamespace(at=at, means=means)
     v = SimpleNamespace(vertices=vertices, bumps=bumps, thirds=thirds, bubbles=bubbles, cusps=cusps)
     sums = SimpleNamespace(steepness=steepness)
+    c = SimpleNamespace(low=np.array(reaction), high=np.array(reaction))
+    unsure = certificate._of_means(level, cells, kappa, c, certain, segments, 0.0)
     known = SimpleNamespace(
-        flux=SimpleNamespace(carried=None),
-        level=level,
-        cells=cells,
-        kappa=kappa,
-        size=0.0,
-        certain=certain,
-        segments=segments,
-        c=SimpleNamespace(low=np.array(reaction), high=np.array(reaction)),
+        cells=cells, kappa=kappa, certain=certain, segments=segments, c=c, unsure=unsure
     )
     loose, change = certificate._hidden(known, v, sums)
     poincare = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702
@@ -1409,7 +1404,7 @@ def test_triangles_where_lengths_are_stretched():
     stretch /= np.sqrt(np.linalg.det(stretch))[:, None, None]
     cells = Cells(domain, V, stretch=stretch)
     for side in cells.sides.values():
-        found = Triangles.stretched(cells, side)
+        found = Triangles.of(cells, side, stretched=True)
         apex, base = corner_points(cells, side)
         apex, (first, last) = (
             np.einsum("nij,...nj->...ni", stretch[side.cells], x) for x in (apex, base)
