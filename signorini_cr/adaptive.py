@@ -6,7 +6,7 @@ fewest cells that hold a given part of it; their sides are halved.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from mpi4py import MPI
@@ -68,13 +68,32 @@ def solve_adaptive(
             next level would not fit into the memory there is, or into ``max_time``.
     """
     check_arguments(problem, domain)
+    limits = Limits(max_time)
+    step = adaptively(
+        limits, tolerance=tolerance, levels=levels, max_dofs=max_dofs, fraction=fraction
+    )
+    limits.begin(domain, element, restart)
+    for solution in solve_sequence(problem, domain, step, element, monitor, restart=restart):
+        _ = solution.certificate  # made here, so that it doesn't count as time for the mesh
+        yield solution
+
+
+def adaptively(
+    limits: Limits, *, tolerance: float, levels: int | None, max_dofs: int, fraction: float
+) -> Callable[[Solution], Refined | None]:
+    """A step for `solve_sequence`, or for `solve_physics`, that refines where the error is.
+
+    Args:
+        limits: What the levels may take in all.
+        tolerance: As for `solve_adaptive`, like the others.
+        levels: The end.
+        max_dofs: The end.
+        fraction: Part of the bound's square that the marked cells hold.
+    """
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None and levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
-
-    limits = Limits(max_time)
-    limits.begin(domain, element, restart)
 
     def step(solution: Solution) -> Refined | None:
         certificate = solution.certificate
@@ -94,16 +113,14 @@ def solve_adaptive(
                 solution.level.number + 1,
             )
         fine, parent_cell = refine_marked(solution.domain, marked)
-        tdim = fine.mesh.topology.dim
-        dofs = fine.mesh.topology.index_map(tdim - 1).size_global
+        facets = fine.mesh.topology.index_map(fine.mesh.topology.dim - 1).size_global
+        dofs = facets * solution.u.function_space.dofmap.index_map_bs
         if dofs > max_dofs:
             return None
         limits.admit(solution, dofs)
         return balance(fine, parent_cell)
 
-    for solution in solve_sequence(problem, domain, step, element, monitor, restart=restart):
-        _ = solution.certificate  # made here, so that it doesn't count as time for the mesh
-        yield solution
+    return step
 
 
 def _smallest(domain: Domain, marked: BoolArray) -> float:

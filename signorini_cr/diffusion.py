@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 
-from .data.admissible import check_data
+from .data.admissible import NOT_DEFINITE, check_data
 from .data.diffusion import DiffusionOnMesh
 from .data.moments import Compiled
 from .estimate.certificate import Certificate, certify
@@ -25,6 +25,11 @@ class Diffusion(Forms):
     def galerkin(self) -> bool:
         """Whether quadrature sees the same on all meshes: κ jumps between cells, if at all."""
         return self.steady and self.of_one is None
+
+    @property
+    def not_definite(self) -> str | None:
+        """What to say of a form of the user's own that is found not to be positive definite."""
+        return NOT_DEFINITE if self.problem.form is not None else None
 
     def check(self, domain: Domain) -> None:
         """Refuse data for which there is no solution; collective."""

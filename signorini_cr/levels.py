@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 from dolfinx import fem
 
-from .data.admissible import NOT_DEFINITE
 from .diffusion import Diffusion
 from .errors import InputError, NotConverged, insist_on_kind
 from .fem.conditions import facets_of
@@ -267,8 +266,9 @@ def solve_level(
             )
             iterations = solve_vi(cycle, vectors, system.residual_scale, monitor=told, data=data)
     except NotConverged as failure:
-        if level.physics.problem.form is not None and "DIVERGED_INDEFINITE" in failure.reason:
-            raise InputError(f"{NOT_DEFINITE}; level {level.number} shows it") from None
+        doubt = level.physics.not_definite
+        if doubt is not None and "DIVERGED_INDEFINITE" in failure.reason:
+            raise InputError(f"{doubt}; level {level.number} shows it") from None
         raise NotConverged(failure.reason, level.number) from None
     for function in (u, residual):
         function.x.scatter_forward()

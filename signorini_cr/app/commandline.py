@@ -177,8 +177,8 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         "--resume",
         action="store_true",
         help="go on from the last level, or step in time, that a run into DIR has finished, on any"
-        " number of ranks; the problem must be the same, but --levels, tolerance and max_dofs may"
-        " differ where there is no [time]; where DIR has none, begin",
+        " number of ranks; the problem must be the same, but --levels and other limits that only"
+        " end a run may differ where there is no [time]; where DIR has none, begin",
     )
     solve.add_argument(
         "-v", "--verbose", action="store_true", help="print every step of the solver"

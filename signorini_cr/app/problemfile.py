@@ -54,6 +54,7 @@ from .readers import (
 )
 from .reference import (
     ADAPTIVE,
+    ENDS,
     EXPRESSIONS,
     KINDS,
     MATERIAL,
@@ -67,8 +68,6 @@ from .reference import (
 
 KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
-ENDS = ("refine.levels", "refine.tolerance", "refine.max_dofs")
-"""Keys that say where a run ends, and nothing else."""
 TELLING = ("units", "names")
 """Sections that levels, and what is told of them, do not depend on."""
 ENOUGH = 1000

@@ -107,7 +107,7 @@ def get(
     key: str,
     read: Callable[[str, Any], Any],
     default: Any = None,
-    needed: str = "",
+    needed: str | None = None,
 ) -> Any:
     """The value of a key, read and checked.
 
@@ -116,13 +116,13 @@ def get(
         section: Where, for the message.
         key: The key wanted.
         read: Called with the full key and the value.
-        default: What a missing key stands for; without one, it is an error.
-        needed: What belongs there, for the message.
+        default: What a missing key stands for.
+        needed: What belongs there; a missing key is an error then.
     """
     full = f"{section}.{key}" if section else key
     if key in table:
         return read(full, table[key])
-    if default is None:
+    if needed is not None:
         raise InputError(f"{full}: this key is missing; {needed} is needed")
     return default
 

@@ -27,6 +27,8 @@ class Key(NamedTuple):
             name; it is a key of [refine] then, and `problemfile` hands it on.
         used_on: The part of the boundary that an expression of [data] is used on; "" for all of the
             domain.
+        ends: Whether it says where a run ends, and nothing else: it may differ in a run that is
+            resumed.
     """
 
     section: str
@@ -37,6 +39,7 @@ class Key(NamedTuple):
     example: str
     argument: Callable[[str, Any], Any] | None = None
     used_on: str = ""
+    ends: bool = False
 
     @property
     def is_expression(self) -> bool:
@@ -160,12 +163,13 @@ KEYS = (
     Key("refine", "mode", '"uniform" or "adaptive"', '"uniform"', "Every triangle into four; or "
         "where the error sits.", 'mode = "adaptive"'),
     Key("refine", "levels", "a whole number above 0", "1; if adaptive, as many as it takes",
-        "Number of meshes, the coarsest included.", "levels = 5"),
+        "Number of meshes, the coarsest included.", "levels = 5", ends=True),
     Key("refine", "tolerance", "a number, 0 or above", USUAL["tolerance"],
         "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it.",
-        "tolerance = 0.05", not_negative),
+        "tolerance = 0.05", not_negative, ends=True),
     Key("refine", "max_dofs", "a whole number above 0", USUAL["max_dofs"],
-        "Adaptive: stop before a mesh with more degrees of freedom.", "max_dofs = 200000", whole),
+        "Adaptive: stop before a mesh with more degrees of freedom.", "max_dofs = 200000", whole,
+        ends=True),
     Key("refine", "fraction", "a number above 0, at most 1", USUAL["fraction"],
         "Adaptive: the part of the squared bound that the cells to be refined hold. Less takes "
         "more meshes, and fewer cells for the same bound.", "fraction = 0.3", part),
@@ -239,6 +243,8 @@ ADAPTIVE = {
     key.name: (key.argument, DEFAULTS[key.name]) for key in KEYS if key.argument is not None
 }
 """The keys that only adaptive refinement has: how each is read, and what it is when left out."""
+ENDS = tuple(f"{key.section}.{key.name}" for key in KEYS if key.ends)
+"""The keys that say where a run ends, and nothing else."""
 EXPRESSIONS = {f"{key.section}.{key.name}": key for key in KEYS if key.is_expression}
 """The keys whose values are expressions."""
 

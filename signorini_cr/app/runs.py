@@ -28,6 +28,7 @@ from ..rounding import at_most
 from ..solution import Solution
 from . import problemfile
 from .problemfile import ProblemFile
+from .reference import ENDS
 from .screen import Screen, wrapped
 from .signals import keep
 from .statement import folded, statement
@@ -271,11 +272,12 @@ def _above_tolerance(case: ProblemFile, records: list[output.Record]) -> NotConv
     bound = records[-1]["bound_h1"]
     if bound is not None and bound <= tolerance:
         return None
-    limit = (
-        f"levels = {case.levels}"
-        if len(records) >= case.levels
-        else f"max_dofs = {case.adaptive['max_dofs']}"
-    )
+    limits = [
+        f"{key} = {value}"
+        for key, value in case.adaptive.items()
+        if f"refine.{key}" in ENDS and key != "tolerance"
+    ]
+    limit = f"levels = {case.levels}" if len(records) >= case.levels else " or ".join(limits)
     return NotConverged(
         f"the certified bound is {at_most(bound)}, above the tolerance of {tolerance:g}, and"
         f" {limit} allows no further mesh",

@@ -113,6 +113,10 @@ class Physics(Protocol):
     def galerkin(self) -> bool:
         """Whether P1 operators are sure to be the Galerkin products of finer meshes' operators."""
 
+    @property
+    def not_definite(self) -> str | None:
+        """What to say where a_h is found not to be positive definite; None if it is sure to be."""
+
     def check(self, domain: Domain) -> None:
         """Refuse data for which there is no solution; collective."""
 
