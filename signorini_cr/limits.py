@@ -58,7 +58,7 @@ class Limits:
         for k in range(levels - 1):  # the halves of all facets, and three in each triangle
             dofs = 2 * dofs + 3 * 4**k * topology.index_map(topology.dim).size_global
         if restart is not None:
-            number, dofs = len(restart.added), len(restart.u[0][0])
+            number, dofs = len(restart.added), restart.u[0][1].size
         _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
 
     def admit(self, solution: Solved, dofs: int) -> None:

@@ -36,8 +36,9 @@ class Restart:
     Attributes:
         added: For each mesh but the coarsest the places of the vertices that the one below does not
             have; None where every triangle was cut into four.
-        u: Places of the dofs of u_h and its values, on the last mesh and on the one below it; or,
-            in time, all on the last mesh, after the last step and after those before it.
+        u: Places of the nodes of u_h and its values there, shape (nodes, block), on the last mesh
+            and on the one below it; or, in time, all on the last mesh, after the last step and
+            after those before it.
     """
 
     added: tuple[Places | None, ...]
@@ -57,8 +58,7 @@ class Restart:
         """
         comm, V = solution.domain.mesh.comm, solution.u.function_space
         size = V.dofmap.index_map.size_local
-        at, values = _places(V)[:size], solution.u.x.array[:size]
-        here = _gathered(at, comm), _gathered(values, comm)
+        here = _gathered(_places(V)[:size], comm), _gathered(_by_nodes(solution.u), comm)
         if below is None:
             return cls((), (here,))
         added = None
@@ -85,7 +85,7 @@ class Restart:
         V, comm = last[0].function_space, last[0].function_space.mesh.comm
         size = V.dofmap.index_map.size_local
         at = _gathered(_places(V)[:size], comm) if below is None else below.u[0][0]
-        u = tuple((at, _gathered(each.x.array[:size], comm)) for each in last)
+        u = tuple((at, _gathered(_by_nodes(each), comm)) for each in last)
         return cls((None,) * (levels - 1), u)
 
     def meshes(self, domain: Domain) -> Iterator[Refined]:
@@ -118,7 +118,7 @@ class Restart:
         complaint = "the mesh is not the one that the levels before were solved on"
         raise_together(V.mesh.comm, complaint if other else None)
         u = fem.Function(V)
-        u.x.array[:] = values[index]
+        u.x.array[:] = values[index].ravel()
         return u
 
 
@@ -133,8 +133,15 @@ def _nodes(mesh: Mesh) -> Places:
     return x[:, 0] + 1j * x[:, 1]
 
 
+def _by_nodes(u: fem.Function) -> FloatArray:
+    """The values at the nodes that this rank owns, shape (nodes, block)."""
+    dofmap = u.function_space.dofmap
+    values: FloatArray = u.x.array.reshape(-1, dofmap.index_map_bs)[: dofmap.index_map.size_local]
+    return values
+
+
 def _places(V: fem.FunctionSpace) -> Places:
-    """Find where the dofs of CR or P1 are, ghosts included."""
+    """Find where the nodes of CR or P1 are, ghosts included."""
     layout, at = Layout.of_space(V), _corners(V.mesh)
     places = np.empty(layout.index_map.size_local + layout.index_map.num_ghosts, dtype=at.dtype)
     places[layout.cells] = _midpoints(at) if layout.cr else at

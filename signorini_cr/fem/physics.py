@@ -30,7 +30,7 @@ class Imposed:
         facets: Local indices of the part's facets, ghosts included, shape (n,).
         components: Which unknowns of a facet it is about, shape (c,).
         means: Their values' means over the facets, shape (n, c).
-        ends: Their values at the vertices, shape (n, d, c).
+        ends: Their values at the vertices, in the order of `facet_measures`, shape (n, d, c).
         sign: Of a bound: s, where s times the unknown must not be below the values.
     """
 
@@ -75,11 +75,14 @@ class OnMesh(Protocol):
         """Compute ∫ f + ∫ g over each owned cell by two rules, much finer than that of `chi`.
 
         Returns:
-            Shape (2, cells), the finest last; None if that can't be told.
+            A cell's unknowns one after the other, shape (2, block * cells), the finest last; None
+            if that can't be told.
         """
 
     def conforming(self, cells: Int32Array, index_map: Any) -> tuple[fem.Form, float]:
         """Return a form whose matrix, times a number, is the P1 operator on this mesh.
+
+        `compat.with_dofs` makes a space with such nodes.
 
         Args:
             cells: The vertices' nodes in each local cell, shape (cells, d + 1).
@@ -130,4 +133,9 @@ class Physics(Protocol):
         """‖u − w‖_h and ‖u − w‖ in L2, where u is known; collective."""
 
     def certify(self, solution: Any) -> Any:
-        """Bound the error of a solution, or say why that can't be done; collective."""
+        """Bound the error of a solution, or say why that can't be done; collective.
+
+        Returns:
+            A `Certificate`, or what has its `bound_h1`, `indicators` and `reason`, which is what
+            adaptive refinement goes by.
+        """
