@@ -264,7 +264,9 @@ class Coefficient:
 
             def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
                 at = Enclosure(boxes)
-                return np.stack([deviation(at, half)[0] for deviation in deviations])
+                largest = (cells.tdim + 1) ** 2  # as it is for affine fields
+                each = (deviation(at, half, largest=largest) for deviation in deviations)
+                return np.stack([quadratic for quadratic, _ in each])
 
             rough = self._by_mean(errors_on(Pieces.of_cells(cells), errors, cells), cells)
             self.rough = np.fmin(rough, theta)

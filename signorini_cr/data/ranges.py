@@ -137,6 +137,7 @@ class Deviation:
         half: FloatArray,
         inverse: bool = False,
         hats: FloatArray | None = None,
+        largest: float = 1.0,
     ) -> tuple[FloatArray, FloatArray]:
         """R and W, shapes (n,).
 
@@ -146,6 +147,7 @@ class Deviation:
             inverse: Of the expression's inverse.
             hats: Points of a rule that is exact for degree 4, where R and W need only hold in the
                 mean over a simplex, so that data without a bound may be of use.
+            largest: How far above its mean the square of what R is multiplied by may be.
 
         Raises:
             Unknown: The expression holds an operator whose range is not known.
@@ -158,7 +160,7 @@ class Deviation:
             which = np.flatnonzero(left_out)
             jet = self._jet(Enclosure(boxes.whole(which), order=0), inverse)
             part, width = left_out[which], jet.high - jet.low
-            quadratic[which] += np.sqrt(part) * width
+            quadratic[which] += np.sqrt(largest * part) * width
             cubic[which] = np.minimum(cubic[which] + 2 * part * width, quadratic[which])
         if hats is not None and boxes.corners is not None and self.singular:
             rough, missed = allowance(self.expression, boxes.corners, hats)

@@ -667,18 +667,20 @@ def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> F
     With z = v or 2u_h − v it is the smaller of two bounds of what it misses of ∫ κ⁻¹|y − κ∇z|²:
     that of its three products, and what follows from ‖κ^{-1/2}(y − κ∇z)‖ ≤ N(y − κ∇z) + 2R N(∇z),
     where N(·)² is 1 + t times the quadrature of κ⁻¹|·|². |y|² is at most `largest` times its mean.
+    On strips κ may be what it is nowhere else; W and W' have that for products with constants.
     """
     pp, bb, pb, vv, yy, *at_z = rows
     R, t, W, inverse_W, strip_low, strip_high, _ = errors
     slack = []
     for sign, (zz, steep) in ((-2.0, at_z[:2]), (2.0, at_z[2:])):
-        products = 2.0 * (inverse_W * yy + W * zz)
+        # an affine field is nowhere more than d + 1 times its norm
+        strips = largest * strip_low * yy + (d + 1) ** 2 * strip_high * zz
+        products = 2.0 * (inverse_W * yy + W * zz) + strips
         square = np.maximum(pp + bb + sign * pb, 0.0)
         norm = (1.0 + t) * (np.sqrt(square) + 2.0 * R * np.sqrt(np.maximum(steep, 0.0))) ** 2
-        # on strips κ may be what it is nowhere else, and an affine field (d + 1) times its norm
-        strips = largest * strip_low * yy + (d + 1) ** 2 * strip_high * zz
         slack.append(np.fmin(products, norm - square + 2.0 * strips))
-    return np.stack([pp, bb, pb, vv, *slack, W * at_z[0]])
+    energy = (W + 0.5 * (d + 1) ** 2 * strip_high) * at_z[0]
+    return np.stack([pp, bb, pb, vv, *slack, energy])
 
 
 def _at_points(

@@ -742,6 +742,17 @@ def test_quadrature_on_pieces(more):
         strips = 2 * (largest * errors[4] * of_y + 9 * errors[5] * of_z)
         assert np.allclose(found[0][row], strips[1:])
     assert np.isclose(largest, 36 if more else 9)
+    # without R the products are bounded one by one, strips apart
+    errors[1], errors[2:4] = np.inf, rng.uniform(size=(2, number))
+    kappa.cut = SimpleNamespace(errors=errors, pieces=whole[:0], errors_inside=errors[:, :0])
+    kappa.inside = np.empty((len(at.weights), 0))
+    rows = gap._by_quadrature(cells, kappa, part, y, v, w)
+    for row, dz in ((4, u + off), (5, u - off)):
+        of_z = at.integral((dz**2).sum(axis=2))
+        missed = (2 * errors[3] + largest * errors[4]) * of_y + (2 * errors[2] + 9 * errors[5]) * of_z
+        assert np.allclose(rows[row], missed[1:])
+    of_v = at.integral(((u + off) ** 2).sum(axis=2))
+    assert np.allclose(rows[6], ((errors[2] + 4.5 * errors[5]) * of_v)[1:])
     assert np.allclose(found[0][0], (at.integral((field**2).sum(axis=2)) / k)[1:])
 
 
