@@ -118,21 +118,21 @@ def _corrected(
             product += bound * left_by(of_phi, made)
             if not np.isfinite(product):
                 return None
-        work, slack = against(made, cells, at)
+        work, missed, slack = against(made, cells, at)
         own, work, energy, more = cells.total(
             sum(through(made, cells, c) for c in conditions if c not in settled.free),
             work,
             square(made, cells, at),
-            unsure(made, at, slack),
+            missed + unsure(made, at, slack),
         )
         middle, reach = own + work, made.loose * np.sqrt(energy) + more + product
     through_facets, off = np.zeros((2, len(cells.exterior)))
-    loss = np.zeros(len(cells.exterior))
-    loss[made.segments.facets.dofs] = made.segments.loss
+    loss = np.zeros((2, len(cells.exterior)))
+    loss[:, made.segments.facets.dofs] = made.segments.loss, made.segments.most
     for condition in (*settled.held, *settled.free):
         side, chosen = cells.sides[condition.number], float(condition in conditions)
-        lost = loss[side.dofs] * measures(cells, side) * chosen
-        through_facets[side.dofs] = np.abs(flows[side.local, side.cells] + lost)
+        lost = loss[:, side.dofs] * measures(cells, side) * chosen
+        through_facets[side.dofs] = np.abs(flows[side.local, side.cells] + lost).max(axis=0)
         off[side.dofs] = np.abs(trace_of(cells, side, at) - chosen).max(axis=0)
     reach += settled.unknown(made, cells, through_facets, off)
     return float(middle - reach), float(middle + reach)

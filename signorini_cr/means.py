@@ -211,7 +211,7 @@ def _insist_on_weight(reason: str | None) -> None:
 
 def _simple(made: Made, cells: Cells) -> bool:
     """Tell whether the products of v and y with functions of P1 are known."""
-    return cells.tdim == 2 and not made.varies and made.beyond is None
+    return cells.tdim == 2 and made.beyond is None
 
 
 def _corrected(
@@ -238,13 +238,16 @@ def _corrected(
     phi = extended(z, np.flatnonzero(seen > 0).astype(np.int32), made)
     with_phi = np.ascontiguousarray(phi.x.array[dofs].T)
     inside = np.ascontiguousarray(z.x.array[dofs].T) - with_phi
-    work, other, size, of_phi = cells.total(
-        against(made, cells, inside)[0],
-        against(made, cells, with_phi)[0],
+    work, missed, _ = against(made, cells, inside)
+    other, more, _ = against(made, cells, with_phi)
+    work, other, missed, size, of_phi = cells.total(
+        work,
+        other,
+        missed + 0.5 * more,
         square(made, cells, inside),
         square(made, cells, with_phi),
     )
-    reach = made.loose * np.sqrt(size) + made.reach * np.sqrt(of_phi)
+    reach = made.loose * np.sqrt(size) + made.reach * np.sqrt(of_phi) + missed
     return [(float(-work - 0.5 * other), float(reach + dual.bound_companion * bound))]
 
 
@@ -286,8 +289,9 @@ def _settled(
         side = cells.sides[each.number]
         through[side.dofs] = np.abs(flows[side.local, side.cells])
         off[side.dofs] = np.abs(trace_of(cells, side, at)).max(axis=0)
-    work, size = cells.total(against(made, cells, at)[0], square(made, cells, at))
-    reach = made.loose * np.sqrt(size) + bound * dual.bound_companion
+    work, missed, _ = against(made, cells, at)
+    work, missed, size = cells.total(work, missed, square(made, cells, at))
+    reach = made.loose * np.sqrt(size) + missed + bound * dual.bound_companion
     if settled.held:
         reach += bound * left_by(of_z, made)
     reach += settled.unknown(made, cells, through, off)

@@ -82,6 +82,50 @@ def test_contact_all_along(part, loss):
     assert (abs(orders(found) - 2.0) < 0.2).all()
 
 
+@pytest.mark.parametrize("touching", [False, True])
+def test_where_all_data_vary_within_cells(touching):
+    """κ, c and b are waves; u = sin(2x + y) + x, and h² as with numbers."""
+
+    def phases(x):
+        return 2.0 * x[0] + x[1], 3.0 * x[0] - x[1]
+
+    def u(x):
+        return ufl.sin(phases(x)[0]) + x[0]
+
+    def kappa(x):
+        return 2.0 + ufl.sin(phases(x)[1])
+
+    def c(x):
+        return 1.0 + x[0] * x[1]
+
+    def b(x):
+        return 1.0 + x[0] ** 2
+
+    def load(x):
+        p, q = phases(x)
+        rise = ufl.cos(q) * (3.0 * (2.0 * ufl.cos(p) + 1.0) - ufl.cos(p))
+        return 5.0 * kappa(x) * ufl.sin(p) - rise + c(x) * u(x)
+
+    def along(x):
+        return kappa(x) * (2.0 * ufl.cos(phases(x)[0]) + 1.0)
+
+    pressure, room = (0.7, 0.0) if touching else (0.0, 1.0)
+
+    def known(x):
+        return -kappa(x) * ufl.cos(phases(x)[0]) + b(x) * (u(x) - 0.5) - pressure
+
+    floor = Contact(lambda x: u(x) - room, g=known, coefficient=b, external=0.5)
+    sides = {"floor": floor, "top": Dirichlet(u), "right": Neumann(along)}
+    sides["left"] = Neumann(lambda x: -along(x))
+    problem = Problem(f=load, coefficient=kappa, reaction=c, conditions=sides)
+    t, weights = np.polynomial.legendre.leggauss(20)
+    x = 0.5 + 0.5 * t
+    top = 0.5 * weights @ ((2.0 + np.sin(3.0 * x - 1.0)) * np.cos(2.0 * x + 1.0))
+    for part, exact in (("floor", pressure), ("top", top)):
+        found = widths(problem, part, inside=exact)
+        assert (orders(found) > 1.7).all() and found[-1] < 0.02
+
+
 @pytest.mark.slow
 def test_contact_that_begins_somewhere():
     """h: nothing is corrected."""

@@ -452,6 +452,37 @@ class Leaky(Uneven):
         return lambda x: self.loss(i, x[0], x[1], ufl.sin)
 
 
+class Waving(Leaky):
+    """The same with a coefficient that varies within cells: waves."""
+
+    def __init__(self, rng: np.random.Generator):
+        super().__init__(rng)
+        self.beats, self.beat = rng.uniform(-9, 9, 2), float(rng.uniform(0, 6))
+        self.depth = float(rng.uniform(0.1, 0.9))
+
+    def _rise(self, x: Any, y: Any, sin: Any) -> Any:
+        p, q = map(float, self.beats)
+        return self.depth * sin(p * x + q * y + self.beat)
+
+    def tensor(self, x: Any, y: Any, sin: Any = np.sin) -> tuple[Any, Any, Any]:
+        """κ's entries."""
+        here = self.kappa * (1.0 + self._rise(x, y, sin))
+        return here, 0.0, here
+
+    @property
+    def coefficient(self) -> Any:
+        """κ for UFL."""
+        return lambda x: self.tensor(x[0], x[1], ufl.sin)[0]
+
+    def f(self, x: Any, y: Any, sin: Callable[[Any], Any] = np.sin) -> Any:
+        """−∇·(κ∇u) + c u."""
+        cos = np.cos if sin is np.sin else ufl.cos
+        mass, (a, b) = self.mass(x, y, sin) * self.u(x, y, sin), self.slope(x, y, cos)
+        p, q = map(float, self.beats)
+        bend = (1.0 + self._rise(x, y, sin)) * (super().f(x, y, sin) - mass)
+        return bend - self.kappa * self._rise(x, y, cos) * (p * a + q * b) + mass
+
+
 CUT = 0.55
 """Where the line that cuts c off meets y = 0."""
 
@@ -681,9 +712,9 @@ def exact_flux(case: Case, i: int, weight: Callable[[Any], Any] = np.ones_like) 
     return float(weights @ case.through(i, *edge(i, t)))
 
 
-def apart(rng: np.random.Generator) -> Case:
+def apart(rng: np.random.Generator, kind: type[Case] = Case) -> Case:
     """Contact below, contact or Dirichlet's condition above, others between them."""
-    case = Case(rng)
+    case = kind(rng)
     kind = str(rng.choice(["robin", "neumann"]))
     b = float(rng.choice(SIZES)) if kind == "robin" else 0.0
     floor, right, top, left = case.sides
@@ -696,9 +727,9 @@ def apart(rng: np.random.Generator) -> Case:
     return case
 
 
-def settled(rng: np.random.Generator) -> Case:
+def settled(rng: np.random.Generator, kind: type[Case] = Case) -> Case:
     """The same, with contact everywhere on a part or nowhere."""
-    case = apart(rng)
+    case = apart(rng, kind)
     case.sides = [
         replace(
             side, wave=(side.wave[0], 1e-9, float(rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.5)))
@@ -724,6 +755,7 @@ MEANS = "Means of parts and of the domain"
 INTEGRALS = "Integrals and means with weights, of parts, materials and the domain"
 UNEVEN = "the same with c that varies within cells: waves, down to 0 or cut off along a slant line"
 LEAKY = "the same with b that varies within facets, waves, down to 0 as well; c may vary, too"
+VARYING = "All of these where κ, a tensor at times, c and b vary within cells: waves"
 LAYERS = "the same with κ, up to 1 : 10⁴, and c, up to 1e8 or 0, of their own left and right"
 
 
@@ -780,6 +812,18 @@ def _intervals(
 def _fluxes(case: Case, solution: Solution, rng: np.random.Generator) -> Found:
     for i in (0, 2):
         yield SIDES[i], solution.flux(SIDES[i]), exact_flux(case, i)
+
+
+def varying(rng: np.random.Generator) -> Case:
+    """A case in which κ, c or b vary within cells, and parts that keep clear of one another."""
+    kind = (Waving, Waving, Leaky, Anisotropic)[rng.integers(4)]
+    return (apart, settled)[rng.integers(2)](rng, kind)
+
+
+def _all_of_them(case: Case, solution: Solution, rng: np.random.Generator) -> Found:
+    yield from _fluxes(case, solution, rng)
+    yield from _weighted_fluxes(case, solution, rng)
+    yield from _means(case, solution, rng)
 
 
 def mixed(rng: np.random.Generator) -> Case:
@@ -936,5 +980,6 @@ def terms(seed: int, quick: bool) -> Group:
             told(_intervals(WEIGHTED, seed, 2 if quick else 50, 80, mixed, _weighted_fluxes)),
             told(_intervals(MEANS, seed, 1 if quick else 50, 79, Case, _means)),
             told(_intervals(INTEGRALS, seed, 1 if quick else 50, 81, mixed, _integrals)),
+            told(_intervals(VARYING, seed, 1 if quick else 60, 82, varying, _all_of_them)),
         ],
     )

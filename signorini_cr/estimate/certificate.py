@@ -33,7 +33,7 @@ from .curl import improve, promising
 from .cusps import Cusps
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .functional import Functional, Masses
-from .gap import integrate, integrate_edge
+from .gap import Within, integrate, integrate_edge
 from .lifting import below
 from .loss import Loss, half
 from .reaction import Reaction
@@ -151,8 +151,9 @@ class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
     κ is given by its means, as `Coefficient` has them, and by least, a lower bound of its
-    eigenvalues; whether it, c or b varies within cells is told. hats and segments are moments of f
-    and g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are
+    eigenvalues; within is about a κ that varies within cells, None if it does not; most_reaction is
+    an upper bound of c, of which reaction is a lower one. hats and segments are moments of f and
+    g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are
     this rank's shares of the contact forces in y, by the parts' numbers, missed is what quadrature
     may have missed of f and g in each cell, shape (cells,) or (). reach is the radius of the ball
     around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖
@@ -177,8 +178,9 @@ class Made:
     thirds: FloatArray | None
     bubbles: FloatArray | None
     cusps: Cusps | None
-    varies: bool
+    within: Within | None
     reaction: FloatArray
+    most_reaction: FloatArray
     left: FloatArray
     taken_up: BoolArray | None
     shed: FloatArray | None
@@ -637,7 +639,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,
-        varies=known.kappa.varies or known.c.varies or known.b.varies,
+        within=Within.of(known.cells, known.kappa, v, known.w),
         excess=flux.excess,
         beyond=flux.beyond,
         vertices=v.vertices,
@@ -646,6 +648,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         bubbles=v.bubbles,
         cusps=v.cusps,
         reaction=known.c.low,
+        most_reaction=known.c.high,
         left=flux.left,
         taken_up=flux.taken_up,
         shed=flux.shed,

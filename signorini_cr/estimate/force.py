@@ -24,6 +24,7 @@ from ..options import ESTIMATE_PREFIX, LINEAR, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
 from .gap import apart
+from .heights import distance
 from .weights import Beyond, Weight
 
 NO_BOUNDS = "what flows through the part has no bounds"
@@ -32,7 +33,6 @@ MEETS = (
     "the part touches another one on which u is set or bounded: what flows through it is no bounded"
     " functional of the solution"
 )
-VARIES = "the coefficient or the reaction varies within cells, or a heat loss within facets"
 SPATIAL = "they are worked out for d = 2 only"
 
 
@@ -77,8 +77,8 @@ def interval(
     ω on the parts, see `Weight`.
     """
     made = made_of(solution)
-    if made.varies or made.level.domain.mesh.topology.dim != 2:
-        raise InputError(f"{NO_BOUNDS}: {VARIES if made.varies else SPATIAL}")
+    if made.level.domain.mesh.topology.dim != 2:
+        raise InputError(f"{NO_BOUNDS}: {SPATIAL}")
     cells = made.cells()
     given = None if weight is None else Weight.of(made, cells, conditions, weight)
     if given is None:
@@ -86,7 +86,7 @@ def interval(
     else:
         phi = extended(given.values, given.known, made)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
-    work, slack = against(made, cells, at)
+    work, off, slack = against(made, cells, at)
     (energy,) = cells.total(square(made, cells, at))
     if given is None:
         beyond = Beyond(force=sum(through(made, cells, condition) for condition in conditions))
@@ -97,7 +97,10 @@ def interval(
     exits = at_fixed or made.on_contact_alone
     more = unsure(made, at, slack, beyond) if exits else 0.0
     value, middle, lifted, more = cells.total(
-        beyond.force, beyond.force + 0.5 * work, beyond.square, beyond.unsure + more
+        beyond.force,
+        beyond.force + 0.5 * work,
+        beyond.square,
+        beyond.unsure + 0.5 * off + more,
     )
     # ℓ meets all of A(u − v), of which one half is known to be at most the radius
     reach = made.reach * (np.sqrt(energy) + 2.0 * np.sqrt(lifted)) + more
@@ -133,8 +136,8 @@ def unsure(
     return float(np.sum(slack) + beyond.left + made.missed.sum() * largest)
 
 
-def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray]:
-    """(A v − p', Aφ), this rank's share, p' = p + A u_h, for d = 2 and κ constant on each cell.
+def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, float, FloatArray]:
+    """(A v − p', Aφ), this rank's share, p' = p + A u_h, for d = 2.
 
     Args:
         made: v, p and u_h.
@@ -142,8 +145,8 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray
         at: φ of P1 at the cells' vertices, shape (3, cells).
 
     Returns:
-        The product, and |∫_T (f + div y)| times φ's mean where c has not taken that up, shape
-        (cells,).
+        The product; how far it may be from the truth, where κ, c or b vary within cells or facets;
+        and |∫_T (f + div y)| times φ's mean where c has not taken that up, shape (cells,).
     """
     d = cells.tdim
     everywhere = slice(0, cells.number)
@@ -151,10 +154,14 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray
     # (A v − p', Aφ) with p' = p + A u_h, cell by cell: first gradients, then c, then b
     v = made.vertices[cells.vertices]
     slopes = cells.apply(at, everywhere)
-    height = made.bumps[cells.facets]
-    work = made.kappa * (
-        dot_rows(v, slopes) - dot_rows(w, slopes) - 4 / 3 * dot_rows(height, slopes)
-    )
+    height, off = made.bumps[cells.facets], 0.0
+    if made.within is None:
+        work = made.kappa * (
+            dot_rows(v, slopes) - dot_rows(w, slopes) - 4 / 3 * dot_rows(height, slopes)
+        )
+    else:
+        work = dot_rows(made.within.pull, at) - made.kappa * dot_rows(w, slopes)
+        off += float(made.within.unsure @ np.sqrt(dot_rows(at, slopes) / cells.volume))
     if made.cusps is not None:
         pull, _ = made.cusps.pulls(cells)
         work[made.cusps.at] += dot_rows(pull, at[:, made.cusps.at])
@@ -168,6 +175,9 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray
         if made.cusps is not None:
             means[made.cusps.at] += dot_rows(made.cusps.moments, at[:, made.cusps.at])
         work += made.reaction * cells.volume * means
+    if made.most_reaction is not made.reaction:
+        sizes = distance(v - w, height) * (total**2 + dot_rows(at, at)) / 12.0
+        off += float(((made.most_reaction - made.reaction) * cells.volume) @ np.sqrt(sizes))
     slack = np.abs(made.left * total) / (d + 1)
     if made.taken_up is not None:
         work -= np.where(made.taken_up, made.left * total, 0.0) / (d + 1)
@@ -175,25 +185,28 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, FloatArray
     edge = made.segments
     on_edge = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, at))
     of_edge = edge.measure * np.sum(edge.weights[:, None] * edge.rest * on_edge, axis=0)
-    if edge.loss.any():
+    if edge.most.any():
         jump = apart(cells, w, edge, made.vertices, made.bumps)
-        loss = edge.loss[edge.place] * edge.measure
-        of_edge = of_edge - loss * np.sum(edge.weights[:, None] * jump * on_edge, axis=0)
+        least, most = edge.of_loss * edge.measure
+        of_edge = of_edge - least * np.sum(edge.weights[:, None] * jump * on_edge, axis=0)
+        sizes = (edge.weights @ jump**2) * (edge.weights @ on_edge**2)
+        off += float((most - least) @ np.sqrt(sizes))
     if made.shed is not None:
         share = edge.measure / measures(cells, edge.facets)[edge.place]
         of_edge = of_edge + made.shed[edge.place] * share * (edge.weights @ on_edge)
-    return float(np.sum(work) - np.sum(of_edge)), slack
+    return float(np.sum(work) - np.sum(of_edge)), off, slack
 
 
 def square(made: Made, cells: Cells, at: FloatArray) -> float:
-    """‖Aφ‖², this rank's share, from φ at the cells' vertices."""
+    """‖Aφ‖², or a bound of it, this rank's share, from φ at the cells' vertices."""
     total, edge = sum_rows(at), made.segments
     slopes = cells.apply(at, slice(0, cells.number))
-    found = float(np.sum(made.kappa * dot_rows(at, slopes)))
-    masses = made.reaction * cells.volume
+    kappa = made.kappa if made.within is None else made.within.mean
+    found = float(np.sum(kappa * dot_rows(at, slopes)))
+    masses = made.most_reaction * cells.volume
     found += float(masses @ (total**2 + dot_rows(at, at))) / 12.0
     (a, b), measure = trace_of(cells, edge.facets, at), measures(cells, edge.facets)
-    return found + float(np.sum(edge.loss * measure * (a**2 + a * b + b**2))) / 3.0
+    return found + float(np.sum(edge.most * measure * (a**2 + a * b + b**2))) / 3.0
 
 
 def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:

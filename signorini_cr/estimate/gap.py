@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -659,6 +660,94 @@ def _of_tensor(
     found = np.sqrt(volume / mean * squares) + 2.0 * rough * np.sqrt(volume * mean * steep)
     far, near = found**2 / (1.0 - theta) - np.stack(gap)
     return volume * vv, far, near, rough * mean * volume * steep[0]
+
+
+class Within(NamedTuple):
+    """κ∇v where κ varies within cells; of a tensor with lengths stretched.
+
+    Attributes:
+        pull: ∫_T κ∇v·∇λ_i, shape (d + 1, cells).
+        unsure: How far ∫_T κ∇v·e may be from that, at most, for a unit vector e, shape (cells,).
+        mean: Upper bound of κ's mean over T, shape (cells,).
+        largest: Upper bound of κ's eigenvalues with lengths as they are, shape (cells,).
+    """
+
+    pull: FloatArray
+    unsure: FloatArray
+    mean: FloatArray
+    largest: FloatArray
+
+    @classmethod
+    def of(cls, cells: Cells, kappa: Coefficient, v: Companion, w: FloatArray) -> Within | None:
+        """Integrate; None where κ is constant on each cell.
+
+        Args:
+            cells: The mesh.
+            kappa: The coefficient.
+            v: v.
+            w: u_h at the cells' vertices, shape (d + 1, cells).
+        """
+        if not kappa.varies:
+            return None
+        work = _tensor_within if kappa.tensor is not None else _within
+        rows = [work(cells, kappa, part, v, w) for part in blocks(cells.number)]
+        pull, unsure, mean = (np.concatenate(row, axis=-1) for row in zip(*rows, strict=True))
+        return cls(pull, unsure, mean, np.broadcast_to(kappa.most, mean.shape))
+
+
+Row = tuple[FloatArray, FloatArray, FloatArray]
+"""What `Within` has of some cells: pull, unsure, mean."""
+
+
+def _within(cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray) -> Row:
+    """By quadrature on cells, or on their pieces, and by what that may miss."""
+    values, cut, rule = kappa.values, kappa.cut, kappa.rule
+    assert values is not None and cut is not None
+
+    def integrals(
+        where: slice | IndexArray, errors: FloatArray, there: FloatArray, hats: FloatArray
+    ) -> FloatArray:
+        volume, slopes = cells.volume[where], v.slopes(cells, where)
+        total, steep = np.zeros_like(w[:, where]), np.zeros_like(volume)
+        for k, weight, hat in zip(there, rule.weights, hats, strict=True):
+            gamma = w[:, where] + slopes(hat.reshape(len(hat), -1))
+            total += weight * k * gamma
+            steep += weight * dot_rows(gamma, cells.apply(gamma, where))
+        _, _, W, _, _, strip, _ = errors
+        unsure = (2.0 * W + (cells.tdim + 1) * strip) * np.sqrt(volume * np.maximum(steep, 0.0))
+        mean = rule.weights @ there + 2.0 * W + strip
+        return np.stack([*cells.apply(total, where), unsure, mean])
+
+    rows = integrals(part, cut.errors[:, part], values[:, part], rule.hats.T)
+    first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
+    if first < last:
+        pieces = cut.pieces[np.arange(first, last)]
+        hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
+        known = cut.errors_inside[:, first:last], kappa.inside[:, first:last]
+        there = integrals(pieces.parent, *known, hats) * pieces.part
+        which, place = np.unique(pieces.parent - part.start, return_inverse=True)
+        rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
+    *pull, unsure, mean = rows
+    return np.array(pull), unsure, mean
+
+
+def _tensor_within(
+    cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray
+) -> Row:
+    """The same of a tensor, which is within ϱ κ_T of what the rule is exact for."""
+    k, volume, slopes = pick(kappa.mean, part), cells.volume[part], v.slopes(cells, part)
+    _, gradients = cells.corners(part)
+    total, steep = np.zeros((len(volume), cells.tdim)), np.zeros_like(volume)
+    rule = kappa.rule
+    for tensor, weight, hat in zip(
+        kappa.apart(cells, part), rule.weights, rule.hats.T[:, :, None], strict=True
+    ):
+        slope = np.einsum("in,ink->nk", w[:, part] + slopes(hat), gradients)
+        total += weight * (k[:, None] * slope + np.einsum("nij,nj->ni", tensor, slope))
+        steep += weight * (slope**2).sum(axis=1)
+    pull = volume * np.einsum("ink,nk->in", gradients, total)
+    unsure = 2.0 * kappa.rough[part] * k * volume * np.sqrt(steep)
+    return pull, unsure, pick(kappa.high, part)
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:

@@ -172,7 +172,9 @@ def pressed(made: Made, cells: Cells, side: BoundaryFacets) -> FloatArray:
 
 
 def _largest(made: Made) -> FloatArray:
-    """The largest eigenvalue of κ, constant on each cell, shape (cells,) or ()."""
+    """An upper bound of κ's eigenvalues, shape (cells,) or ()."""
+    if made.within is not None:
+        return made.within.largest
     if made.stretch is None or not len(made.stretch):
         return made.kappa
     return np.asarray(made.kappa / np.linalg.eigvalsh(made.stretch)[:, 0] ** 2)
@@ -185,9 +187,9 @@ def _square(
     which, place = np.unique(side.cells, return_inverse=True)
     steep, area = (np.bincount(place, row) for row in (lifted.steep, lifted.area))
     loss, edge = np.zeros(len(cells.exterior)), made.segments
-    loss[edge.facets.dofs] = edge.loss
+    loss[edge.facets.dofs] = edge.most
     found = pick(most, which) @ steep**2 if most.ndim else float(most) * np.sum(steep**2)
-    found += np.sum(pick(made.reaction, which) * area**2)
+    found += np.sum(pick(made.most_reaction, which) * area**2)
     return float(found + loss[side.dofs] @ lifted.edge**2)
 
 

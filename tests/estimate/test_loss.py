@@ -241,17 +241,21 @@ def test_without_a_place_where_u_is_held():
         assert error <= solution.certificate.bound_energy_norm < 1.2 * error
 
 
-def test_means_hold_and_forces_are_refused():
+@pytest.mark.parametrize("floor", FLOORS)
+def test_means_and_fluxes_hold(floor):
     loss = LOSSES["wave"]
-    solution = solve(problem(loss), SQUARE.mesh(0.1, MPI.COMM_WORLD))
-    known = Reference(solution.domain, loss)
+    solution = solve(problem(loss, floor), SQUARE.mesh(0.1, MPI.COMM_WORLD))
+    known = Reference(solution.domain, loss, floor)
     one = 1.0 + 0.0 * known.x[0]
     for where, measure in ((None, known.dx), ("right", known.sides["right"])):
         _, lower, upper = solution.mean(where)
         exact = known.total(u(known.x) * measure) / known.total(one * measure)
         assert lower <= exact <= upper and upper - lower < 0.2
-    with pytest.raises(InputError, match="or a heat loss within facets"):
-        solution.flux("floor")
+    through = {"floor": known.pressure, "top": KAPPA * u(known.x).dx(1)}
+    for part, density in through.items():
+        _, lower, upper = solution.flux(part)
+        assert lower <= known.total(density * known.sides[part]) <= upper
+        assert upper - lower < 1.0
 
 
 def test_reasons():

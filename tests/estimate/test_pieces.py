@@ -957,13 +957,13 @@ def test_slack_of_quadrature(few):
     for row, sign, zz, steep in ((4, -2, *at_z[:2]), (5, 2, *at_z[2:])):
         for i in range(5):
             square = pp[i] + bb[i] + sign * pb[i]
-            products = 2 * (inverse_W[i] * yy[i] + W[i] * zz[i])
+            strips = 9 * (strip_low[i] * yy[i] + strip_high[i] * zz[i])
+            products = 2 * (inverse_W[i] * yy[i] + W[i] * zz[i]) + strips
             norm = (1 + t[i]) * (square**0.5 + 2 * R[i] * steep[i] ** 0.5) ** 2 - square
-            strips = 2 * 9 * (strip_low[i] * yy[i] + strip_high[i] * zz[i])
-            assert np.isclose(found[row, i], min(products, norm + strips))
-            by_norm += norm + strips < products
+            assert np.isclose(found[row, i], min(products, norm + 2 * strips))
+            by_norm += norm + 2 * strips < products
     assert by_norm > 3 if few else by_norm == 0
-    assert np.allclose(found[6], W * at_z[0])
+    assert np.allclose(found[6], (W + 4.5 * strip_high) * at_z[0])
 
 
 @pytest.mark.serial

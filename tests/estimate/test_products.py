@@ -119,6 +119,7 @@ def made_up(cells, seed):
         thirds=None,
         bubbles=None,
         cusps=None,
+        within=None,
         lift=(none.astype(int), none, none, none),
         bounded=none.astype(int),
     )
@@ -355,15 +356,43 @@ def by_points(made, cells, phi):
     )
 
 
+def vary(made, cells, phi, work, rng):
+    """Let κ, c and b vary by given amounts; what becomes of (A v − p', Aφ), ‖Aφ‖² and is unsure."""
+    at, on, edge = Points(cells), OnFacets(cells, made.segments.facets), made.segments
+    (values, slopes), number = at.affine(phi), cells.number
+    jump, bend = sums_of(
+        at.affine(made.vertices[cells.vertices] - made.w), at.of_facets(made.bumps)
+    )
+    pull, (unsure, mean) = rng.normal(size=(3, number)), rng.uniform(1, 2, (2, number))
+    made.within = gap.Within(pull, unsure, mean, mean)
+    kappa = np.broadcast_to(made.kappa, number)[:, None]
+    own = bend + at.affine(made.w)[1]  # ∇v
+    work += (pull * phi).sum() - at.integral(kappa * (own * slopes).sum(axis=2)).sum()
+    off = (unsure * np.sqrt((slopes**2).sum(axis=2)[:, 0])).sum()
+    more = rng.uniform(1, 2, number)
+    made.most_reaction = made.reaction + more
+    norms = at.integral(jump**2) * at.integral(values**2)
+    off += (more * np.sqrt(norms)).sum()
+    phi_on = on.affine(phi)
+    jump_on = on.affine(made.vertices[cells.vertices] - made.w) + on.bump(made.bumps)
+    less, there = edge.loss, edge.loss[edge.place]
+    made.segments = replace(edge, between=np.stack([there, there + 3.0]))
+    off += (3.0 * np.sqrt(on.integral(jump_on**2) * on.integral(phi_on**2))).sum()
+    size = at.integral(mean[:, None] * (slopes**2).sum(axis=2)).sum()
+    size += at.integral(np.broadcast_to(made.most_reaction, number)[:, None] * values**2).sum()
+    return work, size + on.integral((less + 3.0)[:, None] * phi_on**2).sum(), off
+
+
 @pytest.mark.serial
 @pytest.mark.parametrize("reaction", [0.0, 3.0, "some"])
 @pytest.mark.parametrize("lossy", [False, True])
-def test_the_residual_against_affine_functions(reaction, lossy):
+@pytest.mark.parametrize("varies", [False, True])
+def test_the_residual_against_affine_functions(reaction, lossy, varies):
     level, cells, kappa, edge, rng = on_sides(6)
     _, made = made_up(cells, 7)
     made.level, made.kappa = level, kappa
     some = np.where(rng.uniform(size=cells.number) < 0.5, 0.0, 2.0)
-    made.reaction = some if reaction == "some" else np.array(reaction)
+    made.reaction = made.most_reaction = some if reaction == "some" else np.array(reaction)
     # a cell in a corner has two facets, and one b for both in the form that finds φ
     alone = cells.exterior[cells.facets].sum(axis=0)[edge.facets.cells] == 1
     loss = rng.uniform(5, 9, len(edge.loss)) * alone * lossy
@@ -377,8 +406,13 @@ def test_the_residual_against_affine_functions(reaction, lossy):
     made.cells = lambda: cells
     phi = rng.normal(size=cells.vertices.max() + 1)[cells.vertices]
     work, size, slack = by_points(made, cells, phi)
-    found, left = force.against(made, cells, phi)
+    expected = 0.0
+    if varies:
+        work, size, expected = vary(made, cells, phi, work, rng)
+    found, off, left = force.against(made, cells, phi)
     assert np.isclose(found, work, rtol=1e-5)
+    # on facets in pieces the norms are those on the pieces
+    assert 0.99 * expected <= off <= expected * (1 + 1e-9)
     assert np.allclose(left, slack)
     assert np.isclose(force.square(made, cells, phi), size)
     made.missed = np.array([0.125, 0.125])
@@ -386,6 +420,8 @@ def test_the_residual_against_affine_functions(reaction, lossy):
     assert np.isclose(force.unsure(made, phi, left), slack.sum() + 0.25 * np.abs(phi).max())
     expected = slack.sum() + 0.125 + 0.25 * (np.abs(phi).max() + 0.5)
     assert np.isclose(force.unsure(made, phi, left, beyond), expected)
+    if varies:
+        return
     # The function with given values that has the least ‖Aφ‖, by solving for it densely
     V = function_space(cells.domain.mesh, "P1")
     dofs = V.dofmap.list[: cells.number].T
@@ -415,7 +451,7 @@ def test_the_residual_against_affine_functions(reaction, lossy):
 def test_norm_of_what_a_weight_has_beyond_its_values_at_vertices(tensor):
     """(λ ‖∇ℓ‖² + c ‖ℓ‖²) on cells, the norms added up in a corner's, λ κ's largest eigenvalue."""
     _, cells, kappa, edge, rng = on_sides(8)
-    made = SimpleNamespace(kappa=kappa, stretch=None, segments=edge)
+    made = SimpleNamespace(kappa=kappa, stretch=None, segments=edge, within=None)
     if tensor:
         a = rng.normal(size=(cells.number, 2, 2))
         full = a @ a.swapaxes(1, 2) + 0.1 * np.eye(2)
@@ -426,7 +462,8 @@ def test_norm_of_what_a_weight_has_beyond_its_values_at_vertices(tensor):
     most = weights._largest(made)
     assert np.allclose(most, kappa)
     loss = rng.uniform(1, 2, len(edge.loss))
-    made.segments, made.reaction = replace(edge, loss=loss), rng.uniform(1, 2, cells.number)
+    made.segments = replace(edge, loss=loss)
+    made.reaction = made.most_reaction = rng.uniform(1, 2, cells.number)
     side = edge.facets
     cell = side.cells[0]
     side = replace(side, cells=np.where(np.arange(len(loss)) < 2, cell, side.cells))
@@ -437,7 +474,7 @@ def test_norm_of_what_a_weight_has_beyond_its_values_at_vertices(tensor):
         rows[:, at] += steep[i], area[i]
     expected = np.sum(kappa * rows[0] ** 2 + made.reaction * rows[1] ** 2) + loss @ on_edge**2
     assert np.isclose(weights._square(made, cells, side, lifted, most), expected)
-    made.reaction = np.array(3.0)
+    made.reaction = made.most_reaction = np.array(3.0)
     expected = np.sum(2.0 * rows[0] ** 2 + 3.0 * rows[1] ** 2) + loss @ on_edge**2
     assert np.isclose(weights._square(made, cells, side, lifted, np.array(2.0)), expected)
 
@@ -749,11 +786,87 @@ def test_quadrature_on_pieces(more):
     rows = gap._by_quadrature(cells, kappa, part, y, v, w)
     for row, dz in ((4, u + off), (5, u - off)):
         of_z = at.integral((dz**2).sum(axis=2))
-        missed = (2 * errors[3] + largest * errors[4]) * of_y + (2 * errors[2] + 9 * errors[5]) * of_z
+        missed = (2 * errors[3] + largest * errors[4]) * of_y + (
+            2 * errors[2] + 9 * errors[5]
+        ) * of_z
         assert np.allclose(rows[row], missed[1:])
     of_v = at.integral(((u + off) ** 2).sum(axis=2))
     assert np.allclose(rows[6], ((errors[2] + 4.5 * errors[5]) * of_v)[1:])
     assert np.allclose(found[0][0], (at.integral((field**2).sum(axis=2)) / k)[1:])
+
+
+def below(corners, normal, level):
+    """Triangles that make up where normal·x < level in a triangle."""
+    found, side = [], corners @ normal - level
+    for k in range(3):
+        a, b = side[k], side[(k + 1) % 3]
+        if a < 0:
+            found.append(corners[k])
+        if a * b < 0:
+            found.append(corners[k] + a / (a - b) * (corners[(k + 1) % 3] - corners[k]))
+    return [np.array([found[0], *found[k : k + 2]]) for k in range(1, len(found) - 1)]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["waves", "jump", "tensor"])
+def test_a_coefficient_against_affine_functions(kind):
+    """∫_T κ∇v·∇λ_i, by a finer rule or on triangles on either side of the jump."""
+    normal, level, high = np.array([1.0, 0.3]), 0.55, 40.0
+
+    def waves(x):
+        return 2.0 + np.sin(3.0 * x[..., 0] - 2.0 * x[..., 1])
+
+    def kappa(x):
+        wave = 2.0 + ufl.sin(3.0 * x[0] - 2.0 * x[1])
+        if kind == "tensor":
+            return ufl.as_matrix([[wave + 4.0, 0.1 * wave], [0.1 * wave, wave]])
+        return wave if kind == "waves" else ufl.conditional(x[0] + 0.3 * x[1] < level, 1.0, high)
+
+    made = solve(Problem(f=-9.0, coefficient=kappa), square(3)).certificate._made
+    cells = made.cells()
+    plain = Cells(made.level.domain, made.level.V)
+    at = Points(plain)
+    slope = sums_of(at.affine(made.vertices[plain.vertices]), at.of_facets(made.bumps))[1]
+    tensor = waves(at.x)[..., None, None] * np.eye(2)
+    if kind == "tensor":
+        one = np.array([[1.0, 0.1], [0.1, 1.0]])
+        tensor = waves(at.x)[..., None, None] * one + 4.0 * np.diag([1.0, 0.0])
+    flow = np.einsum("nqij,nqj->nqi", tensor, slope)
+    mean, largest = waves(at.x) @ at.weights, np.linalg.eigvalsh(tensor)[..., -1].max(axis=1)
+    if kind == "jump":
+        # ∇v is affine: its values at the corners of a cell, and so everywhere
+        gram = (at.hats * at.weights) @ at.hats.T
+        corners = np.linalg.solve(
+            gram, np.einsum("iq,q,nqk->ink", at.hats, at.weights, slope).reshape(3, -1)
+        )
+        corners = corners.reshape(3, cells.number, 2)
+        flow, mean = at.integral(slope.transpose(2, 0, 1)).T * high, np.full(cells.number, high)
+        largest = np.full(cells.number, 1.0)
+        for n in range(cells.number):
+            to_hats = np.linalg.inv(np.vstack([at.corners[n].T, np.ones(3)]))
+            for triangle in below(at.corners[n], normal, level):
+                (x, y), (z, w) = triangle[1:] - triangle[0]
+                area = abs(x * w - y * z) / 2
+                hats = to_hats @ [*triangle.mean(axis=0), 1.0]
+                flow[n] += (1.0 - high) * area * (hats @ corners[:, n])
+                mean[n] += (1.0 - high) * area / at.area[n]
+        assert (mean < 0.9 * high).sum() > 3 and ((mean > 1.1) & (mean < 0.9 * high)).sum() > 3
+    else:
+        flow = at.integral(flow.transpose(2, 0, 1)).T
+    truth = np.einsum("nik,nk->in", at.gradients, flow)
+    within, reach = made.within, np.sqrt((at.gradients**2).sum(axis=2)).T
+    if kind == "tensor":  # lengths are stretched
+        other = Points(cells)
+        reach = np.sqrt((other.gradients**2).sum(axis=2)).T
+        mean = np.sqrt(np.linalg.det(np.einsum("nqij,q->nij", tensor, at.weights)))
+    noise = 1e-12 * np.abs(truth).max()
+    assert (np.abs(within.pull - truth) <= within.unsure * reach + noise).all()
+    assert (mean <= within.mean * (1 + 1e-12)).all() and (
+        largest <= within.largest * (1 + 1e-12)
+    ).all()
+    unsure, more = {"waves": (0.02, 1.001), "jump": (0.02, 1.2), "tensor": (0.2, 2.5)}[kind]
+    assert (within.unsure * reach).max() <= unsure * np.abs(truth).max()
+    assert (within.mean <= more * mean).all()
 
 
 @pytest.mark.serial
