@@ -90,6 +90,9 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     if record["bound_h1"] is None:
         return f"no bound of the error: {record['bound_reason']}"
     facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {at_most(record['bound_h1'])}"]
+    own = at_most(record["bound_energy_norm"])
+    if own != at_most(record["bound_h1"]):  # where κ is not 1, or with c or b
+        facts.append(f"in the norm of the energy it is at most {own}")
     energy = record["energy_bounds"]
     if energy["lower"] is not None and energy["upper"] is not None:
         facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")

@@ -22,7 +22,7 @@ RECORD = {
     "energy": -2.0, "quantities": {}, "contact": {"active": 2, "length": 1.0,
     "force_bounds": {"lower": None, "upper": None, "reason": "none"}}, "error_h1": None,
     "error_l2": None,
-    "bound_h1": 0.26683801, "bound_reason": None,
+    "bound_h1": 0.26683801, "bound_energy_norm": 0.26683801, "bound_reason": None,
     "energy_bounds": {"lower": -2.68565172, "upper": -2.68529189},
     "seconds": {"mesh": 0.5, "assemble": 0.25, "solve": 1.0, "estimate": None},
 }  # fmt: skip
@@ -47,6 +47,12 @@ def test_what_is_printed_as_certain_is_certain(factor, bound):
     width = ends["upper"] - ends["lower"]
     assert wide >= 99.99 * width / -ends["lower"] and wide <= 0.0141
     assert high - low <= 1.21 * width
+
+
+def test_the_energy_norm_is_told_where_it_is_another_one():
+    assert "norm of the energy" not in plain(certified(RECORD))
+    told = plain(certified(RECORD | {"bound_energy_norm": 0.98765432}))
+    assert "; in the norm of the energy it is at most 0.988; J(u)" in told
 
 
 def test_no_bound_no_figures():
