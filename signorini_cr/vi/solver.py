@@ -35,6 +35,12 @@ from .system import DATUM, Vectors
 SET_TOLERANCE = 0.01
 """What dofs in the wrong set may have for a residual, in parts of what all may have together."""
 
+SET_STEPS = 2
+"""Newton steps that are made for that alone, when the residual as a whole is small already.
+
+Only one where that is so after more steps than these: what takes long has been looked at often.
+"""
+
 LARGE = 1e10
 """Contrast of stiffness from which on it is told of when a solver gives up."""
 
@@ -43,12 +49,6 @@ ENTRIES = 3.0
 
 SLIGHT = 0.1
 """What need not be worked out, in parts of what may be wrong with the forces."""
-
-SET_STEPS = 2
-"""Newton steps to that end alone, when the residual as a whole is small enough already.
-
-One less after as many steps: what takes long has been looked at often.
-"""
 
 PASSES = 6
 """Newton steps in an active set that does not change any more; they refine the solution."""
@@ -290,49 +290,104 @@ class NewtonTest:
         Reason = PETSc.SNES.ConvergedReason
         if not np.isfinite(norm):
             return DIVERGED_NAN
+        small = self._small(snes, step, norm)
+        before, self._forces = self._forces, self._linear.forces()
+        if step == 0:
+            done = self._is_solved_by_the_start(norm, small)
+            return Reason.CONVERGED_FNORM_ABS if done else Reason.ITERATING
+        force_error, imbalance = self.force_error, self.imbalance
+        self._forget()
+        facts = self._contact_facts(before)
+        if self._is_large(snes, step, norm, small) or self._looks_at_the_set(step, small, facts):
+            return Reason.ITERATING
+        noise = self._measure(snes, norm, facts)
+        if self.force_error <= self._loose * FORCES and self.imbalance <= self._loose * FLOWS:
+            return Reason.CONVERGED_FNORM_ABS
+        if self._has_another_set(facts, noise) or self._refines(force_error, imbalance):
+            return Reason.ITERATING
+        return self._as_far_as_it_goes(snes.getSolution())
+
+    def _small(self, snes: PETSc.SNES, step: int, norm: float) -> float:
+        """What the residual's norm may be; a tolerance that is looser than ours loosens all."""
         if step == 0:
             self._start = norm
         rtol, atol, _, _ = snes.getTolerances()
         small = max(atol, rtol * self._start)
-        self._loose = loose = max(1.0, small / self._target)  # who sets a tolerance sets them all
-        before, self._forces = self._forces, self._linear.forces()
-        if step == 0:
-            enough = norm == 0.0 or (loose > 1.0 and norm <= small)
-            if enough:
-                self.force_error = self.imbalance = 0.0
-            return Reason.CONVERGED_FNORM_ABS if enough else Reason.ITERATING
-        known, solved, self.touching = self.force_error, self.imbalance, False
-        self.force_error = self.imbalance = np.inf  # what was known of another set says nothing
-        x, last = snes.getSolution(), self._linear.active.dofs
-        facts = self._contact_facts(before)
-        if norm > small and (step == 1 or norm > NOISE * self._cycle.finest.rounding(x, last)):
-            return Reason.ITERATING
+        self._loose = max(1.0, small / self._target)
+        return float(small)
+
+    def _is_solved_by_the_start(self, norm: float, small: float) -> bool:
+        """Whether no step is needed: by our own tolerance one is made, to look at the set."""
+        enough = norm == 0.0 or (self._loose > 1.0 and norm <= small)
+        if enough:
+            self.force_error = self.imbalance = 0.0
+        return enough
+
+    def _forget(self) -> None:
+        """What was measured in another set says nothing."""
+        self.force_error = self.imbalance = np.inf
+        self.touching = False
+
+    def _is_large(self, snes: PETSc.SNES, step: int, norm: float, small: float) -> bool:
+        """Whether the residual is too large, and no rounding; collective."""
+        if norm <= small:
+            return False
+        active = self._linear.active.dofs
+        finest = self._cycle.finest
+        return step == 1 or norm > NOISE * finest.rounding(snes.getSolution(), active)
+
+    def _looks_at_the_set(self, step: int, small: float, facts: _ContactFacts) -> bool:
+        """Whether a step is made only because dofs are in the wrong set."""
         allowed = SET_STEPS if step <= SET_STEPS else 1
-        if self._for_the_set < allowed and facts.misclassified_norm > SET_TOLERANCE * small:
-            self._for_the_set += 1
-            return Reason.ITERATING
+        wrong = facts.misclassified_norm > SET_TOLERANCE * small
+        if self._for_the_set >= allowed or not wrong:
+            return False
+        self._for_the_set += 1
+        return True
+
+    def _measure(self, snes: PETSc.SNES, norm: float, facts: _ContactFacts) -> FloatArray:
+        """Work out what may be wrong; return what of the forces is rounding, by class; collective."""
+        x, residual = snes.getSolution(), snes.getFunction()[0]
         errors, noise = self._force_errors(x, norm, facts)
         self.force_error = float(errors.max(initial=0.0))
-        self.imbalance = self._stiffness.imbalance(x, self._b, snes.getFunction()[0], last)
-        if self.force_error <= loose * FORCES and self.imbalance <= loose * FLOWS:
-            return Reason.CONVERGED_FNORM_ABS
-        if (facts.misclassified > np.maximum(loose * FORCES * facts.sizes, noise)).any():
-            self._swaps += 1
-            if self._swaps < SWAPS:
-                self.force_error = self.imbalance = np.inf  # of another set
-                return Reason.ITERATING
+        active = self._linear.active.dofs
+        self.imbalance = self._stiffness.imbalance(x, self._b, residual, active)
+        return noise
+
+    def _has_another_set(self, facts: _ContactFacts, noise: FloatArray) -> bool:
+        """Whether dofs in the wrong set are what is wrong, and it has not been so too often."""
+        allowed = np.maximum(self._loose * FORCES * facts.sizes, noise)
+        if not (facts.misclassified > allowed).any():
+            return False
+        self._swaps += 1
+        if self._swaps >= SWAPS:
+            return False
+        self.force_error = self.imbalance = np.inf
+        return True
+
+    def _refines(self, force_error: float, imbalance: float) -> bool:
+        """Whether to solve once more in the same set, as that has helped.
+
+        Args:
+            force_error: As it was a step before.
+            imbalance: The same.
+        """
         self._passes += 1
-        figures = (self.force_error, known, FORCES), (self.imbalance, solved, FLOWS)
-        gains = any(loose * limit < now <= GAIN * last for now, last, limit in figures)
-        if gains and self._passes < PASSES:
-            reduction = min(1.0, loose * FLOWS / max(self.imbalance, 1e-300))
-            self._linear.reduction = SET_SHARE * reduction
-            return Reason.ITERATING
+        figures = (self.force_error, force_error, FORCES), (self.imbalance, imbalance, FLOWS)
+        gains = any(self._loose * most < now <= GAIN * last for now, last, most in figures)
+        if not gains or self._passes >= PASSES:
+            return False
+        reduction = min(1.0, self._loose * FLOWS / max(self.imbalance, 1e-300))
+        self._linear.reduction = SET_SHARE * reduction
+        return True
+
+    def _as_far_as_it_goes(self, x: PETSc.Vec) -> int:
+        """End where rounding has the last word: go to twice the digits, put up with it, or fail."""
         if self._data is not None:
             self.doubtful = True
-            return Reason.CONVERGED_FNORM_ABS
-        if max(self.force_error, self.imbalance) <= loose * ROUNDED:
-            return Reason.CONVERGED_FNORM_ABS
+            return int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS)
+        if max(self.force_error, self.imbalance) <= self._loose * ROUNDED:
+            return int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS)
         self.failure = self._lost_in_rounding(x)
         return DIVERGED_ROUNDING
 
