@@ -85,10 +85,10 @@ def adaptively(
 
     Args:
         limits: What the levels may take in all.
-        tolerance: As for `solve_adaptive`, like the others.
-        levels: The end.
-        max_dofs: The end.
-        fraction: Part of the bound's square that the marked cells hold.
+        tolerance: The end: a bound not above it.
+        levels: The end: so many meshes.
+        max_dofs: The end: the next mesh would have more degrees of freedom.
+        fraction: Part of the bound's square that the marked cells hold, in (0, 1].
     """
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")

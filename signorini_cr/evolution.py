@@ -13,7 +13,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from numbers import Real
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import ufl
@@ -40,10 +40,24 @@ from .restart import Restart
 from .solution import Solution
 from .vi.level import Level
 
-SCHEMES = ("euler", "bdf2")
-
 Refined = tuple[Domain, Int32Array]
 """A mesh, and the cell of the one below that holds each of its cells."""
+
+
+class Scheme(NamedTuple):
+    """A step of length Δt: rate = factor capacity / Δt, and w a sum of the solutions before.
+
+    Attributes:
+        factor: Of the rate.
+        weights: Of the solutions before in w, the last one first.
+    """
+
+    factor: float
+    weights: tuple[float, ...]
+
+
+SCHEMES = {"euler": Scheme(1.0, (1.0,)), "bdf2": Scheme(1.5, (4.0 / 3.0, -1.0 / 3.0))}
+"""By name; the first steps, which have too little before them, are Euler's."""
 
 
 class Clock(Protocol):
@@ -266,8 +280,9 @@ def solve_in_time(
     limits.begin(domain, "CR", restart, levels)
     try:
         for step in range(max(done, 1), steps + 1):
-            second = scheme == "bdf2" and step > 1
-            needed = (1.5 if second else 1.0) * steps / end
+            weights = SCHEMES[scheme].weights
+            method = SCHEMES[scheme if step >= len(weights) else "euler"]
+            needed = method.factor * steps / end
             if solver is None or needed != factor:
                 factor, former = needed, solver
                 added = {name: factor * each for name, each in {"": capacity, **own}.items()}
@@ -280,7 +295,8 @@ def solve_in_time(
                 else:
                     start, then, before = _gone_on(solver, restart, initial, step)
             source = fem.Function(solver.V)
-            source.x.array[:] = (4.0 * then - before) / 3.0 if second else then
+            for weight, former_u in zip(method.weights, (then, before), strict=False):
+                source.x.array[:] += weight * former_u
             t = end * step / steps
             if time is not None:
                 time.value = t

@@ -152,7 +152,10 @@ def solve_physics(
     nested: bool = True,
     restart: Restart | None = None,
 ) -> Iterator[Solution]:
-    """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`."""
+    """Solve any physics on a mesh and on those that ``step`` makes of it; see `solve_sequence`.
+
+    What is left of a sequence that nobody asks to its end is freed with its meshes, see `garbage`.
+    """
     physics.check(domain)
     hierarchy, seconds = Hierarchy(physics, domain), {"mesh": domain.seconds}
     level, start, before = Level(hierarchy.meshes), Start(), None
@@ -274,7 +277,7 @@ def solve_level(
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
     contact = contact_facts(level.data, system, u, residual, iterations)
-    if system.offset:
+    if system.offset:  # the solver works with u less a number, where that is large
         u.x.array[:] += system.offset
     owned = system.A.getLocalSize()[0]
     energy = level.domain.mesh.comm.allreduce(

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 from .. import __version__
 from ..errors import InputError, NotConverged, naming, on_root
+from ..evolution import SCHEMES
 from ..mesh.domain import Domain
 from ..options import PREFIX
 from ..output import report as output
@@ -299,7 +300,7 @@ class _Steps:
         self._run, case = run, run.case
         assert case.time is not None
         self._number = case.time.steps
-        self._back = 2 if case.time.scheme == "bdf2" else 1  # so many steps are behind the next
+        self._back = len(SCHEMES[case.time.scheme].weights)  # so many steps are behind the next
         self._said = {**run.said(), "refine.levels (or --levels)": case.levels}
         self._restart = run.resumed(self._said)
         self._records: list[output.Record] = []

@@ -150,18 +150,39 @@ class Certificate:
 class Made:
     """What y and v are made of; the cells' geometry is made again when it is needed.
 
-    κ is given by its means, as `Coefficient` has them, and by least, a lower bound of its
-    eigenvalues; within is about a κ that varies within cells, None if it does not; most_reaction is
-    an upper bound of c, of which reaction is a lower one. hats and segments are moments of f and
-    g, left is ∫_T (f + div y), in s where c has taken it up, and shed what b has. forces are
-    this rank's shares of the contact forces in y, by the parts' numbers, missed is what quadrature
-    may have missed of f and g in each cell, shape (cells,) or (). reach is the radius of the ball
-    around the middle of p and b that A(u − u_h) is in, loose ends added, and loose these and ‖Aℓ‖
-    alone. lift has bounds of ℓ, which v lacks, and bounded the facet dofs of Γ1 that its last row
-    is about. on_contact_alone tells that part of the domain is held by contact alone: (2) is then
-    for functions that vanish there. contact are y's forces off each bound, facet by facet, above
-    bounds what they make of v + ℓ − α, and complementary is a bound of what λ makes of that and
-    they make of u − α.
+    Attributes:
+        level: The mesh, with those below it.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        kappa: κ_T, as `Coefficient` has it.
+        least: A lower bound of κ's eigenvalues.
+        stretch: How lengths are measured where κ is a tensor, see `Tensor.stretch`.
+        excess: Fluxes of y − κ_T∇u_h out of the cells, shape (d + 1, cells).
+        vertices: v at the vertices, ghosts included.
+        bumps: Heights of its bumps, by facet.
+        hats: Moments of f.
+        segments: g − b u_h.
+        beyond: What y has beyond that, if it has anything.
+        thirds: Heights of v's cubics, by facet.
+        bubbles: The same of cells.
+        cusps: Those of v.
+        within: What κ is within cells; None where it is constant on each.
+        reaction: c, or a lower bound of it.
+        most_reaction: The same object, or an upper bound.
+        left: ∫_T (f + div y), shape (cells,).
+        taken_up: Where c has taken that up.
+        shed: What b has taken up, by facet.
+        forces: This rank's shares of the contact forces in y, by the parts' numbers.
+        missed: What quadrature may have missed of f and g, shape (cells,) or ().
+        reach: Radius of the ball around the middle of p and b that A(u − u_h) is in, with loose
+            ends.
+        loose: These and ‖Aℓ‖ alone.
+        lift: Bounds of ℓ, which v lacks.
+        bounded: Facet dofs of Γ1, which the last row of lift is about.
+        on_contact_alone: Whether part of the domain is held by contact alone: the residual is then
+            known for functions that vanish on Γ1.
+        contact: y's forces off each bound, facet by facet.
+        complementary: Bound of what λ makes of v + ℓ − α and these make of u − α.
+        above: Bound of what they make of v + ℓ − α.
     """
 
     level: Level

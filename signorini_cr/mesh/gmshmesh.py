@@ -32,7 +32,7 @@ _OPTIONS = {
     "General.Terminal": 0,
     "General.AbortOnError": 2,  # raise instead of going on
     "General.NumThreads": 1,  # the same mesh every time
-    "Mesh.Algorithm": 6,  # Frontal-Delaunay: the best angles
+    "Mesh.Algorithm": 6,  # Frontal-Delaunay: the best angles; but see `_widen_inwards`
     "Mesh.ElementOrder": 1,
     "Mesh.RandomSeed": 1,
     "Mesh.MeshSizeFromPoints": 1,
