@@ -346,7 +346,7 @@ class NewtonTest:
         return True
 
     def _measure(self, snes: PETSc.SNES, norm: float, facts: _ContactFacts) -> FloatArray:
-        """Work out what may be wrong; return what of the forces is rounding, by class; collective."""
+        """Work out what may be wrong; return what of the forces is rounding; collective."""
         x, residual = snes.getSolution(), snes.getFunction()[0]
         errors, noise = self._force_errors(x, norm, facts)
         self.force_error = float(errors.max(initial=0.0))
