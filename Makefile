@@ -93,9 +93,10 @@ lint:
 types:
 	$(run) container/tool mypy
 
-# What tools leave behind, but no results.
+# What tools leave behind, but no results, and nothing of the user's own.
 clean:
-	git clean -fdX -e '!/out/' -e '!/demo-output/' -e '!/*-out/'
+	git clean -fdX -e '!/out/' -e '!/demo-output/' -e '!/*-out/' \
+	    -e '!/results/' -e '!/membrane.toml' -e '!/signorini/'
 
 # The environments, those of other checkouts with them.
 purge:

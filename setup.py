@@ -5,8 +5,11 @@ from pathlib import Path
 
 
 def without_its_folder(text: str) -> str:
-    """Drop pictures, and links that are no addresses: an index of packages has no such files."""
-    text = re.sub(r"!\[[^]]*\]\((?!https?:)[^)]*\)\n+", "", text)
+    """Drop pictures and what is said below them, and links that are no addresses.
+
+    An index of packages has no such files.
+    """
+    text = re.sub(r"!\[[^]]*\]\((?!https?:)[^)]*\)\n+(\*[^*]+\*\n+)?", "", text)
     return re.sub(r"\[([^]]+)\]\((?!https?:)[^)]*\)", r"\1", text)
 
 

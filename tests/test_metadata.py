@@ -83,6 +83,8 @@ def test_the_long_description_does_without_the_folder():
     text = without((ROOT / "README.md").read_text(encoding="utf-8"))
     assert "](https://" in text and not re.search(r"\]\((?!https://)", text) and "![" not in text
     assert "a b c" == without("a [b](docs/b.md#x) c")
+    assert "**a**\n" == without("![p](p.png)\n\n*of [b](b.md)*\n\n**a**\n")
+    assert "**a**\n" == without("![p](p.png)\n\n**a**\n")
 
 
 @pytest.mark.serial
