@@ -92,12 +92,14 @@ def _corrected(
 ) -> tuple[float, float] | None:
     """Bound ∫ λ over parts by a(v, φ) − χ(φ), a-harmonic φ; None where contact begins or ends.
 
+    Parts without contact are bounded for themselves, whatever there is on others.
+
     a(u − v, φ) is a product of two errors, and what Γ1 leaves: y·n of φ's flux times u − v where
     there is contact, φ times λ where there is none.
     """
     cells = made.cells()
     settled = Settled.of(made, cells)
-    if settled is None:
+    if settled.mixed and any(condition not in settled.free for condition in conditions):
         return None
     bound = solution.certificate.bound_companion
     assert bound is not None

@@ -264,8 +264,10 @@ def _settled(
     Where there is none, λ is next to nothing, and φ may be whatever z is. Where there is, e is, and
     z is solved for once more, so that it vanishes there.
     """
-    settled = Settled.of(made, cells) if _simple(made, cells) else None
-    if settled is None or not (settled.held or settled.free):
+    if not _simple(made, cells):
+        return []
+    settled = Settled.of(made, cells)
+    if settled.mixed or not (settled.held or settled.free):
         return []
     through, off = np.zeros((2, len(cells.exterior)))
     pinned = [each for each in settled.held if each.part == where]

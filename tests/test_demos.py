@@ -31,7 +31,7 @@ COMM = MPI.COMM_WORLD
 def studies(tmp_path_factory):
     """Every demo of the theory in one go, as docs/studies.md is made."""
     folder = COMM.bcast(tmp_path_factory.mktemp("studies"))
-    status, printed = script(DEMOS, folder, SIGNORINI_DEMO_LEVELS="4")
+    status, printed = script(DEMOS, folder, SIGNORINI_DEMO_LEVELS="5")
     assert status == 0
     return folder, COMM.bcast(printed)
 
@@ -51,7 +51,7 @@ def test_the_first_demo_prints_a_row_a_level(studies):
     folder, printed = studies
     first = printed.split("demo_s1: ")[0].splitlines()
     rows = [line.split() for line in first if re.match(r"\s+\d+ ", line)]
-    assert [int(row[0]) for row in rows] == [0, 1, 2, 3]
+    assert [int(row[0]) for row in rows] == [0, 1, 2, 3, 4]
     drawn = {path.name for path in (folder / "studies").glob("s1-*.png")}
     assert drawn == {f"s1-{name}.png" for name in ("solution", "contact", "convergence")}
 

@@ -133,3 +133,13 @@ def test_contact_that_begins_somewhere():
     load = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), -8.0, 8.0)  # noqa: E731
     found = widths(Problem(f=load, conditions=conditions | {"right": Neumann()}), "floor", levels=3)
     assert (orders(found) < 1.7).all()
+
+
+def test_a_part_without_contact_beside_one_where_contact_begins():
+    """What is known of one part does not hang on the other: h², and h there."""
+    sides = {"floor": Contact(-9.0), "top": Contact(0.0)} | {"left": Neumann(), "right": Neumann()}
+    problem = Problem(f=lambda x: 2.0 - 4.0 * x[0], reaction=2.0, conditions=sides)
+    found = widths(problem, "floor", inside=0.0)
+    assert (orders(found) > 1.7).all()
+    first = widths(problem, "top", levels=3)
+    assert (abs(orders(first) - 1.0) < 0.5).all()

@@ -264,7 +264,8 @@ class Coefficient:
 
             def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
                 at = Enclosure(boxes)
-                largest = (cells.tdim + 1) ** 2  # as it is for affine fields
+                # v's gradient may be quadratic on triangles, and is affine or constant else
+                largest = 36.0 if cells.tdim == 2 else (cells.tdim + 1) ** 2
                 each = (deviation(at, half, largest=largest) for deviation in deviations)
                 return np.stack([quadratic for quadratic, _ in each])
 

@@ -690,8 +690,9 @@ class Within(NamedTuple):
         if not kappa.varies:
             return None
         work = _tensor_within if kappa.tensor is not None else _within
-        rows = [work(cells, kappa, part, v, w) for part in blocks(cells.number)]
-        pull, unsure, mean = (np.concatenate(row, axis=-1) for row in zip(*rows, strict=True))
+        pull, (unsure, mean) = np.empty((cells.tdim + 1, cells.number)), np.empty((2, cells.number))
+        for part in blocks(cells.number):
+            pull[:, part], unsure[part], mean[part] = work(cells, kappa, part, v, w)
         return cls(pull, unsure, mean, np.broadcast_to(kappa.most, mean.shape))
 
 
@@ -738,16 +739,18 @@ def _tensor_within(
     k, volume, slopes = pick(kappa.mean, part), cells.volume[part], v.slopes(cells, part)
     _, gradients = cells.corners(part)
     total, steep = np.zeros((len(volume), cells.tdim)), np.zeros_like(volume)
-    rule = kappa.rule
+    rule, off = kappa.rule, np.zeros((len(volume), cells.tdim, cells.tdim))
     for tensor, weight, hat in zip(
         kappa.apart(cells, part), rule.weights, rule.hats.T[:, :, None], strict=True
     ):
         slope = np.einsum("in,ink->nk", w[:, part] + slopes(hat), gradients)
         total += weight * (k[:, None] * slope + np.einsum("nij,nj->ni", tensor, slope))
         steep += weight * (slope**2).sum(axis=1)
+        off += weight * tensor
     pull = volume * np.einsum("ink,nk->in", gradients, total)
-    unsure = 2.0 * kappa.rough[part] * k * volume * np.sqrt(steep)
-    return pull, unsure, pick(kappa.high, part)
+    missed = 2.0 * kappa.rough[part] * k
+    mean = k + missed + np.linalg.norm(off, axis=(1, 2))
+    return pull, missed * volume * np.sqrt(steep), np.fmin(mean, pick(kappa.high, part))
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:

@@ -18,36 +18,38 @@ from .lifting import gaps
 
 @dataclass(frozen=True)
 class Settled:
-    """The parts of Γ1, none of which has contact beginning or ending on it.
+    """The parts of Γ1, sorted by whether contact begins or ends on them.
 
     Attributes:
         held: Where each facet has a force.
         free: Where none has.
+        mixed: Where contact begins or ends.
         force: y's force on each facet of the boundary, off whichever bound.
         alpha: The bounds, off which v is where it is free.
     """
 
     held: list[Condition]
     free: list[Condition]
+    mixed: list[Condition]
     force: FloatArray
     alpha: OnParts
 
     @classmethod
-    def of(cls, made: Made, cells: Cells) -> Settled | None:
-        """Sort the parts; None where contact begins or ends on one; collective."""
+    def of(cls, made: Made, cells: Cells) -> Settled:
+        """Sort the parts; collective."""
         data = diffusion(made.level.data)
         alpha = OnParts.of(data.alpha, cells)
         force = np.zeros(len(cells.exterior))
         np.maximum.at(force, alpha.side.dofs, made.contact)
         held: list[Condition] = []
         free: list[Condition] = []
+        mixed: list[Condition] = []
         for condition in data.forms.bounded:
             dofs = cells.sides[condition.number].dofs
             touching, number = cells.total(float((force[dofs] > 0.0).sum()), float(len(dofs)))
-            if 0 < touching < number:
-                return None
-            (held if touching else free).append(condition)
-        return cls(held, free, force, alpha)
+            kind = mixed if 0 < touching < number else held if touching else free
+            kind.append(condition)
+        return cls(held, free, mixed, force, alpha)
 
     def unknown(self, made: Made, cells: Cells, flows: FloatArray, off: FloatArray) -> float:
         """Bound |∫ q e| over held parts and |∫ λ φ| over free ones, together; collective.
@@ -58,7 +60,7 @@ class Settled:
         Args:
             made: v and y.
             cells: The mesh.
-            flows: ∫ |q| on each facet of the boundary, q constant on each.
+            flows: max |q| |F| for each facet F of the boundary.
             off: max |φ| likewise.
         """
         room = gaps(cells, self.alpha, made.vertices, made.bumps, made.thirds)
