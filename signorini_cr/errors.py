@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import difflib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -56,6 +57,14 @@ def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], nee
     """
     if not isinstance(value, kinds):
         raise InputError(f"{name} is of the type {type(value).__name__}: {needed} is needed")
+
+
+def meant(word: object, known: Iterable[str]) -> str:
+    """Say what there is in the place of a word that is not known, the likeliest first."""
+    known = list(known)
+    near = difflib.get_close_matches(str(word).lower(), known, n=1)
+    there = f"there are {', '.join(known)}"
+    return f"did you mean {near[0]}? {there[0].upper()}{there[1:]}" if near else there
 
 
 def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:

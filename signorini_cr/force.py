@@ -11,7 +11,7 @@ from .arrays import FloatArray
 from .data.diffusion import diffusion
 from .data.loads import trace_of
 from .dual import certified
-from .errors import InputError
+from .errors import InputError, meant
 from .estimate.certificate import Made
 from .estimate.force import (
     Certified,
@@ -68,8 +68,7 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
     for part, name in zip(parts, names, strict=True):
         if name not in known:
             raise InputError(
-                f"{part!r} is no Dirichlet or contact part of the boundary; there are"
-                f" {', '.join(known)}"
+                f"{part!r} is no Dirichlet or contact part of the boundary; {meant(part, known)}"
             )
     conditions = [known[name] for name in names]
     if weight is not None:

@@ -11,7 +11,7 @@ from dolfinx import fem
 from .data.diffusion import diffusion
 from .data.loads import Certain, Segments, trace_of
 from .dual import Dual, certified, solved
-from .errors import InputError
+from .errors import InputError, meant
 from .estimate.certificate import Certificate, Made, certify
 from .estimate.force import Certified, Interval, against, extended, square
 from .estimate.pairing import Pairing, in_cells, on_side
@@ -128,8 +128,8 @@ def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
         return None
     if place in domain.parts:
         raise InputError(f"{NO_MEAN}: u is set on {where!r}, where its mean is that of a datum")
-    there = ", ".join([*own, DOMAIN])
-    raise InputError(f"{where!r} is no part of the boundary and no material; there are {there}")
+    there = meant(where, [*own, DOMAIN])
+    raise InputError(f"{where!r} is no part of the boundary and no material; {there}")
 
 
 def _insist_on_extent(cells: Cells, where: str | None) -> None:

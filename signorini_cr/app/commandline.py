@@ -31,6 +31,14 @@ EXIT_NOTE = (
 )
 
 
+KEYS_OF = {
+    **dict.fromkeys(("mode", "tolerance", "max_dofs", "fraction"), "refine"),
+    **dict.fromkeys(("end", "steps", "scheme"), "time"),
+    **dict.fromkeys(("size", "mesh"), "domain"),
+}
+"""Keys of problem files that are no options, and their sections."""
+
+
 class UsageError(Exception):
     """The command line cannot be understood."""
 
@@ -264,6 +272,8 @@ def _unknown(word: str, command: _Parser) -> NoReturn:
     options = [name for name in command._option_string_actions if name.startswith("--")]
     near = difflib.get_close_matches(word.split("=")[0], options, n=1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(options)}"
+    if section := KEYS_OF.get(key := word.split("=")[0].lstrip("-").replace("-", "_")):
+        hint = f"{key} is a key of [{section}] in the problem file"
     command.error(f"there is no option {word.split('=')[0]}; {hint}")
 
 

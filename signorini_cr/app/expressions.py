@@ -7,6 +7,7 @@ Python. What comes out is a graph of operations, see :mod:`signorini_cr.app.form
 import ast
 import difflib
 import math
+import re
 import unicodedata
 import warnings
 from collections.abc import Callable, Collection, Mapping
@@ -44,6 +45,7 @@ _FOREIGN = {  # what other languages say
     "arctan2": "atan2", "fabs": "abs", "sgn": "sign", "minimum": "min", "maximum": "max",
     "conditional": "where", "pow": "a**b", "π": "pi",
 }  # fmt: skip
+_DECIMALS = "decimals have a point, as 0.5"
 _CONSTRUCTS: dict[type, str] = {  # what Python has and this language has not
     ast.BitXor: "a power is written **, not ^",
     ast.BitAnd: "conditions are joined by 'and', not &",
@@ -55,7 +57,7 @@ _CONSTRUCTS: dict[type, str] = {  # what Python has and this language has not
     ast.Attribute: "a dot is not part of the language",
     ast.Subscript: "square brackets are not part of the language",
     ast.List: "square brackets are not part of the language",
-    ast.Tuple: "a comma only separates the arguments of a function",
+    ast.Tuple: f"a comma only separates the arguments of a function; {_DECIMALS}",
     ast.Lambda: "'lambda' is not part of the language",
 }
 
@@ -141,6 +143,8 @@ class _Reader:
             return f"'{self.line[at : at + 1]}' is never closed"
         if "unmatched" in message or "invalid character" in message:
             return message
+        if re.search(r"\d,0\d", self.line) and "leading zeros" in message:
+            return _DECIMALS
         if at >= len(self.line):
             return "something is missing at the end"
         if "invalid decimal literal" in message:

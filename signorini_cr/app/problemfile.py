@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -248,7 +250,7 @@ class ProblemFile:
         )
 
 
-def load(path: str | Path, comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
+def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> ProblemFile:
     """Read a problem file on rank 0 and check it on every rank; collective.
 
     Args:
@@ -524,7 +526,12 @@ def _circle(table: Mapping[str, Any], section: str, names: tuple[str, ...], size
 
 def _label(names: tuple[str, ...]) -> Callable[[str, Any], str]:
     """A reader of labels of edges."""
-    return one_of((*PARTS, *(name for name in names if name not in PARTS)))
+
+    def more(found: str) -> str:
+        plain = re.fullmatch(r"[A-Za-z0-9_-]+", found)
+        return f", or a name with a section [boundary.{found}]" if plain else ""
+
+    return one_of((*PARTS, *(name for name in names if name not in PARTS)), more)
 
 
 def _points(key: str, vertices: list[Any], least: int = 3) -> FloatArray:

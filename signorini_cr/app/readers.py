@@ -54,6 +54,8 @@ def parse_toml(text: str) -> dict[str, Any]:
         what = re.sub(r"\('(.*?)',?\)", lambda name: "[" + name[1].replace("', '", ".") + "]", what)
         if not where.startswith("line "):
             last = len(text.rstrip().split("\n"))
+            if re.match(r"Unterminated|Expected [\"']'+", what):
+                what = "a quote is not closed"
             raise InputError(
                 f"TOML syntax at the end of the file (line {last}): {what or error}"
             ) from None
@@ -62,6 +64,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         picture = f"\n    {found}\n    {' ' * (column - 1)}^" if 0 < len(found) <= 70 else ""
         if "{" in found and "}" not in found:
             what += " (all of { … } must stand on one line)"
+        what = _said_better(what, found, column)
         raise InputError(f"TOML syntax in {where}: {what}{picture}") from None
     except ValueError:  # Python's own limit, of which TOML knows nothing
         digits = sys.get_int_max_str_digits()
@@ -70,6 +73,30 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise InputError(
             f"a whole number{place} has more than {digits} digits; up to that many are allowed"
         ) from None
+
+
+def _said_better(what: str, found: str, column: int) -> str:
+    """What the parser says, with the cure where it is clear.
+
+    Args:
+        what: Its words.
+        found: The line.
+        column: Where they point to, from 1.
+    """
+    if re.search(r"character '\\[nr]'", what):
+        return "the quote is not closed in this line"
+    if not what.startswith(("Invalid value", "Expected newline or end of document")):
+        return what
+    pair = re.match(r"""\s*([\w.-]+)\s*=\s*([^\s"'\[{#][^"'#]*)""", found)
+    value = pair[2].strip() if pair else re.split(r"[],}#]", found[column - 1 :])[0].strip()
+    if re.fullmatch(r"[+-]?\d+,\d+", value):
+        return f"decimals have a point, as {value.replace(',', '.')}"
+    if re.fullmatch(r"[+-]?(\.\d+|\d+\.)", value):
+        return "a point in a number has digits before it and behind it, as 0.5"
+    if not value or len(value) > 60 or '"' in value or not (pair or "value" in what):
+        return what
+    example = f'{pair[1]} = "{value}"' if pair else f'"{value}"'
+    return f"{what}; an expression or a name stands between quotes, as {example}"
 
 
 def insist_known(
@@ -208,15 +235,24 @@ def whole(key: str, value: Any) -> int:
     return value
 
 
-def one_of(allowed: Collection[str]) -> Callable[[str, Any], str]:
-    """A reader that insists on one of the given words."""
+def one_of(
+    allowed: Collection[str], more: Callable[[str], str] = lambda found: ""
+) -> Callable[[str, Any], str]:
+    """A reader that insists on one of the given words.
+
+    Args:
+        allowed: The words.
+        more: Says of what was found instead what else would help.
+    """
 
     def read(key: str, value: Any) -> str:
         if string(key, value) in allowed:
             return value
         near = difflib.get_close_matches(value.lower(), allowed, n=1)
         hint = f"did you mean {near[0]}? Allowed" if near else "allowed"
-        raise InputError(f"{key}: {shown(value)} is unknown; {hint} are {', '.join(allowed)}")
+        raise InputError(
+            f"{key}: {shown(value)} is unknown; {hint} are {', '.join(allowed)}{more(value)}"
+        )
 
     return read
 

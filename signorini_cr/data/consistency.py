@@ -48,12 +48,24 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
         main = condition.main
         given = condition.source != "exact.u" and main is not None and number(main) != 0.0
         if given and domain.mesh.comm.allreduce(len(domain.facets(condition.number))) == 0:
-            found.append(f"{condition.source}: it acts nowhere, for no facet is {condition.part}")
+            found.append(f"{condition.source}: it acts nowhere, for {_nowhere(condition, forms)}")
     if forms.exact is not None:
         said = _Solution(forms, domain).complaint()
         if said is not None:
             found.append(f"exact.u: {said}: it is not the solution, and errors say how far from it")
     return found + _jumps(forms, domain)
+
+
+def _nowhere(condition: Condition, forms: Forms) -> str:
+    """Say why a condition has no facet, and where its main datum would belong."""
+    if not any(
+        type(each) is type(condition) and each is not condition for each in forms.conditions
+    ):
+        return f"no facet is {condition.part}"
+    return (
+        f"no edge is labelled {condition.part}; parts with a section of their own take"
+        f" boundary.NAME.{condition.names()[0]}"
+    )
 
 
 def _jumps(forms: Forms, domain: Domain) -> list[str]:

@@ -154,7 +154,7 @@ def scalar(weight: Data, forms: Forms) -> ufl.core.expr.Expr:
     Raises:
         InputError: It is no scalar, or on another mesh.
     """
-    found = as_expression(weight, forms.x)
+    found = as_expression(weight, forms.x, "weight")
     if found.ufl_shape != ():
         raise InputError(f"the weight has the shape {found.ufl_shape}; a scalar is needed")
     if any(each != forms.mesh.ufl_domain() for each in ufl.domain.extract_domains(found)):

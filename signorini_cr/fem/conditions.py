@@ -58,12 +58,13 @@ class Given:
     """What conditions are made from.
 
     Attributes:
-        expression: Turns data into an expression in the coordinates.
+        expression: Turns data into an expression in the coordinates; `called` is what messages
+            call them.
         exact: The exact solution u, if it is known.
         flux: κ∂ₙu, if u is known and not constant.
     """
 
-    expression: Callable[[Any], Expr]
+    expression: Callable[..., Expr]
     exact: Expr | None = None
     flux: Expr | None = None
 
@@ -101,7 +102,10 @@ class Condition:
             {main: 0.0} if left_out else {}
         )
         expressions = {
-            name: None if value is None else given.expression(value) for name, value in own.items()
+            name: None
+            if value is None
+            else given.expression(value, called=_in_python(label, part, name))
+            for name, value in own.items()
         }
         if left_out and (derived := self._derived(given, expressions)) is not None:
             expressions[main], source = derived, "exact.u"
@@ -311,6 +315,12 @@ class Contact(Condition):
     def loss(self) -> Any:
         """All of b; None where it is 0."""
         return None if number(self.coefficient) == 0.0 else self.coefficient
+
+
+def _in_python(label: str, part: str, name: str) -> str:
+    """Say what a datum of a condition is called by those who do not write a file."""
+    usual = label.startswith("data.")
+    return label.removeprefix("data.") if usual else f"conditions[{part!r}].{name}"
 
 
 def _known(condition: Any) -> Any:

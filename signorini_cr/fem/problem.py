@@ -13,7 +13,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import basix.ufl
@@ -137,8 +137,13 @@ class Problem:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
 
 
-def as_expression(data: Data, x: Expr) -> Expr:
+def as_expression(data: Data, x: Expr, called: str = "data") -> Expr:
     """Turn ``data`` into a UFL expression in the coordinates x.
+
+    Args:
+        data: What the user has given.
+        x: The coordinates.
+        called: What it is called in messages.
 
     Raises:
         InputError: That is not possible.
@@ -149,9 +154,10 @@ def as_expression(data: Data, x: Expr) -> Expr:
             raise ValueError("it holds a complex number")
         return found
     except (TypeError, ValueError) as error:
+        text = "expressions as text are for problem files; " if isinstance(data, str) else ""
         raise InputError(
-            f"data: {data!r} does not give a number or a UFL expression ({error}); functions of x "
-            "take theirs from ufl, as in ufl.sin(x[0])"
+            f"{called}: {data!r} does not give a number or a UFL expression ({error}); {text}"
+            "functions of x take theirs from ufl, as in ufl.sin(x[0])"
         ) from error
 
 
@@ -262,7 +268,9 @@ class Forms:
         if self.uniform and not 0.0 < float(self.kappa) < np.inf:
             said = "finite and above 0" if float(self.kappa) > 0.0 else "above 0"
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be {said}")
-        self.exact = None if problem.exact is None else as_expression(problem.exact, self.x)
+        self.exact = (
+            None if problem.exact is None else as_expression(problem.exact, self.x, "exact")
+        )
         # UFL can't differentiate a number
         level = self.exact is None or number(self.exact) is not None or problem.form is not None
         flux = None if level else self.kappa * ufl.grad(self.exact)
@@ -276,7 +284,7 @@ class Forms:
             self.asked = gain if self.asked is None else simplified(self.asked + gain)
         derived = 0.0 if self.asked is None else self.asked
         self.f = self._by_material("f", derived if problem.f is None else problem.f, materials)
-        given = Given(lambda data: as_expression(data, self.x), self.exact, outward)
+        given = Given(partial(as_expression, x=self.x), self.exact, outward)
         self.conditions = _conditions(problem, given, parts)
         d = mesh.geometry.dim
         for key, data in self._data.items():
@@ -287,9 +295,9 @@ class Forms:
 
     def _by_material(self, name: str, usual: Data, materials: Materials) -> Expr:
         """A datum that materials may have of their own, and elsewhere is the usual one."""
-        base = as_expression(usual, self.x)
+        base = as_expression(usual, self.x, name)
         own = {
-            material: as_expression(datum, self.x)
+            material: as_expression(datum, self.x, f"materials[{material!r}].{name}")
             for material, data in self.problem.materials.items()
             if (datum := getattr(data, name)) is not None
         }
@@ -624,7 +632,10 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
     usual: dict[str, tuple[Condition, str]] = {
         "dirichlet": (Dirichlet(problem.dirichlet), "data.dirichlet"),
         "neumann": (Neumann(problem.g), "data.g"),
-        "contact": (Contact(given.expression(problem.obstacle)), "data.obstacle"),
+        "contact": (
+            Contact(given.expression(problem.obstacle, called="obstacle")),
+            "data.obstacle",
+        ),
     }
     called = parts.called if isinstance(parts, Parts) else {}
     own: dict[str, Condition] = {}

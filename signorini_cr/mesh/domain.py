@@ -553,7 +553,7 @@ class Polygon:
 
 
 def read_gmsh(
-    path: str | Path,
+    path: str | PathLike[str],
     comm: MPI.Comm = MPI.COMM_WORLD,
     names: Sequence[str] = (),
     materials: Sequence[str] = (),

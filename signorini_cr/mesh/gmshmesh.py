@@ -186,6 +186,7 @@ def _outline(loops: Sequence[FloatArray], inner: FloatArray, size: float) -> _Ou
     if counts.sum() > _MOST_FACETS or triangles > _MOST_TRIANGLES:
         raise InputError(
             f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
+            f"; {_fitting(loops[0], lengths)}"
         )
     facets = lengths / counts
     x, edges = _numbered(ends)
@@ -260,6 +261,13 @@ def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
     return np.array([np.min(h + _GROWTH * np.hypot(*(x - p).T)) for p in x])
 
 
+def _fitting(outline: FloatArray, lengths: FloatArray) -> str:
+    """Say how large a polygon is, and what facet length suits it."""
+    across = " by ".join(f"{extent:.3g}" for extent in np.ptp(outline, axis=0))
+    size = max(np.sqrt(_area(outline) / 0.43 / 400), lengths.sum() / 200)
+    return f"the domain is {across}, and a size of {float(f'{size:.1g}'):g} makes some hundred"
+
+
 def read(
     path: Path,
     parts: Mapping[str, int],
@@ -278,6 +286,11 @@ def read(
         InputError: The file cannot be read, or is no such mesh; the message begins with its path.
     """
     with naming(path):
+        if path.suffix.lower() == ".geo" and path.is_file():
+            raise InputError(
+                "this describes a domain and is no mesh yet; `gmsh -2 "
+                f"{path.name}` makes {path.stem}.msh of it, which is needed here"
+            )
         return _read(mshfile.load(path), parts, needed, materials)
 
 

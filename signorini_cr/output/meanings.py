@@ -41,7 +41,7 @@ PRINTED = {
         "for N unknowns takes the place of h.",
     ),
     "bound": (
-        "certified, the H1 error is not above it",
+        "certified, ‖∇_h(u − u_h)‖ is not above it",
         "The error ‖∇_h(u − u_h)‖ is not above this, whatever the mesh, the data and the solver "
         "did. Where there is none, the column is not there and the reason is below the table.",
     ),
@@ -62,7 +62,7 @@ OF_STEPS = {
         "J(u_h) of the step's own problem, in which the steps before are data.",
     ),
     "bound": (
-        "certified, the H1 error of that problem is not above it",
+        "certified, ‖∇_h(u − u_h)‖ of that problem is not above it",
         "The error ‖∇_h(u − u_h)‖ of the step's own problem is not above this; none where there "
         "is no bound. It says nothing of what the length of the steps does to u.",
     ),

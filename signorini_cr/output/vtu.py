@@ -46,7 +46,7 @@ TAIL = "</Piece></UnstructuredGrid>\n</VTKFile>\n"
 Fields = Mapping[str, npt.NDArray]
 
 
-def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
+def write_vtu(u: fem.Function, path: str | os.PathLike[str], name: str = "u") -> None:
     """Write a CR or P1 function as a piecewise affine field; collective.
 
     Args:
@@ -60,10 +60,10 @@ def write_vtu(u: fem.Function, path: Path, name: str = "u") -> None:
     mesh = u.function_space.mesh
     owned = slice(mesh.topology.index_map(mesh.topology.dim).size_local)
     x = mesh.geometry.x[cell_nodes(mesh)[owned, : mesh.topology.dim + 1]]
-    _write(mesh.comm, path, [x], {name: vertex_values(u, owned).ravel()}, {})
+    _write(mesh.comm, Path(path), [x], {name: vertex_values(u, owned).ravel()}, {})
 
 
-def write_solution(solution: Solution, path: Path) -> None:
+def write_solution(solution: Solution, path: str | os.PathLike[str]) -> None:
     """Write u_h and what is known about it; collective.
 
     At the corners of each cell, and of each facet of Γ1: `u`, and `companion`, the vertex values
@@ -109,7 +109,7 @@ def write_solution(solution: Solution, path: Path) -> None:
         on_facets = np.zeros(len(contact.facets))
         on_cells["indicator"] = np.append(np.sqrt(certificate.indicators), on_facets)
     shapes = [mesh.geometry.x[nodes] for nodes in at_corners(cell_nodes(mesh)[:, :corners])]
-    _write(mesh.comm, path, shapes, on_points, on_cells)
+    _write(mesh.comm, Path(path), shapes, on_points, on_cells)
 
 
 def _write(

@@ -143,7 +143,14 @@ BAD: dict[str, tuple[str, list[str]]] = {
     ),
     "label without a section": (
         CASE.replace('["contact"', '["deck"', 1),
-        ["domain.boundary[0]:", '"deck" is unknown', "allowed are contact, dirichlet, neumann"],
+        [
+            *(
+                "domain.boundary[0]:",
+                '"deck" is unknown',
+                "allowed are contact, dirichlet, neumann",
+            ),
+            "neumann, or a name with a section [boundary.deck]",
+        ],
     ),
     "section without an edge": (
         part_case("desk"),
@@ -403,6 +410,58 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["data.obstacle: at (-1, 0)", "0.001", "only 0"],
     ),
     "syntax": (with_("size = 0.5", "size = "), ["TOML syntax in line 5, column 8", "^"]),
+    "an expression without quotes": (
+        with_('f = "1 + r"', "f = -1*x"),
+        ["TOML syntax in line 9", 'between quotes, as f = "-1*x"', "f = -1*x\n          ^"],
+    ),
+    "a function without quotes": (
+        with_('f = "1 + r"', "f = -sin(x)  # down"),
+        ['an expression or a name stands between quotes, as f = "-sin(x)"'],
+    ),
+    "a name without quotes": (
+        CASE + "[quantities]\npush = { force = contact }\n",
+        ['an expression or a name stands between quotes, as "contact"'],
+    ),
+    "a label without quotes": (
+        CASE.replace('["contact"', "[contact", 1),
+        ['an expression or a name stands between quotes, as "contact"'],
+    ),
+    "a comma without quotes": (
+        with_("size = 0.5", "size = 0,5"),
+        ["TOML syntax in line 5", "decimals have a point, as 0.5"],
+    ),
+    "no digit before the point": (
+        with_("size = 0.5", "size = .5"),
+        ["a point in a number has digits before it and behind it, as 0.5"],
+    ),
+    "a comma in an expression": (
+        with_("obstacle = 0", 'obstacle = "-0,6"'),
+        ["data.obstacle: a comma only separates", "decimals have a point, as 0.5"],
+    ),
+    "a comma and a nought": (
+        with_("obstacle = 0", 'obstacle = "-0,06"'),
+        ["data.obstacle: decimals have a point, as 0.5"],
+    ),
+    "a quote that is open": (
+        with_('f = "1 + r"', 'f = "1 + r'),
+        ["TOML syntax in line 9", "the quote is not closed in this line"],
+    ),
+    "a quote that is open at the end": (
+        CASE + 'max_dofs = "3',
+        ["TOML syntax at the end of the file (line 15): a quote is not closed"],
+    ),
+    "a single quote that is open": (
+        with_('f = "1 + r"', "f = '1 + r") + "dirichlet = '0'",
+        ["TOML syntax in line 9", "the quote is not closed in this line"],
+    ),
+    "far too small a size": (
+        with_("size = 0.5", "size = 1e-5").replace("[1, 1], [-1, 1]", "[1, 1.5], [-1, 1.5]"),
+        ["the domain is 2 by 1.5, and a size of 0.1 makes some hundred"],
+    ),
+    "a description in the place of a mesh": (
+        mesh_case("wall.geo"),
+        ["domain.mesh: ", "no mesh yet; `gmsh -2 wall.geo` makes wall.msh"],
+    ),
     "syntax at the end": (CASE + "[other", ["TOML syntax at the end of the file (line 15)"]),
     "section twice": (CASE + "[data]\n", ["TOML syntax in line 15", "Cannot declare [data] twice"]),
     "key twice": (with_("size = 0.5", "size = 0.5\nsize = 1"), ["TOML syntax in line 6"]),
@@ -446,6 +505,7 @@ def msh(elements: list[str], contact: str = "contact") -> str:
 LINES = ["1 2 1 1 1 2", "1 2 2 2 3 4"]
 MESHES = {
     "junk.msh": "nothing",
+    "wall.geo": "Point(1) = {0, 0, 0};",
     "cut.msh": msh(LINES + _TRIANGLES)[:-60],
     "nameless.msh": msh(LINES + _TRIANGLES, "floor"),
     "quads.msh": msh([*LINES, "3 2 3 3 1 2 3 4"]),
@@ -585,6 +645,11 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "FILE", "--max-time", "1h"], ["--max-time", "seconds", "found 1h"]),
         (["solve", "FILE", "--out="], ["--out", "folder"]),
         (["solve", "FILE", "--element", "p2"], ["--element", "cr", "p1"]),
+        (
+            ["solve", "FILE", "--tolerance=0.1"],
+            ["no option --tolerance; tolerance is a key of [refine] in the problem file"],
+        ),
+        (["solve", "FILE", "--max-dofs", "9"], ["max_dofs is a key of [refine]"]),
         (["check", "FILE", "--levels", "2"], ["no option --levels"]),
         (["solve", "FILE", "-options_file", "none"], ["-options_file none", "no such file"]),
         (["solve", "none.toml"], ["none.toml: there is no such file"]),

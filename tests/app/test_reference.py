@@ -14,7 +14,7 @@ from mpi4py import MPI
 import signorini_cr
 from signorini_cr import options
 from signorini_cr.app.cli import main
-from signorini_cr.app.commandline import _parser
+from signorini_cr.app.commandline import KEYS_OF, _parser
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, KEYS, MATERIAL, PART, QUANTITY, TYPES
 from signorini_cr.fem.problem import Material, Problem
@@ -187,6 +187,11 @@ def test_every_expression_of_the_table_is_used() -> None:
         assert any(key.section == section and key.is_expression for key in KEYS)
     keys = {key.name for key in KEYS if key.section == PART} - {"type"}
     assert keys == {name for names in TYPES.values() for name in names}
+
+
+def test_what_is_no_option_is_a_key() -> None:
+    known = {(key.section, key.name) for key in KEYS}
+    assert {(section, key) for key, section in KEYS_OF.items()} <= known
 
 
 @pytest.mark.serial

@@ -441,19 +441,31 @@ def test_a_size_as_long_as_the_domain_is_taken(run):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (FILE + "g = 1\n", "data.g: it acts nowhere"),
+        (FILE + "g = 1\n", "data.g: it acts nowhere, for no facet is neumann"),
+        (
+            FILE.replace('"contact"', '"floor"')
+            + 'obstacle = -1\n[boundary.floor]\ntype = "contact"',
+            "data.obstacle: it acts nowhere, for no edge is labelled contact; parts with a section"
+            " of their own take boundary.NAME.obstacle",
+        ),
         (FILE + '[exact]\nu = "-y"\n', None),
         (FILE + '[exact]\nu = "y"\n', "the pressure on the obstacle is -1, below 0: it is not"),
         (FILE + 'obstacle = "-x**2"\n[exact]\nu = "-2*x**2 + y"\n', "data.obstacle: at (-1, 0)"),
     ],
-    ids=["flux on no facet", "a solution", "pulled down", "below the obstacle"],
+    ids=[
+        "flux on no facet",
+        "obstacle elsewhere",
+        "a solution",
+        "pulled down",
+        "below the obstacle",
+    ],
 )
 def test_what_contradicts_itself_is_told(run, text: str, words: str | None):
     status, said = run(text, "check")
     if words is None:
         assert (status, said) == (0, "")
     else:
-        refuses = "obstacle:" in words
+        refuses = "obstacle: at" in words
         assert status == (2 if refuses else 0)
         assert words in said and refuses == ("warning" not in said)
 

@@ -618,6 +618,10 @@ def test_what_has_no_flux_is_said():
     (*_, solution) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Dirichlet(0.0)])
     with pytest.raises(InputError, match="'right' is no Dirichlet or contact part"):
         flux(solution, "right")
+    with pytest.raises(InputError, match=r"did you mean floor\? There are "):
+        flux(solution, "flor")
+    with pytest.raises(InputError, match=r"did you mean right\? There are "):
+        solution.mean("rigt")
     with pytest.raises(InputError, match="Γ1 touches Γ0"):
         force_bounds(solution)
     with pytest.raises(InputError, match="the part touches another one"):

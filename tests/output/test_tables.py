@@ -84,6 +84,7 @@ def test_every_printed_column_has_its_word(exact):
     head = re.sub("(H1|L2) error", r"\1_error", table_header(record)).split()
     named = [name.replace("_", " ") for name in head if name not in ("level", "cells")]
     assert list(dict.fromkeys(named)) == told and set(told) <= set(PRINTED)
+    assert "bound: certified, ‖∇_h(u − u_h)‖ is not above it" in legend(record)  # H1 error or not
 
 
 def test_every_column_of_the_steps_has_its_meaning():

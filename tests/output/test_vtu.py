@@ -190,7 +190,7 @@ def test_readers_find_the_fields_of_the_solution(read, solution, shared_tmp_path
 
 
 def test_one_rank_writes_what_all_ranks_write(shared_tmp_path):
-    write_solution(on_a_slope(2), shared_tmp_path / "all.vtu")
+    write_solution(on_a_slope(2), str(shared_tmp_path / "all.vtu"))
     alone = shared_tmp_path / f"alone-{WORLD.rank}.vtu"
     write_solution(on_a_slope(2, MPI.COMM_SELF), alone)
     ours, mine = by_hand(shared_tmp_path / "all.vtu"), by_hand(alone)

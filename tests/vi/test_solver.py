@@ -10,7 +10,16 @@ from dolfinx.fem import Function
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import InputError, NotConverged, Polygon, Problem, exact, solve, solve_levels
+from signorini_cr import (
+    Contact,
+    InputError,
+    NotConverged,
+    Polygon,
+    Problem,
+    exact,
+    solve,
+    solve_levels,
+)
 from signorini_cr.fem.space import closure_dofs, function_space
 from signorini_cr.mesh.domain import CONTACT
 from signorini_cr.options import explained
@@ -208,8 +217,15 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        ({"f": "x"}, "'x' does not give a number or a UFL expression"),
-        ({"obstacle": None}, "None does not give a number"),
+        ({"f": "x"}, "^f: 'x' does not give a number or a UFL expression"),
+        ({"f": "x"}, "expressions as text are for problem files"),
+        ({"obstacle": None}, "^obstacle: None does not give a number"),
+        ({"dirichlet": "x"}, "^dirichlet: 'x' does not give"),
+        ({"exact": "x"}, "^exact: 'x' does not give"),
+        (
+            {"conditions": {"contact": Contact(0.0, upper=lambda x: "y")}},
+            r"^conditions\['contact'\].upper: <function .* does not give",
+        ),
         ({"f": 1j}, "1j does not give a number or a UFL expression .it holds a complex number"),
         ({"obstacle": lambda x: 2j * x[0]}, "it holds a complex number"),
         ({"f": lambda x: np.sin(x[0])}, r"as in ufl.sin\(x\[0\]\)"),
