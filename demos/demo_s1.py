@@ -51,8 +51,11 @@ for solution in solve_levels(exact.S1.problem, domain, levels):
         study.tell(table_header(records[0]))
     study.tell(table_row(records[-1], records[0]))
 study.parts.append(markdown_table(records).strip())
-for words in (legend(records[0]), certified(records[-1])):
-    study.tell("\n" + textwrap.fill(words, 80))
+study.tell("\n" + textwrap.fill(legend(records[0]), 80) + "\n")
+head, *figures = certified(records[-1])
+study.tell(textwrap.fill(head, 80))
+for figure in figures:
+    study.tell(textwrap.fill(figure, 80, initial_indent="  ", subsequent_indent="    "))
 
 # %% [markdown]
 # ## Look

@@ -11,6 +11,7 @@ import gc
 import itertools
 import os
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -198,6 +199,7 @@ class Study:
     Attributes:
         folder: Where all of it goes; there from now on, on every rank.
         parts: Paragraphs, tables and references to pictures, in Markdown.
+        pictures: The names of these pictures.
     """
 
     def __init__(self, name: str, title: str):
@@ -206,6 +208,7 @@ class Study:
         self.title = title
         self.folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
         self.parts: list[str] = []
+        self.pictures: list[str] = []
         on_root(comm, lambda: self.folder.mkdir(parents=True, exist_ok=True))
         self.tell(f"\n{title}\n{'=' * len(title)}")
 
@@ -278,13 +281,16 @@ class Study:
     def show(self, file: str, caption: str) -> None:
         """Keep a reference to a picture that is there."""
         self.parts.append(f"![{caption}]({file})\n\n*{caption}*")
+        self.pictures.append(file)
 
     def finish(self) -> None:
         """Write what was kept."""
         path = self.folder / f"{self.name}.md"
         page = "\n\n".join([f"## {self.title}", *self.parts]) + "\n"
         on_root(comm, lambda: path.write_text(page, encoding="utf-8"))
-        self.tell(f"\nwritten: {path} and the pictures it shows")
+        names = ["no pictures"] if not self.pictures else self.pictures
+        fold = textwrap.TextWrapper(80, break_long_words=False, break_on_hyphens=False)
+        self.tell("\n" + fold.fill(f"written: {path} and, beside it, {', '.join(names)}"))
 
     def intervals(
         self,

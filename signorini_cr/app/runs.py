@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +34,11 @@ from .reference import ENDS
 from .screen import Screen, wrapped
 from .signals import keep
 from .statement import folded, statement
+
+SURE = 3
+"""So many bounds tell at which rate they fall."""
+FAR = 10
+"""So many times the unknowns that there may be are out of reach."""
 
 
 def solve_case(
@@ -203,6 +209,7 @@ def _solve_levels(run: _Run) -> None:
         _tell(record, kept[0], screen)
     finest: Solution | None = None
     failure: NotConverged | None = None
+    warned = False
     try:
         for solution in _solutions(run, restart):
             if solution.level.number < len(kept):  # the one that it goes on from
@@ -221,6 +228,9 @@ def _solve_levels(run: _Run) -> None:
                 taken = solution.iterations.preconditioner
                 screen.line(wrapped(taken, "  linear systems: "))
             _tell(record, kept[0], screen)
+            if not warned and (doubt := _out_of_reach(run.case, kept)) is not None:
+                screen.warn(f"{run.args.file}: {doubt}")
+                warned = True
     except NotConverged as error:
         failure = error
     failure = failure or _above_tolerance(run.case, kept)
@@ -260,9 +270,28 @@ def _conclude(run: _Run, names: str) -> None:
     screen.text(tables.legend(records[0], units))
     screen.line("")
     screen.text(tables.facts(records[-1], units))
-    screen.text(tables.certified(records[-1], units))
+    screen.items(*tables.certified(records[-1], units))
     screen.text(tables.times(records))
     screen.text(f"written to {run.folder}: {names}")
+
+
+def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None:
+    """Say so where the bounds so far tell that far too many unknowns would be needed."""
+    tolerance, most = (case.adaptive[key] for key in ("tolerance", "max_dofs"))
+    if case.mode != "adaptive" or tolerance == 0.0 or len(records) < SURE:
+        return None
+    (n, bound), (m, last) = ((each["dofs"], each["bound_h1"]) for each in records[-2:])
+    if bound is None or last is None or last <= tolerance or m <= n:
+        return None
+    rate = max(math.log(bound / last) / math.log(m / n), 0.5)
+    # the logarithm, as the number itself may be beyond all floats
+    digits = math.log10(m) + math.log10(last / tolerance) / rate
+    if digits <= math.log10(FAR * most):
+        return None
+    return (
+        f"refine.tolerance: at this rate the tolerance {tolerance:g} takes about"
+        f" 1e{digits:+03.0f} unknowns; max_dofs is {most}"
+    )
 
 
 def _above_tolerance(case: ProblemFile, records: list[output.Record]) -> NotConverged | None:
@@ -389,6 +418,7 @@ class _Steps:
         screen.text(f"at the end {tables.facts(finest, units)}")
         for sentence in (series.certified(records), *series.over_time(records, units)):
             screen.text(sentence)
-        screen.text(f"the last step's own problem, {tables.certified(finest, units)}")
+        head, *figures = tables.certified(finest, units)
+        screen.items(f"the last step's own problem, {head}", *figures)
         screen.text(series.times(records))
         screen.text(f"written to {run.folder}: {names}, times.csv, series.pvd and its fields")

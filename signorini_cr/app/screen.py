@@ -42,6 +42,12 @@ class Screen:
         """Results as a paragraph."""
         self.line(wrapped(text))
 
+    def items(self, head: str, *items: str) -> None:
+        """Results as a list under a head: a paragraph each, whose further lines hang."""
+        self.text(head)
+        for item in items:
+            self.line(wrapped(item, "  ", " " * 4))
+
     def step(self, text: str) -> None:
         """A step of the solver: for good with -v, else as the progress line."""
         if self.verbose:
@@ -98,14 +104,17 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\u00a0" else ascii(c)[1:-1] for c in text)
 
 
-def wrapped(text: str, before: str = "") -> str:
+def wrapped(text: str, before: str = "", hanging: str = "") -> str:
     """Fold to the width of a terminal; lines that begin with blanks are left as they are.
 
     Args:
         text: One paragraph a line.
         before: What the first line begins with.
+        hanging: What the lines begin with on which a paragraph goes on.
     """
-    fold = textwrap.TextWrapper(WIDTH, break_long_words=False, break_on_hyphens=False)
+    fold = textwrap.TextWrapper(
+        WIDTH, break_long_words=False, break_on_hyphens=False, subsequent_indent=hanging
+    )
     lines: list[str] = []
     for line in text.rstrip().split("\n"):
         fold.initial_indent = before if not lines else ""

@@ -38,7 +38,7 @@ def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
     exact = "exact.u" in said
     rows = {
         "domain": f"{_extent(domain)}{unit}",
-        "equation": _equation(said, own, kappa),
+        "equation": _equation(said, own, kappa, _of_all_cells(materials, domain)),
     }
     for name, material in materials.items():
         data = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
@@ -87,21 +87,42 @@ def _extent(domain: Domain) -> str:
     return f"{mesh.topology.index_map(mesh.topology.dim).size_global} cells in {extent}"
 
 
-def _equation(said: Mapping[str, Any], own: Collection[str], kappa: str) -> str:
+def _equation(
+    said: Mapping[str, Any], own: Collection[str], kappa: str, of_all: Collection[str]
+) -> str:
     """Say what holds in the domain.
 
     Args:
         said: What the file says.
         own: The data that materials have of their own.
         kappa: What stands before ∂ₙu.
+        of_all: Those of them that all cells have from their materials.
     """
     gain = " + c u" if "reaction" in own else ""
-    if (reaction := said.get("data.reaction", 0)) not in (0, "0"):
+    reaction = said.get("data.reaction", 0)
+    if reaction not in (0, "0") and "reaction" not in of_all:
         gain = f" + {as_factor(_short(reaction))} u"
     load = _short(said.get("data.f", "f from exact.u" if "exact.u" in said else "0"))
-    if not kappa:
-        return f"−Δu{gain} = {load}"
-    return f"−∇·(κ∇u){gain} = {load}, κ = {_short(said.get('data.coefficient', 1))}"
+    parts = [f"{'−∇·(κ∇u)' if kappa else '−Δu'}{gain} = {'f' if 'f' in of_all else load}"]
+    if kappa and "coefficient" not in of_all:
+        parts.append(f"κ = {_short(said.get('data.coefficient', 1))}")
+    if of_all:
+        *first, last = (sign for key, sign in _SIGNS.items() if key in of_all)
+        parts.append(f"{', '.join(first)}{' and ' if first else ''}{last} by material")
+    return ", ".join(parts)
+
+
+def _of_all_cells(materials: Mapping[str, Mapping[str, Any]], domain: Domain) -> set[str]:
+    """Find which of κ, f and c all cells have from their materials; collective."""
+    mesh = domain.mesh
+    missed = {}
+    for key in ("coefficient", "f", "reaction"):
+        without = np.ones(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=bool)
+        for name, material in materials.items():
+            if key in material:
+                without &= ~domain.materials.where(name)[: len(without)]
+        missed[key] = mesh.comm.allreduce(np.count_nonzero(without))
+    return {key for key, number in missed.items() if number == 0}
 
 
 def _cells(domain: Domain, material: str) -> int:

@@ -67,19 +67,21 @@ def run_page(
     statement = "".join(
         f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in problem.items()
     )
+    head, *figures = tables.certified(level, units)
     if steps is None:
-        known = [tables.facts(level, units), tables.certified(level, units)]
+        known = [tables.facts(level, units), head]
     else:
         known = [
             f"At the end {tables.facts(level, units)}",
             series.certified(steps),
             *series.over_time(steps, units),
-            f"the last step's own problem, {tables.certified(level, units)}",
+            f"the last step's own problem, {head}",
         ]
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<dl>{statement}</dl>",
         *(_paragraph(text[0].upper() + text[1:]) for text in known),
+        _list(figures),
         *(
             _picture(
                 folder / name, f"{what}{' at the end' if steps and name in AT_THE_END else ''}"
@@ -125,6 +127,11 @@ def _steps(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
 
 def _paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
+
+
+def _list(items: Sequence[str]) -> str:
+    entries = "".join(f"<li>{escape(item)}</li>" for item in items)
+    return f"<ul>{entries}</ul>" if items else ""
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:

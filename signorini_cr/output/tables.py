@@ -80,30 +80,43 @@ def _ten(facet: float | None) -> float | None:
     return None if facet is None else 10 * facet
 
 
-def certified(record: Mapping[str, Any], units: Units = PLAIN) -> str:
+def certified(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:
     """What is certain about a level, rounded so that it stays certain.
 
     Args:
         record: The last level's.
         units: What forces and u are measured in.
+
+    Returns:
+        A head and what stands under it, a figure each; or one sentence, if there is no bound.
     """
     if record["bound_h1"] is None:
-        return f"no bound of the error: {record['bound_reason']}"
-    facts = [f"certified: ‖∇_h(u − u_h)‖ is at most {at_most(record['bound_h1'])}"]
+        return [f"no bound of the error: {record['bound_reason']}"]
+    facts = ["certified:", f"‖∇_h(u − u_h)‖ is at most {at_most(record['bound_h1'])}"]
     own = at_most(record["bound_energy_norm"])
     if own != at_most(record["bound_h1"]):  # where κ is not 1, or with c or b
         facts.append(f"in the norm of the energy it is at most {own}")
     energy = record["energy_bounds"]
     if energy["lower"] is not None and energy["upper"] is not None:
         facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")
-    wanted = {"the contact force": record["contact"]["force_bounds"], **record["quantities"]}
-    for name, found in wanted.items():
+    force, quantities = record["contact"]["force_bounds"], record["quantities"]
+    same = [name for name, found in quantities.items() if _is_all_of(force, found)]
+    called = f"the contact force ({', '.join(same)})" if same else "the contact force"
+    others = {name: found for name, found in quantities.items() if name not in same}
+    for name, found in {called: force, **others}.items():
         if found["reason"] is None:
             unit = unit_of(found, units)
             facts.append(f"{name} is in {_interval(found['lower'], found['upper'], unit)}")
         else:
             facts.append(f"{name} has no bounds: {found['reason']}")
-    return "; ".join(facts)
+    return facts
+
+
+def _is_all_of(force: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
+    """Tell whether a quantity is the total contact force under another name."""
+    plain = found.get("kind") == "force" and not found["weighted"]
+    ends = ("lower", "upper", "reason")
+    return plain and force["reason"] is None and all(found[end] == force[end] for end in ends)
 
 
 def unit_of(found: Mapping[str, Any], units: Units) -> str:

@@ -18,6 +18,7 @@ import pytest
 from mpi4py import MPI
 
 from signorini_cr.app import cli, commandline, problemfile, readers
+from signorini_cr.app.screen import wrapped
 from signorini_cr.errors import NotConverged
 from signorini_cr.mesh import mshfile
 
@@ -730,6 +731,63 @@ def test_the_problem_is_stated_before_the_table(write) -> None:
     assert bounds["upper"] <= high
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_all_cells_have_of_their_materials_is_not_stated_for_others(whole, write) -> None:
+    top = 1 if whole else 0.8
+    soil = f"""
+[material.soil]
+polygon = [[-1, 0], [1, 0], [1, 0.5], [-1, 0.5]]
+coefficient = 2
+[material.rock]
+polygon = [[-1, 0.5], [1, 0.5], [1, {top}], [-1, {top}]]
+coefficient = 3
+f = -4
+reaction = 5
+"""
+    status, text, _ = run("check", write(CASE + soil), "--out", "out")
+    assert status == 0
+    if COMM.rank == 0:
+        last = "κ by material" if whole else "κ = 1"
+        assert f"equation   −∇·(κ∇u) + c u = 1 + r, {last}\n" in text
+    text = with_('f = "1 + r"\n', "") + soil.replace("ent = 2", "ent = 2\nf = -1\nreaction = 1")
+    status, text, _ = run("check", write(text, "all.toml"), "--out", "out")
+    if COMM.rank == 0:
+        last = "f, κ, f and c by material" if whole else "0, κ = 1"
+        assert f"equation   −∇·(κ∇u) + c u = {last}\n" in text
+
+
+def test_what_is_certain_stands_line_by_line(write) -> None:
+    """What goes on does so further in; the force is told once and kept under both names."""
+    wall = '"neumann", "dirichlet", "neumann"'
+    text = with_(LINE, LINE.replace('"dirichlet", "dirichlet", "dirichlet"', wall))
+    asked = 'push = { force = "contact" }\nheat = { flux = "dirichlet", weight = "x**2" }'
+    status, text, _ = run("solve", write(f"{text}\n[quantities]\n{asked}\n"), "--out", "out")
+    assert status == 0
+    if COMM.rank > 0:
+        return
+    lines = text.split("\n")
+    assert max(map(len, lines)) <= 80
+    first = lines.index("certified:") + 1
+    told = lines[first : first + 4]
+    for line, words in zip(
+        told,
+        ("‖∇_h(u − u_h)‖ is at most ", "J(u) is in [", "the contact force (push) is in [", "heat "),
+        strict=True,
+    ):
+        assert line.startswith(f"  {words}")
+    level = json.loads(Path("out/report.json").read_text())["levels"][-1]
+    push = level["quantities"]["push"]
+    assert {end: push[end] for end in ("lower", "upper")} == {
+        end: level["contact"]["force_bounds"][end] for end in ("lower", "upper")
+    }
+
+
+def test_long_figures_hang() -> None:
+    lines = wrapped("; ".join(["a reason why"] * 20), "  ", "    ").split("\n")
+    assert len(lines) > 2 and max(map(len, lines)) <= 80
+    assert lines[0].startswith("  a") and all(line.startswith("    ") for line in lines[1:])
+
+
 def test_where_the_force_has_no_bounds_the_reason_is_told(write) -> None:
     status, text, _ = run("solve", write(CASE), "--out", "out", "--levels", "1")
     assert status == 0
@@ -902,6 +960,28 @@ def test_an_adaptive_run_that_a_limit_stops(limit: str, write) -> None:
         assert "case.toml: stopped on level 1: the certified bound is" in message
         assert f"above the tolerance of 0.001, and {limit} allows no further mesh" in message
         assert len(json.loads(Path("out/report.json").read_text())["levels"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "most", "warned"), [("5e-6", 1000, True), ("0.05", 1000, False)]
+)
+def test_a_tolerance_out_of_reach_is_told_early(tolerance, most, warned, write) -> None:
+    """After the third mesh, once, and the run goes on to its limit."""
+    text = with_("uniform", "adaptive").replace("levels = 2", f"max_dofs = {most}")
+    path = write(text.replace("tolerance = 0", f"tolerance = {tolerance}"))
+    status, told, err = run("solve", path, "--out", "out")
+    assert status == cli.NOT_CONVERGED
+    if COMM.rank == 0:
+        message = " ".join(err.split())
+        found = re.findall(
+            r"warning: case.toml: refine.tolerance: at this rate the tolerance 5e-06 takes about"
+            r" (\de[+]\d\d) unknowns; max_dofs is 1000",
+            message,
+        )
+        assert len(found) == warned and message.count("at this rate") == warned
+        assert not warned or 1e9 < float(found[0]) < 1e14
+        assert len(re.findall(r"^ +\d+ +\d+ ", told, re.M)) > 3
+        assert "allows no further mesh" in message
 
 
 def test_an_adaptive_run_without_a_tolerance_ends_at_its_limit(write) -> None:

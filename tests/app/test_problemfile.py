@@ -373,7 +373,7 @@ all = { mean = "domain" }
     measured = Units(u="K", force="W")
     wanted = {"heat": {**found["low"], "kind": "flux"}, "low": found["low"]}
     bounds = {"contact": {"force_bounds": {"reason": "x"}}, "quantities": wanted}
-    told = certified(solution_record | bounds, measured)
+    told = "; ".join(certified(solution_record | bounds, measured))
     assert re.search(r"heat is in \[[^]]*\]\sW, .*; low is in \[[^]]*\]\sK, ", told)
     named = read(text.replace("[material.low]", "[material.domain]").replace('"low"', '"domain"'))
     renamed = {name: ("mean", "domain", None) for name in ("low", "all")}
@@ -409,7 +409,7 @@ all = { integral = "domain", weight = "x - y" }
         assert each["weighted"] and each["reason"] is None
         assert each["lower"] <= exact[name] <= each["upper"]
         assert each["upper"] - each["lower"] < 1e-8
-    told = certified(record, Units(u="K", force="W"))
+    told = "; ".join(certified(record, Units(u="K", force="W")))
     assert re.search(r"tilt is in \[[^]]*\]\sK,", told)
     assert re.search(r"push is in \[[^]]*\],", told) and re.search(r"all is in \[[^]]*\],", told)
     for old, new, said in [

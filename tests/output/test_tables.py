@@ -29,8 +29,9 @@ RECORD = {
 
 
 def plain(text):
-    """With spaces that break."""
-    return text.replace("\u00a0", " ")
+    """With spaces that break, and what stands under a head behind it."""
+    head, *items = [text] if isinstance(text, str) else text
+    return " ".join([head, "; ".join(items)]).strip().replace("\u00a0", " ")
 
 
 @pytest.mark.parametrize("factor", [1.0, 1e-9, 123.456, 7.1e5])
@@ -57,7 +58,7 @@ def test_the_energy_norm_is_told_where_it_is_another_one():
 
 def test_no_bound_no_figures():
     record = RECORD | {"bound_h1": None, "bound_reason": "no flux"}
-    assert certified(record) == "no bound of the error: no flux"
+    assert certified(record) == ["no bound of the error: no flux"]
 
 
 @pytest.mark.parametrize("lower, upper", [(0.24871234, 0.25131234), (0.0, 3.1), (0.25, 0.25)])
@@ -75,6 +76,27 @@ def test_no_force_but_a_reason():
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"inflow": inflow}}
     text = plain(certified(record))
     assert "; the contact force has no bounds: they touch; inflow is in [0.9, 1.1]" in text
+
+
+def test_what_is_certain_is_a_line_each():
+    assert [line.split()[0] for line in certified(RECORD)] == [
+        *("certified:", "‖∇_h(u", "J(u)", "the")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "once"),
+    [({}, True), ({"weighted": True}, False), ({"kind": "flux"}, False), ({"upper": 1.2}, False)],
+    ids=["the same", "weighted", "a flux", "another part"],
+)
+def test_the_contact_force_under_another_name_is_told_once(change, once):
+    bounds = {"lower": 0.9, "upper": 1.1, "reason": None}
+    push = {"kind": "force", "weighted": False, "value": 1.0, **bounds, **change}
+    record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"push": push}}
+    lines = [plain(line) for line in certified(record)]
+    assert ("the contact force (push) is in [0.9, 1.1], 19 % wide" in lines[-1]) is once
+    assert lines[-1].startswith("push is in ") is not once
+    assert len(lines) == (4 if once else 5)
 
 
 @pytest.mark.parametrize("exact", [None, 0.5])
@@ -127,7 +149,7 @@ def test_energies_have_the_digits_that_are_known():
 
 
 def test_nothing_breaks_between_a_number_and_its_unit():
-    text = certified(RECORD, Units(force="N"))
+    text = "".join(certified(RECORD, Units(force="N")))
     assert "\u00a0% wide" in text and ",\u00a0-2.68" in text
 
 
