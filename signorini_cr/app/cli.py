@@ -188,7 +188,7 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         return DONE
 
     def draw(path: Path) -> None:
-        plots.plot_mesh(domain, path, case.title, units=case.units)
+        plots.plot_mesh(domain, path, case.title, units=case.units, problem=case.problem)
 
     with naming("--out"):
         write_files(folder, {picture: draw}, comm=comm)

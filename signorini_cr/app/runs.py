@@ -290,7 +290,7 @@ def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None
         return None
     return (
         f"refine.tolerance: at this rate the tolerance {tolerance:g} takes about"
-        f" 1e{digits:+03.0f} unknowns; max_dofs is {most}"
+        f" {10.0 ** min(digits, 300.0):.0e} unknowns; max_dofs is {most}"
     )
 
 

@@ -67,7 +67,7 @@ def folded(rows: Mapping[str, str]) -> str:
         textwrap.fill(
             text,
             WIDTH,
-            initial_indent=name.ljust(INDENT),
+            initial_indent=f"{name} ".ljust(INDENT),
             subsequent_indent=" " * INDENT,
             break_on_hyphens=False,
             max_lines=2,

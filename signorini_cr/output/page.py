@@ -14,10 +14,10 @@ from .units import Units
 
 PICTURES = {
     "strip.png": "The solution u_h at some moments, and where there is contact",
-    "mesh.png": "The mesh and the parts of its boundary",
+    "mesh.png": "The mesh, the finest whose cells can be told apart, and the parts of its boundary",
     "solution.png": "The solution u_h, and where there is contact",
     "contact.png": "What happens along the contact boundary",
-    "convergence.png": "Errors and bounds of the levels",
+    "convergence.png": "{} of the levels",
 }
 AT_THE_END = {"solution.png", "contact.png"}
 """Those that are of the last step, in a run in time."""
@@ -84,7 +84,9 @@ def run_page(
         _list(figures),
         *(
             _picture(
-                folder / name, f"{what}{' at the end' if steps and name in AT_THE_END else ''}"
+                folder / name,
+                what.format(_drawn(report["levels"]))
+                + (" at the end" if steps and name in AT_THE_END else ""),
             )
             for name, what in PICTURES.items()
             if (folder / name).exists()
@@ -103,6 +105,13 @@ def run_page(
         + "\n".join(parts)
         + "\n</body></html>\n"
     )
+
+
+def _drawn(records: Sequence[Mapping[str, Any]]) -> str:
+    """Say whether errors, bounds or both are known."""
+    names = {"error_h1": "errors", "bound_h1": "bounds"}
+    there = [name for key, name in names.items() if any(record[key] for record in records)]
+    return " and ".join(there).capitalize()
 
 
 def _levels(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:

@@ -16,14 +16,16 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from dolfinx import fem
 from dolfinx.mesh import Mesh, entities_to_geometry
 from mpi4py import MPI
 
 from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root
-from ..fem.space import facet_measures
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
+from ..fem.space import closure_dofs, facet_measures
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain, named
+from ..multigrid.parents import Layout
 from .canvas import (
     BLUE,
     GREY,
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
+    from ..fem.problem import Problem
     from ..solution import Solution
 
 Where = str | os.PathLike[str]
@@ -77,18 +80,25 @@ SERIES = {
     },
     "error_l2": {"color": RED, "marker": "s", "label": r"$\|u-u_h\|$"},
 }
+SAME = 1e-6
+"""By less, in parts of what u_h differs by, values do not differ on a picture."""
 MOST_EDGES = 40_000
 """A mesh with more edges is drawn without those inside."""
 
 
-def _styles(domain: Domain) -> dict[int, dict[str, Any]]:
-    """How the parts of the boundary are drawn."""
+def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]]:
+    """How the parts of the boundary are drawn, and what holds there, as far as it is known."""
+    kinds = {}
+    for key, condition in getattr(problem, "conditions", {}).items():
+        kind = type(condition).__name__
+        kinds[named(domain.parts, key)] = "contact" if kind == "Contact" else kind
     own = [(name, part) for name, part in domain.parts.items() if part not in STYLES]
     colors = itertools.cycle(OTHERS)
-    return STYLES | {
-        part: {"color": color, "linewidth": 3.5, "label": name}
-        for (name, part), color in zip(own, colors, strict=False)
-    }
+    styles = dict(STYLES)
+    for (name, part), color in zip(own, colors, strict=False):
+        label = f"{name}: {kinds[name]}" if name in kinds else name
+        styles[part] = {"color": color, "linewidth": 3.5, "label": label.replace("$", r"\$")}
+    return styles
 
 
 def can_draw(comm: MPI.Comm) -> bool:
@@ -102,6 +112,7 @@ def plot_mesh(
     title: str = "",
     ax: Axes | None = None,
     units: Units = PLAIN,
+    problem: Problem | None = None,
 ) -> Figure | SubFigure | None:
     """Draw the mesh with Γ0, Γ1 and Γg, and its materials.
 
@@ -111,6 +122,7 @@ def plot_mesh(
         title: What the picture is of, say the problem's name.
         ax: Axes to draw on, on rank 0.
         units: What u and the axes are called and measured in.
+        problem: Whose conditions are told beside the parts that have names of their own.
 
     Raises:
         InputError: The domain is not plane, or the file can't be written.
@@ -127,7 +139,7 @@ def plot_mesh(
             if len(cells_of):
                 draw_cells(axes, cells_of, color=tint, label=name.replace("$", r"\$"))
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
-        for part, style in _styles(domain).items():
+        for part, style in _styles(domain, problem).items():
             if len(parts[part]):
                 lines = chains(parts[part])
                 draw_lines(axes, lines, zorder=3, capstyle="round", joinstyle="round", **style)
@@ -162,7 +174,8 @@ def plot_solution(
     domain, contact = solution.domain, solution.contact
     mesh = _plane(domain)
     image, box, limits = raster(solution.u)
-    smooth, words = raster(averaged(solution.u))[0], in_words(contact)
+    mean, of_parts = _smooth(solution, limits)
+    smooth, words = raster(mean)[0], in_words(contact)
     boundary = np.concatenate([_segments(domain, part) for part in domain.parts.values()])
     touching, free = contact_lines(contact)
 
@@ -179,7 +192,7 @@ def plot_solution(
             vmax=limits[1],
         )
         inner = contour_heights(limits)
-        draw_contours(axes, smooth, box, inner)
+        draw_contours(axes, smooth, box, _beside(inner, of_parts, limits))
         draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
         if len(free):
             outlined = [Stroke(linewidth=5.5, foreground="black"), Normal()]
@@ -316,7 +329,8 @@ def plot_convergence(
     axes.set_xlabel(size if uniform else "number $N$ of degrees of freedom", fontsize=14)
     if not uniform:
         log_ticks(axes.xaxis)
-    axes.set_ylabel("error" if "bound_h1" not in keys else "error, bound", fontsize=13)
+    kinds = sorted({"bound" if key == "bound_h1" else "error" for key in keys}, reverse=True)
+    axes.set_ylabel(", ".join(kinds), fontsize=13)
     axes.tick_params(labelsize=11)
     axes.grid(which="both", alpha=0.25)
     log_ticks(axes.yaxis)
@@ -381,6 +395,43 @@ def _triangles(domain: Domain, material: str) -> FloatArray:
     few = mesh.topology.index_map(1).size_global <= MOST_EDGES
     nodes = cell_nodes(mesh)[:number][few & domain.materials.where(material)[:number]]
     return _gather(mesh.comm, mesh.geometry.x[nodes, :2])
+
+
+def _smooth(solution: Solution, limits: tuple[float, float]) -> tuple[fem.Function, list[float]]:
+    """The function to draw contour lines of, and the values that it has on whole parts; collective.
+
+    Means at vertices only nearly have the value that u_h has at all midpoints of a part, and its
+    contour line would follow the part in shreds. There they get the value itself.
+    """
+    domain, u = solution.domain, averaged(solution.u)
+    comm, layout, values = domain.mesh.comm, Layout.of_space(u.function_space), []
+    for part in domain.parts.values():
+        facets = domain.facets(part)
+        middles = solution.u.x.array[closure_dofs(solution.u.function_space, facets)].mean(axis=1)
+        low = comm.allreduce(float(middles.min(initial=np.inf)), op=MPI.MIN)
+        high = comm.allreduce(float(middles.max(initial=-np.inf)), op=MPI.MAX)
+        if not 0.0 <= high - low <= SAME * (limits[1] - limits[0]):
+            continue
+        there = np.zeros(len(u.x.array))
+        there[closure_dofs(u.function_space, facets)] = 1.0
+        values.append(0.5 * (low + high))
+        u.x.array[layout.shared_sum(there) > 0.0] = values[-1]
+    return u, values
+
+
+def _beside(
+    heights: FloatArray, values: Sequence[float], limits: tuple[float, float]
+) -> FloatArray:
+    """Heights of contour lines, off those of whole parts by nothing that shows.
+
+    A line then stays away from the part where all is on the other side, as most is.
+    """
+    low, high = limits
+    found = heights.copy()
+    for value in values:
+        off = SAME * (high - low) * (1.0 if value > 0.5 * (low + high) else -1.0)
+        found[np.abs(heights - value) <= SAME * (high - low)] = value + 2.0 * off
+    return found
 
 
 def _segments(domain: Domain, part: int) -> FloatArray:

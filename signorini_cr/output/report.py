@@ -272,7 +272,7 @@ def write_output(
     drawable = pictures and solution.domain.mesh.geometry.dim == 2
     if drawable and plots.can_draw(comm):
         writers["mesh.png"] = lambda path: plots.plot_mesh(
-            *_clear_mesh(solution, path, title), units=units
+            *_clear_mesh(solution, path, title), units=units, problem=solution.problem
         )
         writers["solution.png"] = lambda path: plots.plot_solution(
             solution, path, title, units=units

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -142,7 +143,7 @@ def is_kept(step: int) -> bool:
     return step % (1 + step // 200) == 0
 
 
-def write_step(folder: Path, step: int, solution: Solution) -> None:
+def write_step(folder: str | os.PathLike[str], step: int, solution: Solution) -> None:
     """Write a step's field; collective.
 
     Args:
@@ -158,7 +159,7 @@ def write_step(folder: Path, step: int, solution: Solution) -> None:
 
 
 def write_steps(
-    folder: Path,
+    folder: str | os.PathLike[str],
     report: Mapping[str, Any],
     solution: Solution,
     restart: Restart,
@@ -184,7 +185,7 @@ def write_steps(
     comm, records = solution.domain.mesh.comm, report["times"]
     removed: set[str] = set()
     if len(records) == 1:
-        found = on_root(comm, lambda: [path.name for path in folder.glob(FIELDS)])
+        found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
         removed = {*FILES, *found}
     facts = {"said": said, "times": records}
 
@@ -206,13 +207,13 @@ def write_steps(
     write_files(folder, writers, removed=removed, comm=comm)
 
 
-def read_moments(folder: Path, comm: MPI.Comm) -> list[Moment]:
+def read_moments(folder: str | os.PathLike[str], comm: MPI.Comm) -> list[Moment]:
     """The moments of a run that is resumed; collective.
 
     Raises:
         InputError: They can't be read.
     """
-    arrays = on_root(comm, checkpoint.read_arrays, folder / checkpoint.MOMENTS)
+    arrays = on_root(comm, checkpoint.read_arrays, Path(folder) / checkpoint.MOMENTS)
     return from_arrays(arrays or {})
 
 

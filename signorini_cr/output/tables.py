@@ -18,6 +18,7 @@ from .units import GLUE, PLAIN, Units
 
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 
+FORCE = "the contact force"
 MEASURED = {"h": "x", "contact": "x"}
 """The printed columns whose unit may be told."""
 
@@ -101,12 +102,12 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:
         facts.append(f"J(u) is in {_interval(energy['lower'], energy['upper'])}")
     force, quantities = record["contact"]["force_bounds"], record["quantities"]
     same = [name for name, found in quantities.items() if _is_all_of(force, found)]
-    called = f"the contact force ({', '.join(same)})" if same else "the contact force"
     others = {name: found for name, found in quantities.items() if name not in same}
-    for name, found in {called: force, **others}.items():
+    for name, found in {FORCE: force, **others}.items():
         if found["reason"] is None:
             unit = unit_of(found, units)
-            facts.append(f"{name} is in {_interval(found['lower'], found['upper'], unit)}")
+            also = f" (this is {', '.join(same)})" if found is force and same else ""
+            facts.append(f"{name} is in {_interval(found['lower'], found['upper'], unit)}{also}")
         else:
             facts.append(f"{name} has no bounds: {found['reason']}")
     return facts

@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from signorini_cr.app import cli, commandline, problemfile, readers
 from signorini_cr.app.screen import wrapped
+from signorini_cr.app.statement import folded
 from signorini_cr.errors import NotConverged
 from signorini_cr.mesh import mshfile
 
@@ -771,15 +772,21 @@ def test_what_is_certain_stands_line_by_line(write) -> None:
     told = lines[first : first + 4]
     for line, words in zip(
         told,
-        ("‖∇_h(u − u_h)‖ is at most ", "J(u) is in [", "the contact force (push) is in [", "heat "),
+        ("‖∇_h(u − u_h)‖ is at most ", "J(u) is in [", "the contact force is in [", "heat "),
         strict=True,
     ):
         assert line.startswith(f"  {words}")
+    assert told[2].endswith(" % wide (this is push)")
     level = json.loads(Path("out/report.json").read_text())["levels"][-1]
     push = level["quantities"]["push"]
     assert {end: push[end] for end in ("lower", "upper")} == {
         end: level["contact"]["force_bounds"][end] for end in ("lower", "upper")
     }
+
+
+def test_a_long_name_stands_apart_from_what_is_said_of_it() -> None:
+    rows = folded({"underground_wall": "u = 0", "roof": "u = 1"})
+    assert rows == "underground_wall u = 0\nroof       u = 1"
 
 
 def test_long_figures_hang() -> None:

@@ -87,6 +87,8 @@ def read(path):
 def test_the_page_holds_everything_and_points_nowhere(page):
     reader = read(page(FILE, "--levels", "2"))
     assert len(reader.links) == 4 and {"ul", "li"} <= reader.tags
+    assert "Bounds of the levels" in reader.text
+    assert "The mesh, the finest whose cells can be told apart, and" in reader.text
     for part in (
         FILE,
         "signorini-cr solve",
@@ -97,6 +99,11 @@ def test_the_page_holds_everything_and_points_nowhere(page):
         " % wide",
     ):
         assert part in reader.text
+
+
+def test_the_page_says_that_errors_are_known(page):
+    reader = read(page(FILE + '[exact]\nu = "-0.01 + y"\n', "--levels", "2"))
+    assert "Errors and bounds of the levels" in reader.text
 
 
 def test_the_page_of_a_run_in_time(page):

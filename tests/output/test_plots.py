@@ -13,7 +13,18 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from signorini_cr import Contact, Dirichlet, Domain, InputError, Polygon, Problem, plots, solve
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Domain,
+    InputError,
+    Neumann,
+    Polygon,
+    Problem,
+    Robin,
+    plots,
+    solve,
+)
 from signorini_cr.fem.space import function_space
 from signorini_cr.output import canvas
 from signorini_cr.output.raster import raster
@@ -62,7 +73,7 @@ def test_the_mesh_shows_its_materials(shared_tmp_path):
     path = shared_tmp_path / "mesh.png"
     plots.plot_mesh(domain, path)
     assert on_rank_0(share(path, plots.TINTS[0])) > 10
-    plots.plot_mesh(rectangle(4), path)
+    plots.plot_mesh(rectangle(4), str(path))
     assert on_rank_0(share(path, plots.TINTS[0])) < 0.5
 
 
@@ -73,6 +84,19 @@ def test_the_mesh_shows_each_boundary_part_in_its_colour(shared_tmp_path):
         assert on_rank_0(share(path, canvas.RED)) > 0.5
         assert on_rank_0(share(path, canvas.BLUE)) > 0.3
         assert (on_rank_0(share(path, canvas.YELLOW)) > 0.1) == neumann
+
+
+def test_the_mesh_tells_what_holds_on_parts_of_other_names():
+    sides = ["floor", "air", "top in $", "wall"]
+    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides, names=sides).mesh(0.5, WORLD)
+    held = {"floor": Contact(0.0), "air": Robin(0.0), "top in $": Dirichlet(0.0), "wall": Neumann()}
+    figure = plots.plot_mesh(domain, problem=Problem(conditions=held))
+    bare = plots.plot_mesh(domain)
+    if WORLD.rank == 0:
+        told = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert told == ["floor: contact", "air: Robin", r"top in \$: Dirichlet", "wall: Neumann"]
+        told = [text.get_text() for text in bare.legends[0].get_texts()]
+        assert told == [name.replace("$", r"\$") for name in sides]
 
 
 def test_a_mesh_of_too_many_edges_is_drawn_without(shared_tmp_path, monkeypatch):
@@ -96,6 +120,31 @@ def test_the_solution_shows_where_it_is_in_contact(shared_tmp_path):
     assert none == 0 < half < every == 16
     assert white == 0.0
     assert 0.2 < some < all_red
+
+
+@pytest.mark.parametrize("load", [1.0, -1.0])
+def test_no_contour_line_follows_a_part(load):
+    """u is 0 on Γ0 and nowhere else, but means at vertices are not."""
+    sides = ("contact", "dirichlet", "dirichlet", "dirichlet")
+    domain = Polygon([[0, 0], [2, 0], [2, 1], [0, 1]], sides).mesh(0.2, WORLD)
+    solution = solve(Problem(f=load, obstacle=-9.0), domain)
+    figure = plots.plot_solution(solution)
+    if WORLD.rank == 0:
+        (lines,) = (each for each in figure.axes[0].collections if hasattr(each, "levels"))
+        (zero,) = np.flatnonzero(np.abs(lines.levels) < 1e-5)
+        sizes = [sum(map(len, segments)) for segments in lines.allsegs]
+        assert sizes.pop(zero) == 0 and min(sizes) > 0
+
+
+def test_a_contour_line_inside_stays():
+    """u is 0 on Γ0 and on a line between."""
+    solution = solve(Problem(f=lambda x: x[0], obstacle=-9.0), rectangle(8))
+    figure = plots.plot_solution(solution)
+    if WORLD.rank == 0:
+        (lines,) = (each for each in figure.axes[0].collections if hasattr(each, "levels"))
+        (zero,) = np.flatnonzero(np.abs(lines.levels) < 1e-5)
+        line = max(lines.allsegs[zero], key=len)
+        assert np.abs(line[:, 0]).max() < 0.1 and np.ptp(line[:, 1]) > 0.8
 
 
 def test_parts_of_a_piece_are_named_where_they_are(shared_tmp_path):
@@ -182,6 +231,10 @@ def test_convergence_draws_what_there_is(tmp_path):
     plots.plot_convergence(uniform, path)
     assert all(share(path, color) > 0.05 for color in (canvas.BLUE, canvas.RED, canvas.YELLOW))
     bound_only = [record(0.5, None, None, 0.7, 100), record(0.5, None, None, 0.3, 400)]
+    for records, label in (uniform, "error, bound"), (bound_only, "bound"):
+        assert plots.plot_convergence(records).axes[0].get_ylabel() == label
+    errors = [{**each, "bound_h1": None} for each in uniform]
+    assert plots.plot_convergence(errors).axes[0].get_ylabel() == "error"
     plots.plot_convergence(bound_only, path)
     assert share(path, canvas.BLUE) == share(path, canvas.RED) == 0.0 < share(path, canvas.YELLOW)
     for nothing in (uniform[:1], [], [record(1.0, None), record(0.5, None)]):

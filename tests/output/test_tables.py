@@ -94,7 +94,8 @@ def test_the_contact_force_under_another_name_is_told_once(change, once):
     push = {"kind": "force", "weighted": False, "value": 1.0, **bounds, **change}
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"push": push}}
     lines = [plain(line) for line in certified(record)]
-    assert ("the contact force (push) is in [0.9, 1.1], 19 % wide" in lines[-1]) is once
+    told = "the contact force is in [0.9, 1.1], 19 % wide"
+    assert lines[3] == (f"{told} (this is push)" if once else told)
     assert lines[-1].startswith("push is in ") is not once
     assert len(lines) == (4 if once else 5)
 
