@@ -263,7 +263,7 @@ def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
 
 def _fitting(outline: FloatArray, lengths: FloatArray) -> str:
     """Say how large a polygon is, and what facet length suits it."""
-    across = " by ".join(f"{extent:.3g}" for extent in np.ptp(outline, axis=0))
+    across = " by ".join(f"{extent:.6g}" for extent in np.ptp(outline, axis=0))
     size = max(np.sqrt(_area(outline) / 0.43 / 400), lengths.sum() / 200)
     return f"the domain is {across}, and a size of {float(f'{size:.1g}'):g} makes some hundred"
 

@@ -457,8 +457,8 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["TOML syntax in line 9", "the quote is not closed in this line"],
     ),
     "far too small a size": (
-        with_("size = 0.5", "size = 1e-5").replace("[1, 1], [-1, 1]", "[1, 1.5], [-1, 1.5]"),
-        ["the domain is 2 by 1.5, and a size of 0.1 makes some hundred"],
+        with_("size = 0.5", "size = 0.02").replace("[1, 1], [-1, 1]", "[1, 1500], [-1, 1500]"),
+        ["the domain is 2 by 1500, and a size of 20 makes some hundred"],
     ),
     "a description in the place of a mesh": (
         mesh_case("wall.geo"),
