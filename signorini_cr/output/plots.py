@@ -80,7 +80,7 @@ SERIES = {
     },
     "error_l2": {"color": RED, "marker": "s", "label": r"$\|u-u_h\|$"},
 }
-SAME = 1e-6
+_SAME = 1e-6
 """By less, in parts of what u_h differs by, values do not differ on a picture."""
 MOST_EDGES = 40_000
 """A mesh with more edges is drawn without those inside."""
@@ -410,7 +410,7 @@ def _smooth(solution: Solution, limits: tuple[float, float]) -> tuple[fem.Functi
         middles = solution.u.x.array[closure_dofs(solution.u.function_space, facets)].mean(axis=1)
         low = comm.allreduce(float(middles.min(initial=np.inf)), op=MPI.MIN)
         high = comm.allreduce(float(middles.max(initial=-np.inf)), op=MPI.MAX)
-        if not 0.0 <= high - low <= SAME * (limits[1] - limits[0]):
+        if not 0.0 <= high - low <= _SAME * (limits[1] - limits[0]):
             continue
         there = np.zeros(len(u.x.array))
         there[closure_dofs(u.function_space, facets)] = 1.0
@@ -429,8 +429,8 @@ def _beside(
     low, high = limits
     found = heights.copy()
     for value in values:
-        off = SAME * (high - low) * (1.0 if value > 0.5 * (low + high) else -1.0)
-        found[np.abs(heights - value) <= SAME * (high - low)] = value + 2.0 * off
+        off = _SAME * (high - low) * (1.0 if value > 0.5 * (low + high) else -1.0)
+        found[np.abs(heights - value) <= _SAME * (high - low)] = value + 2.0 * off
     return found
 
 
