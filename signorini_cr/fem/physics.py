@@ -5,7 +5,9 @@ matrices, and of which unknowns are set or bounded. A node is a facet, or a vert
 on coarse meshes; all nodes of a space have the same number of unknowns, its block size, and unknown
 c of node i has the number ``block * i + c``. Everything else is a physics': the space, a_h, χ, what
 is set and bounded, the P1 operator of coarse meshes, and the certificate. A physics whose bounds
-are on a combination of a facet's unknowns chooses that combination as one of them.
+are on a combination of a facet's unknowns chooses that combination as one of them. Transfers carry
+each unknown by itself: the choice is to be the same at all nodes. What is set on Γ0 are all
+unknowns of a facet, and meshes have no ghost cells, so that forms have no inner facets.
 """
 
 from __future__ import annotations
