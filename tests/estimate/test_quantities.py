@@ -142,7 +142,8 @@ def test_all_of_the_domain_has_a_name_unless_something_else_has_it():
         found = Quantity(kind, "domain").of(solution)
         assert found == Quantity(kind).of(solution)
         assert found.value == pytest.approx(expected)
-    with pytest.raises(InputError, match=r"no material; did you mean domain\? There are .*floor, right, left, domain$"):
+    there = r"no material; did you mean domain\? There are .*floor, right, left, domain$"
+    with pytest.raises(InputError, match=there):
         solution.mean("domian")
     below = {"domain": [[0, 0], [2, 0], [2, 0.5], [0, 0.5]]}
     polygon = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=below)
