@@ -18,6 +18,7 @@
 #     mpirun -n 2 python3 demos/demo_frost.py [FOLDER]
 
 # %%
+from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,8 @@ study.field(
     solution,
     draw,
     units=case.units,
-    title=f"Free of frost with {lower[-1]:.2f} to {upper[-1]:.2f} W a metre, none above the ducts",
+    title=f"Free of frost with {floor(lower[-1])} to {ceil(upper[-1])} W a metre, "
+    "none above the ducts",
     size=(11.0, 7.0),
     words={"contact": "heated", "no contact": "not heated", ENDS: "heating begins or ends"},
     nrows=2,
