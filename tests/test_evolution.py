@@ -22,6 +22,8 @@ from signorini_cr import (
     solve_levels,
 )
 
+pytestmark = pytest.mark.slow
+
 WORLD = MPI.COMM_WORLD
 
 

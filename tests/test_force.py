@@ -8,6 +8,8 @@ from mpi4py import MPI
 
 from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, Robin, force, solve_levels
 
+pytestmark = pytest.mark.slow
+
 
 def widths(problem, *parts, levels=4, inside=None):
     """Widths of the intervals on four meshes, each twice as fine as the one before."""

@@ -8,6 +8,8 @@ from mpi4py import MPI
 
 from signorini_cr import Contact, Dirichlet, Neumann, Problem, means, solve_levels
 
+pytestmark = pytest.mark.slow
+
 BESIDE = {"left": Neumann(), "right": Neumann()}
 
 

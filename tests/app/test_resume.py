@@ -18,6 +18,8 @@ from signorini_cr.errors import InputError, NotConverged
 from signorini_cr.output import checkpoint, plots
 from signorini_cr.restart import Restart
 
+pytestmark = pytest.mark.slow
+
 COMM = MPI.COMM_WORLD
 CASE = """[domain]
 vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]

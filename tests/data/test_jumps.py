@@ -19,6 +19,8 @@ from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.jets import Boxes, Enclosure, lowered
 from signorini_cr.data.loads import Certain
 
+pytestmark = pytest.mark.slow
+
 SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 SIZE = 0.02
 """Of a bound, to which what is missed should be small."""

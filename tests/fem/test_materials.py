@@ -20,6 +20,8 @@ from signorini_cr import (
     solve_levels,
 )
 
+pytestmark = pytest.mark.slow
+
 BOTTOM, TOP, SIDES = 1, 2, 3
 SOIL, ROCK = 5, 9
 

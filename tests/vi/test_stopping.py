@@ -40,6 +40,8 @@ from signorini_cr.compat import cell_nodes
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.refinement import refine
 
+pytestmark = pytest.mark.slow
+
 LONG = np.longdouble
 Function = Callable[..., object]  # of x, y and numpy or ufl
 
