@@ -59,11 +59,11 @@ def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], nee
         raise InputError(f"{name} is of the type {type(value).__name__}: {needed} is needed")
 
 
-def meant(word: object, known: Iterable[str]) -> str:
+def meant(word: object, known: Iterable[str], there: str = "there are") -> str:
     """Say what there is in the place of a word that is not known, the likeliest first."""
     known = list(known)
     near = difflib.get_close_matches(str(word).lower(), known, n=1)
-    there = f"there are {', '.join(known)}"
+    there = f"{there} {', '.join(known)}"
     return f"did you mean {near[0]}? {there[0].upper()}{there[1:]}" if near else there
 
 

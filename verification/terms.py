@@ -712,9 +712,9 @@ def exact_flux(case: Case, i: int, weight: Callable[[Any], Any] = np.ones_like) 
     return float(weights @ case.through(i, *edge(i, t)))
 
 
-def apart(rng: np.random.Generator, kind: type[Case] = Case) -> Case:
+def apart(rng: np.random.Generator, draw: type[Case] = Case) -> Case:
     """Contact below, contact or Dirichlet's condition above, others between them."""
-    case = kind(rng)
+    case = draw(rng)
     kind = str(rng.choice(["robin", "neumann"]))
     b = float(rng.choice(SIZES)) if kind == "robin" else 0.0
     floor, right, top, left = case.sides
@@ -727,9 +727,9 @@ def apart(rng: np.random.Generator, kind: type[Case] = Case) -> Case:
     return case
 
 
-def settled(rng: np.random.Generator, kind: type[Case] = Case) -> Case:
+def settled(rng: np.random.Generator, draw: type[Case] = Case) -> Case:
     """The same, with contact everywhere on a part or nowhere."""
-    case = apart(rng, kind)
+    case = apart(rng, draw)
     case.sides = [
         replace(
             side, wave=(side.wave[0], 1e-9, float(rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.5)))

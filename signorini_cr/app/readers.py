@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, meant
 from ..reading import read_regular
 
 MOST_CHARACTERS = 40
@@ -248,11 +248,8 @@ def one_of(
     def read(key: str, value: Any) -> str:
         if string(key, value) in allowed:
             return value
-        near = difflib.get_close_matches(value.lower(), allowed, n=1)
-        hint = f"did you mean {near[0]}? Allowed" if near else "allowed"
-        raise InputError(
-            f"{key}: {shown(value)} is unknown; {hint} are {', '.join(allowed)}{more(value)}"
-        )
+        hint = meant(value, allowed, "allowed are")
+        raise InputError(f"{key}: {shown(value)} is unknown; {hint}{more(value)}")
 
     return read
 

@@ -10,7 +10,7 @@ All of them are quadratic forms in a handful of numbers per cell, in which the m
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -592,21 +592,37 @@ def _by_quadrature(
         exact = ((pick(mean, part), weight, hat) for hat, weight in zip(*quadrature(), strict=True))
         rows = _at_points(cells, mean, part, flux, v, w, exact)
         return *rows[:4], *np.zeros((3, part.stop - part.start))
-    rule = kappa.rule
-    points = zip(values[:, part], rule.weights, rule.hats.T, strict=True)
-    rows = _at_points(cells, mean, part, flux, v, w, points)
     largest = (3 if flux.beyond is None else 6) ** 2 if cells.tdim == 2 else (cells.tdim + 1) ** 2
-    rows = _with_slack(rows, cut.errors[:, part], cells.tdim, largest)
+
+    def integrals(
+        where: slice | IndexArray, errors: FloatArray, there: FloatArray, hats: FloatArray
+    ) -> FloatArray:
+        points = zip(there, kappa.rule.weights, hats, strict=True)
+        rows = _at_points(cells, mean, where, flux, v, w, points)
+        return _with_slack(rows, errors, cells.tdim, largest)
+
+    return tuple(_over_pieces(kappa, part, integrals))
+
+
+Integrals = Callable[[slice | IndexArray, FloatArray, FloatArray, FloatArray], FloatArray]
+"""Of cells or those of pieces, errors as in `Coefficient.cut`, κ at the rule's points, and these in
+barycentric coordinates: rows of what is integrated, a piece's as if it were the cell."""
+
+
+def _over_pieces(kappa: Coefficient, part: slice, integrals: Integrals) -> FloatArray:
+    """Integrate over a range of cells, those that are cut piece by piece, shape (rows, n)."""
+    values, cut, rule = kappa.values, kappa.cut, kappa.rule
+    assert values is not None and cut is not None
+    rows = integrals(part, cut.errors[:, part], values[:, part], rule.hats.T)
     first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
     if first < last:
-        pieces, within = cut.pieces[np.arange(first, last)], cut.errors_inside[:, first:last]
+        pieces = cut.pieces[np.arange(first, last)]
         hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
-        points = zip(kappa.inside[:, first:last], rule.weights, hats, strict=True)
-        there = _at_points(cells, mean, pieces.parent, flux, v, w, points)
-        there = _with_slack(there, within, cells.tdim, largest) * pieces.part
+        known = cut.errors_inside[:, first:last], kappa.inside[:, first:last]
+        there = integrals(pieces.parent, *known, hats) * pieces.part
         which, place = np.unique(pieces.parent - part.start, return_inverse=True)
         rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
-    return tuple(rows)
+    return rows
 
 
 def _of_tensor(
@@ -702,33 +718,23 @@ Row = tuple[FloatArray, FloatArray, FloatArray]
 
 def _within(cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray) -> Row:
     """By quadrature on cells, or on their pieces, and by what that may miss."""
-    values, cut, rule = kappa.values, kappa.cut, kappa.rule
-    assert values is not None and cut is not None
+    weights = kappa.rule.weights
 
     def integrals(
         where: slice | IndexArray, errors: FloatArray, there: FloatArray, hats: FloatArray
     ) -> FloatArray:
         volume, slopes = cells.volume[where], v.slopes(cells, where)
         total, steep = np.zeros_like(w[:, where]), np.zeros_like(volume)
-        for k, weight, hat in zip(there, rule.weights, hats, strict=True):
+        for k, weight, hat in zip(there, weights, hats, strict=True):
             gamma = w[:, where] + slopes(hat.reshape(len(hat), -1))
             total += weight * k * gamma
             steep += weight * dot_rows(gamma, cells.apply(gamma, where))
         _, _, W, _, _, strip, _ = errors
         unsure = (2.0 * W + (cells.tdim + 1) * strip) * np.sqrt(volume * np.maximum(steep, 0.0))
-        mean = rule.weights @ there + 2.0 * W + strip
+        mean = weights @ there + 2.0 * W + strip
         return np.stack([*cells.apply(total, where), unsure, mean])
 
-    rows = integrals(part, cut.errors[:, part], values[:, part], rule.hats.T)
-    first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
-    if first < last:
-        pieces = cut.pieces[np.arange(first, last)]
-        hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
-        known = cut.errors_inside[:, first:last], kappa.inside[:, first:last]
-        there = integrals(pieces.parent, *known, hats) * pieces.part
-        which, place = np.unique(pieces.parent - part.start, return_inverse=True)
-        rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
-    *pull, unsure, mean = rows
+    *pull, unsure, mean = _over_pieces(kappa, part, integrals)
     return np.array(pull), unsure, mean
 
 
