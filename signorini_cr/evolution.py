@@ -28,7 +28,7 @@ from .data.loads import VolumeMoments, chi
 from .data.moments import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError
-from .fem.conditions import Data, is_by_cells
+from .fem.conditions import Data
 from .fem.problem import Problem, as_expression
 from .levels import Start, check_arguments, solve_level
 from .limits import Limits
@@ -327,14 +327,11 @@ def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:
     """The reactions of materials that have their own, by name; "" is for all others."""
     given = {name: each.reaction for name, each in problem.materials.items()}
     x = ufl.SpatialCoordinate(domain.mesh)
-    found = {
+    return {
         name: as_expression(each, x)
         for name, each in {"": problem.reaction, **given}.items()
         if each is not None
     }
-    if not all(map(is_by_cells, found.values())):
-        raise InputError("problems in time need a reaction that is a number on each cell")
-    return found
 
 
 def _stepping(

@@ -27,7 +27,9 @@ DOMAIN = "domain"
 """The place that all of Ω is, unless u has a mean on something else that is called so."""
 NO_MEAN = "u has no bounds there"
 NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral with u has bounds"
-AFLOAT = "nothing but contact holds a part of the domain, and no energy tells how high it is"
+AFLOAT = (
+    "nothing but contact is known to hold a part of the domain, and no energy tells how high it is"
+)
 ROUNDING = 1e-14
 """What rounding may do to an integral, in parts of that of |ψ u|."""
 
@@ -127,7 +129,7 @@ def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
     if place == DOMAIN:
         return None
     if place in domain.parts:
-        raise InputError(f"{NO_MEAN}: u is set on {where!r}, where its mean is that of a datum")
+        raise InputError(f"{NO_MEAN}: {where!r} is a Dirichlet part, on which u, and its mean, is what is given")
     there = meant(where, [*own, DOMAIN])
     raise InputError(f"{where!r} is no part of the boundary and no material; {there}")
 

@@ -197,7 +197,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
             '[data]\ncoefficient = "1 - t"',
             "is 0; it must be above 0 everywhere, at the time 1",
         ),
-        ("[data]", '[data]\nreaction = "x + t"', "need a reaction that is a number on each cell"),
+        ("[data]", '[data]\nreaction = "x - t"', "it must not be below 0, at the time 0.25"),
         ("wave =", "t = 1\nwave =", "define.t: t is the time"),
         ("[time]", '[refine]\nmode = "adaptive"\n[time]', "refine.mode: a problem in time needs"),
         ("[time]", '[exact]\nu = "x"\n[time]', "exact.u: a problem in time has none"),
