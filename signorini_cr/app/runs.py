@@ -72,6 +72,8 @@ def read_case(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[Prob
     case = problemfile.load(args.file, comm)
     if getattr(args, "levels", None) is not None:
         case = replace(case, levels=args.levels)
+    if case.time is not None and getattr(args, "element", "cr") != "cr":
+        raise InputError("--element: problems in time are solved with cr")
     screen.progress("making the mesh")
     domain = case.mesh(comm)
     for doubt in case.check(domain):
@@ -324,8 +326,6 @@ class _Steps:
 
     def __init__(self, run: _Run):
         """Find where it begins; collective."""
-        if run.element != "CR":
-            raise InputError("--element: problems in time are solved with cr")
         self._run, case = run, run.case
         assert case.time is not None
         self._number = case.time.steps

@@ -90,7 +90,7 @@ class Volume:
         values = compat.bound(self._values, cells.domain.own)
         found: FloatArray = values.eval(cells.domain.mesh, which)
         found = found.reshape(cells.number, len(self.rule.weights))
-        self.deviation.off_null_sets(found.T, Pieces.of_cells(cells), cells, self.rule.hats)
+        self.deviation.off_null_sets(found.T, None, cells, self.rule.hats)
         return found
 
     @cached_property

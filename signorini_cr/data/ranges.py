@@ -211,7 +211,7 @@ class Deviation:
         return found
 
     def off_null_sets(
-        self, found: FloatArray, pieces: Pieces, cells: Cells, hats: FloatArray
+        self, found: FloatArray, pieces: Pieces | None, cells: Cells, hats: FloatArray
     ) -> None:
         """Replace values at points where the two sides of a condition are equal, nearly.
 
@@ -220,12 +220,14 @@ class Deviation:
 
         Args:
             found: Values at points of pieces, shape (q, n); changed.
-            pieces: The pieces.
+            pieces: The pieces; None for the cells.
             cells: The mesh.
             hats: Barycentric coordinates of the points in a piece, shape (d + 1, q).
         """
         if not self._compared:
             return
+        if pieces is None:
+            pieces = Pieces.of_cells(cells)
         mixture = np.arange(1.0, 1.0 + len(hats))
         beside = (1.0 - BESIDE) * hats + BESIDE * (mixture / mixture.sum())[:, None]
         for part in chunks(len(pieces.parent)):
