@@ -114,7 +114,7 @@ class OnMesh:
     def bounded(self, facets):
         return 0
 
-    def energy(self, u):
+    def squared_energy_norm(self, u):
         return fem.assemble_scalar(fem.form(self.energy_of(u, u)))
 
     def tidy(self):

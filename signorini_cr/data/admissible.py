@@ -72,6 +72,8 @@ mean of both sides."""
 SHORTEST = 1e3
 """Length of the shortest intervals, in units of the points' rounding."""
 
+SPAN = 64.0
+"""Length of the first intervals in parts of that, at least: u_D must have room to fall."""
 
 LOOKS = 16
 """Into how many parts a facet's edge is cut by the points at which two bounds are compared."""
@@ -309,7 +311,12 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     if u_D.constant or not total:
         return []
     way = end - start
-    pieces = int(np.clip(SAMPLES // total, LEAST, MOST))
+    length = np.linalg.norm(way, axis=1)
+    shortest = SHORTEST * error
+    longest = max(comm.allgather(float(length.max(initial=0.0))))
+    pieces = int(min(np.clip(SAMPLES // total, LEAST, MOST), longest / (SPAN * shortest)))
+    if pieces < 1:
+        return [_far_message(key, u_D.mesh, x) for x in start[:1]]
     intervals = _sampled(u_D, fixed, pieces)
     if intervals is None:
         return []
@@ -318,10 +325,7 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     scale = TOLERANCE * largest
     complaints = _between([(u_D, fixed)], scale, key) if u_D.tied else []
 
-    length = np.linalg.norm(way, axis=1)
-    longest = max(comm.allgather(float(length.max(initial=0.0)))) / pieces
-    shortest = SHORTEST * error
-    halfway = 16.0 * math.sqrt(longest * shortest)
+    halfway = 16.0 * math.sqrt(longest / pieces * shortest)
     while len(intervals.segment):
         segment, s, u = intervals.segment, intervals.s, intervals.u
         rough, width = _roughness(u), (s[2] - s[0]) * length[segment]
@@ -491,6 +495,14 @@ def _between(
         for i in same
         if int(node[i]) in places
     ]
+
+
+def _far_message(key: str, mesh: Mesh, x: FloatArray) -> Complaint:
+    where = place(x, mesh)
+    return where, (
+        f"{key}: around {shown(where)} coordinates have too few digits for facets as short as these"
+        " to tell whether the dirichlet value jumps; the domain must lie nearer to the origin"
+    )
 
 
 def _jump_message(key: str, mesh: Mesh, x: FloatArray, a: float, b: float) -> Complaint:

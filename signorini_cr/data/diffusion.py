@@ -373,7 +373,7 @@ class DiffusionOnMesh:
         _, cells, corners = self._ends
         return np.take_along_axis(vertex_values(u, cells), corners, axis=1)
 
-    def energy(self, u: fem.Function) -> float:
+    def squared_energy_norm(self, u: fem.Function) -> float:
         """a_h(u, u), this rank's cells' share."""
         if self._earlier is None:
             form = self.forms.a_of_w.on(self.domain, (), [u])

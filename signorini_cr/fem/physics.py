@@ -94,7 +94,7 @@ class OnMesh(Protocol):
     def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
         """Values of what is bounded at the vertices of contact facets, shape (n, d)."""
 
-    def energy(self, u: fem.Function) -> float:
+    def squared_energy_norm(self, u: fem.Function) -> float:
         """a_h(u, u), this rank's cells' share."""
 
     def tidy(self) -> None:

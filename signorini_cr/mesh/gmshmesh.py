@@ -27,6 +27,7 @@ _MOST_FACETS = 1e5  # on the boundary
 _MOST_GRADED = 3e4  # on edges beside short ones: gmsh takes a minute for so many
 _UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
+_FAR = 1e3  # in parts of the extent: a polygon that is moved to the origin for gmsh
 _GROWTH = 0.3  # of the size, per length, away from short facets
 _OPTIONS = {
     "General.Terminal": 0,
@@ -126,7 +127,8 @@ def triangulate(
         numbers: The materials' numbers.
     """
     loops, labels, inner = arranged(loops, labels, list(polygons.values()))
-    outline = _outline(loops, inner, size)
+    away = _away(loops[0])
+    outline = _outline([loop - away for loop in loops], inner - away, size)
     with _session() as gmsh:
         curves = _draw(gmsh, outline, [len(loop) for loop in loops], size)
         try:
@@ -142,10 +144,21 @@ def triangulate(
             np.concatenate(found),
             np.repeat(labels, [len(ends) for ends in found]),
         )
+    raw = raw._replace(points=raw.points + away)
     if not polygons:
         return raw
     middles = raw.points[raw.triangles].mean(axis=1)
     return raw._replace(materials=sorted_out(middles, polygons, numbers))
+
+
+def _away(outline: FloatArray) -> FloatArray:
+    """How far a polygon is to be moved towards the origin, shape (2,).
+
+    gmsh compares coordinates with their distances, and loses points far out. Its vertices come back
+    to the digit, as differences of numbers of like size are exact.
+    """
+    extent = np.ptp(outline, axis=0).max()
+    return np.where(np.abs(outline[0]) > _FAR * extent, outline[0], 0.0)
 
 
 class _Outline(NamedTuple):

@@ -86,9 +86,9 @@ class Iterations:
     newton: int
     linear: int
     preconditioner: str
-    force_error: float = 0.0
-    imbalance: float = 0.0
-    extended: bool = False
+    force_error: float
+    imbalance: float
+    extended: bool
 
 
 @dataclass(frozen=True, eq=False)

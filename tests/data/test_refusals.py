@@ -101,6 +101,26 @@ def test_an_exact_solution_may_be_turned_and_moved(shift: float, scale: float):
         assert "the obstacle is 3e-07 but" in refused(lambda: checked(wrong, domain))
 
 
+@pytest.mark.parametrize(("away", "size"), [(1e8, 0.25), (1e9, 0.25), (1e9, 0.06), (1e10, 0.25)])
+def test_a_domain_far_from_the_origin(away: float, size: float):
+    """Continuous data pass, jumps do not; where digits don't tell, that is said."""
+    domain = Polygon(0.5 * RECTANGLE + away, ALL_ROUND).mesh(size)
+
+    def steep(x):
+        return (x[1] - away) ** 2 + ufl.sin(x[0] - away)
+
+    def jumps(x):
+        return ufl.conditional(x[0] > away + 0.1, 1.0, 0.0)
+
+    checked(Problem(dirichlet=1e4, obstacle=0.0), domain)
+    words = refused(lambda: checked(Problem(dirichlet=jumps, obstacle=-9.0), domain))
+    if away < 1e10:
+        checked(Problem(dirichlet=steep, obstacle=-9.0), domain)
+        assert "the dirichlet value jumps from" in words
+    else:
+        assert "coordinates have too few digits" in words
+
+
 @pytest.mark.parametrize(("degrees", "shift"), [(17, 0.0), (200, 0.0), (45, 1e6)])
 def test_a_turned_solution_has_its_error_and_bound(degrees: float, shift: float):
     # Γ1 keeps clear of the angle's cut: with rounding, cells reach across it

@@ -656,3 +656,19 @@ def test_no_gmsh(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "gmsh", None)
     with pytest.raises(InputError, match="this needs gmsh, which cannot be loaded: "):
         Polygon([(0, 0), (1, 0), (0, 1)], ["contact", "dirichlet", "neumann"]).mesh(0.5)
+
+
+@pytest.mark.parametrize("away", [1e6, 1e8, 1e9])
+def test_a_polygon_far_from_the_origin_has_the_mesh_of_one_at_it(away: float):
+    """Up to 2^50 times the size of their last digit all coordinates are exact."""
+    corners = np.array([[0, 0], [2, 0], [2, 1], [0, 1]])
+    stone = np.array([[0.5, 0.25], [1.0, 0.25], [1.0, 0.75]])
+    near, far = (
+        Polygon(corners + shift, LABELS, materials={"stone": stone + shift}).mesh(0.125)
+        for shift in (np.zeros(2), np.array([away, -3.0 * away]))
+    )
+    points = [domain.mesh.geometry.x[:, :2] for domain in (near, far)]
+    assert np.array_equal(near.mesh.geometry.dofmap, far.mesh.geometry.dofmap)
+    assert np.allclose(points[1] - [away, -3.0 * away], points[0], rtol=0, atol=1e-15 * away)
+    assert counts(far) == counts(near)
+    assert np.array_equal(far.materials.where("stone"), near.materials.where("stone"))
