@@ -129,7 +129,9 @@ def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
     if place == DOMAIN:
         return None
     if place in domain.parts:
-        raise InputError(f"{NO_MEAN}: {where!r} is a Dirichlet part, on which u, and its mean, is what is given")
+        raise InputError(
+            f"{NO_MEAN}: {where!r} is a Dirichlet part, on which u, and its mean, is what is given"
+        )
     there = meant(where, [*own, DOMAIN])
     raise InputError(f"{where!r} is no part of the boundary and no material; {there}")
 

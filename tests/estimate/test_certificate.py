@@ -509,7 +509,9 @@ def test_means_are_bracketed_in_one_dimension():
     assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
     with pytest.raises(InputError, match="'neumann' has no extent"):
         mean(solution, "neumann")
-    with pytest.raises(InputError, match="'top' is a Dirichlet part, on which u, and its mean, is what is given"):
+    with pytest.raises(
+        InputError, match="'top' is a Dirichlet part, on which u, and its mean, is what is given"
+    ):
         mean(solution, "top")
     with pytest.raises(InputError, match=r"'air' is no part .* floor, right, left, half"):
         mean(solution, "air")
