@@ -154,7 +154,8 @@ class Made:
         level: The mesh, with those below it.
         w: u_h at the cells' vertices, shape (d + 1, cells).
         kappa: κ_T, as `Coefficient` has it.
-        least: A lower bound of κ's eigenvalues.
+        least: A lower bound of κ's eigenvalues, lengths as they are, shape (cells,) or ().
+        most: An upper bound, likewise.
         stretch: How lengths are measured where κ is a tensor, see `Tensor.stretch`.
         excess: Fluxes of y − κ_T∇u_h out of the cells, shape (d + 1, cells).
         vertices: v at the vertices, ghosts included.
@@ -189,6 +190,7 @@ class Made:
     w: FloatArray
     kappa: FloatArray
     least: FloatArray
+    most: FloatArray
     stretch: FloatArray | None
     excess: FloatArray
     vertices: FloatArray
@@ -657,6 +659,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         w=known.w,
         kappa=known.kappa.mean,
         least=known.kappa.least,
+        most=known.kappa.most,
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,

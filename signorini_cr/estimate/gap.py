@@ -685,13 +685,11 @@ class Within(NamedTuple):
         pull: ∫_T κ∇v·∇λ_i, shape (d + 1, cells).
         unsure: How far ∫_T κ∇v·e may be from that, at most, for a unit vector e, shape (cells,).
         mean: Upper bound of κ's mean over T, shape (cells,).
-        largest: Upper bound of κ's eigenvalues with lengths as they are, shape (cells,).
     """
 
     pull: FloatArray
     unsure: FloatArray
     mean: FloatArray
-    largest: FloatArray
 
     @classmethod
     def of(cls, cells: Cells, kappa: Coefficient, v: Companion, w: FloatArray) -> Within | None:
@@ -709,7 +707,7 @@ class Within(NamedTuple):
         pull, (unsure, mean) = np.empty((cells.tdim + 1, cells.number)), np.empty((2, cells.number))
         for part in blocks(cells.number):
             pull[:, part], unsure[part], mean[part] = work(cells, kappa, part, v, w)
-        return cls(pull, unsure, mean, np.broadcast_to(kappa.most, mean.shape))
+        return cls(pull, unsure, mean)
 
 
 Row = tuple[FloatArray, FloatArray, FloatArray]

@@ -119,8 +119,7 @@ class Weight:
         dofs = self.values.function_space.dofmap.list
         ends = self.values.x.array[dofs[side.cells[:, None], cells.others[side.local]].T]
         none, height = np.zeros(len(side.cells)), self.parts.middle - ends.mean(axis=0)
-        most = _largest(made)
-        goal = SHARE * size / np.sqrt(max(cells.comm.allgather(most.max(initial=1e-300))))
+        goal = SHARE * size / np.sqrt(max(cells.comm.allgather(made.most.max(initial=1e-300))))
         coarse, fine = (
             lift(cells, side, self.trace, None, Cubic(ends, bend, none), self.scale, goal, False)
             for bend in (none, height)
@@ -141,7 +140,7 @@ class Weight:
         return Beyond(
             float(pressure @ (length * (ends.mean(axis=0) + 2.0 / 3.0 * height))),
             unsure,
-            _square(made, cells, side, coarse, most),
+            _square(made, cells, side, coarse),
             float(left @ over_cells),
             float(np.bincount(side.cells, over_cells).max(initial=0.0)),
             _least(self.trace, cells, side),
@@ -171,19 +170,9 @@ def pressed(made: Made, cells: Cells, side: BoundaryFacets) -> FloatArray:
     return np.asarray(made.through(cells)[side.local, side.cells] - known[side.dofs])
 
 
-def _largest(made: Made) -> FloatArray:
-    """An upper bound of κ's eigenvalues, shape (cells,) or ()."""
-    if made.within is not None:
-        return made.within.largest
-    if made.stretch is None or not len(made.stretch):
-        return made.kappa
-    return np.asarray(made.kappa / np.linalg.eigvalsh(made.stretch)[:, 0] ** 2)
-
-
-def _square(
-    made: Made, cells: Cells, side: BoundaryFacets, lifted: Lift, most: FloatArray
-) -> float:
+def _square(made: Made, cells: Cells, side: BoundaryFacets, lifted: Lift) -> float:
     """Bound ‖Aℓ‖², this rank's share."""
+    most = made.most
     which, place = np.unique(side.cells, return_inverse=True)
     steep, area = (np.bincount(place, row) for row in (lifted.steep, lifted.area))
     loss, edge = np.zeros(len(cells.exterior)), made.segments
