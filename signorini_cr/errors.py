@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import TypeVar
 
 from mpi4py import MPI
@@ -59,11 +60,23 @@ def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], nee
         raise InputError(f"{name} is of the type {type(value).__name__}: {needed} is needed")
 
 
-def meant(word: object, known: Iterable[str], there: str = "there are") -> str:
-    """Say what there is in the place of a word that is not known, the likeliest first."""
+def meant(
+    word: object,
+    known: Iterable[str],
+    there: str = "there are",
+    more: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Say what there is in the place of a word that is not known, the likeliest first.
+
+    Args:
+        word: What is not known.
+        known: What is.
+        there: What stands before the list of these.
+        more: What is told of some of them, in the list.
+    """
     known = list(known)
     near = difflib.get_close_matches(str(word).lower(), known, n=1)
-    there = f"{there} {', '.join(known)}"
+    there = f"{there} {', '.join(name + more.get(name, '') for name in known)}"
     return f"did you mean {near[0]}? {there[0].upper()}{there[1:]}" if near else there
 
 

@@ -22,6 +22,7 @@ from ..mesh.domain import Domain
 from ..options import PREFIX
 from ..output import report as output
 from ..output import series, strip, tables
+from ..output.checkpoint import NAME as RESTART
 from ..output.checkpoint import read_checkpoint
 from ..output.files import write_files, write_text
 from ..output.page import run_page
@@ -168,6 +169,8 @@ class _Run:
                         "the same is needed, or another --out"
                     )
         self.kept.extend(facts["times" if "times" in facts else "levels"])
+        kind = "step" if "times" in facts else "level"
+        self.screen.line(f"going on after {kind} {self.kept[-1][kind]}, kept in {self.folder}\n")
         return restart
 
     def report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
@@ -273,8 +276,10 @@ def _conclude(run: _Run, names: str) -> None:
     screen.line("")
     screen.text(tables.facts(records[-1], units))
     screen.items(*tables.certified(records[-1], units))
+    if (reached := _tolerance_reached(run.case, records)) is not None:
+        screen.text(reached)
     screen.text(tables.times(records))
-    screen.text(f"written to {run.folder}: {names}")
+    screen.text(f"written to {run.folder}: {names}, and {RESTART} for --resume")
 
 
 def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None:
@@ -294,6 +299,14 @@ def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None
         f"refine.tolerance: at this rate the tolerance {tolerance:g} takes about"
         f" {10.0 ** min(digits, 300.0):.0e} unknowns; max_dofs is {most}"
     )
+
+
+def _tolerance_reached(case: ProblemFile, records: list[output.Record]) -> str | None:
+    """Say that an adaptive run has ended because the bound is what was asked for."""
+    tolerance, bound = case.adaptive["tolerance"], records[-1]["bound_h1"]
+    if case.mode != "adaptive" or bound is None or bound > tolerance:
+        return None
+    return f"the bound has reached the tolerance of {tolerance:g}: no further mesh is needed"
 
 
 def _above_tolerance(case: ProblemFile, records: list[output.Record]) -> NotConverged | None:
@@ -421,4 +434,7 @@ class _Steps:
         head, *figures = tables.certified(finest, units)
         screen.items(f"the last step's own problem, {head}", *figures)
         screen.text(series.times(records))
-        screen.text(f"written to {run.folder}: {names}, times.csv, series.pvd and its fields")
+        screen.text(
+            f"written to {run.folder}: {names}, times.csv, series.pvd and its fields,"
+            f" and {RESTART} for --resume"
+        )

@@ -17,7 +17,7 @@ from .screen import WIDTH
 
 INDENT = 11
 _SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c", "capacity": "capacity"}
-LONGEST = 50
+LONGEST = 90
 """Characters of an expression; what is longer is cut."""
 
 
@@ -51,8 +51,9 @@ def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
     if case.time is not None:
         words = f"t from 0 to {case.time.end:g}{case.units.after('time')} in {case.time.steps}"
         words += f" steps of {case.time.scheme}"
+        rate = as_factor(f"{case.time.capacity:g}", "∂u/∂t")
         start = f"u = {_short(said.get('time.initial', 0))} at t = 0"
-        rows["time"] = f"{words}; {case.time.capacity:g} ∂u/∂t on the left; {start}"
+        rows["time"] = f"{words}; {rate} on the left; {start}"
     if "exact.u" in said:
         rows["exact.u"] = _short(said["exact.u"])
     helpers = [key.removeprefix("define.") for key in said if key.startswith("define.")]
@@ -101,7 +102,7 @@ def _equation(
     gain = " + c u" if "reaction" in own else ""
     reaction = said.get("data.reaction", 0)
     if reaction not in (0, "0") and "reaction" not in of_all:
-        gain = f" + {as_factor(_short(reaction))} u"
+        gain = f" + {as_factor(_short(reaction), 'u')}"
     load = _short(said.get("data.f", "f from exact.u" if "exact.u" in said else "0"))
     parts = [f"{'−∇·(κ∇u)' if kappa else '−Δu'}{gain} = {'f' if 'f' in of_all else load}"]
     if kappa and "coefficient" not in of_all:

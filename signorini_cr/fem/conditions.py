@@ -337,7 +337,7 @@ def _left_in_words(said: Mapping[str, str], kappa: str) -> str:
         return flux
     difference = _difference("u", said.get("external", "0"))
     difference = f"({difference})" if difference != "u" else difference
-    return f"{flux} + {as_factor(said['coefficient'])} {difference}"
+    return f"{flux} + {as_factor(said['coefficient'], difference)}"
 
 
 def _matters(said: Mapping[str, str], name: str) -> bool:
@@ -350,9 +350,12 @@ def _derived_in_words(name: str, exact: bool) -> str:
     return f"{name} from exact.u" if exact else "0"
 
 
-def as_factor(text: str) -> str:
-    """Write what can be multiplied as it is, anything else in parentheses."""
-    return text if re.fullmatch(r"[\w.]+", text) else f"({text})"
+def as_factor(text: str, of: str = "") -> str:
+    """Write what can be multiplied as it is, anything else in parentheses, and nothing for 1."""
+    if of and text in ("1", "1.0"):
+        return of
+    factor = text if re.fullmatch(r"[\w.]+", text) else f"({text})"
+    return f"{factor} {of}" if of else factor
 
 
 def _difference(left: str, right: str) -> str:

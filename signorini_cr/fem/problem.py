@@ -28,7 +28,7 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_pre_traversal
 
 from ..arrays import Int32Array
-from ..errors import InputError
+from ..errors import InputError, meant
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials
@@ -512,8 +512,7 @@ class Forms:
         def ds(name: str) -> ufl.Measure:
             if name not in self._parts:
                 raise InputError(
-                    f"form: no part of the boundary is called {name!r}; there are"
-                    f" {', '.join(self._parts)}"
+                    f"form: no part of the boundary is called {name!r}; {meant(name, self._parts)}"
                 )
             return self.ds(self._parts[name])
 
@@ -643,9 +642,9 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
         name = named(parts, key)
         if name not in parts:
             values = {part: f" ({value})" for value, part in called.items()}
-            there = ", ".join(part + values.get(part, "") for part in parts)
+            there = meant(key, parts, more=values)
             how = f"is called {key!r}" if name else f"stands for the facet value {key} alone"
-            raise InputError(f"conditions: no part of the boundary {how}; there are {there}")
+            raise InputError(f"conditions: no part of the boundary {how}; {there}")
         if name in own:
             raise InputError(f"conditions: the part {name!r} has two")
         own[name] = condition

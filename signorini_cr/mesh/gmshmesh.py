@@ -417,7 +417,8 @@ def _check_names(
             hint = f"did you mean {near[0]}? Allowed there" if near else "allowed there"
             raise InputError(
                 f"{what} has {number} facets on the boundary; {hint} are"
-                f" {', '.join(allowed)}; a curve without a physical group is neumann"
+                f" {', '.join(allowed)}, or a name with a condition of its own, in a problem file"
+                f" a section [boundary.{name.strip()}]; a curve without a physical group is neumann"
             )
 
 

@@ -123,7 +123,8 @@ def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
         lower, upper = min(each["lower"] for each in found), max(each["upper"] for each in found)
         ends = interval(lower, upper).replace(" ", GLUE)
         said.append(
-            f"certified: {name} of each step's own problem is in {ends}{unit_of(last, units)}"
+            f"certified: over all steps {name} stays within {ends}{unit_of(last, units)};"
+            f" the interval of each step's own problem is in {TABLE}"
         )
     return said
 

@@ -63,22 +63,17 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     wide = None if force["reason"] is not None else force["upper"] - force["lower"]
     line = (
         f"contact on {contact['active']} of {contact['facets']} facets, length"
-        f" {known(contact['length'], _ten(facet))}{units.after('x')}, force"
+        f" {known(contact['length'], facet)}{units.after('x')}, force"
         f" {known(contact['force'], wide, 4 if wide is None else 6)}{units.after('force')}"
     )
     points = [
-        "(" + f",{GLUE}".join(known(value, _ten(facet), least=0) for value in point) + ")"
+        "(" + f",{GLUE}".join(known(value, facet, least=0) for value in point) + ")"
         for point in contact["transitions"]
     ]
     if points:
         more = f" and {len(points) - 6} more" if len(points) > 6 else ""
         line += f"; it begins or ends at {', '.join(points[:6])}{more}{units.after('x')}"
     return line
-
-
-def _ten(facet: float | None) -> float | None:
-    """Ten facets: the second digit of that is the first of one."""
-    return None if facet is None else 10 * facet
 
 
 def certified(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:

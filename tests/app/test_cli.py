@@ -991,6 +991,17 @@ def test_a_tolerance_out_of_reach_is_told_early(tolerance, most, warned, write) 
         assert "allows no further mesh" in message
 
 
+def test_an_adaptive_run_that_is_good_enough_says_so(write) -> None:
+    text = with_("uniform", "adaptive").replace("tolerance = 0", "tolerance = 40")
+    text = text.replace("[data]\n", "[data]\nreaction = 1\n", 1)
+    status, text, err = run("solve", write(text), "--out", "out")
+    assert (status, err) == (0, "")
+    if COMM.rank == 0:
+        said = " ".join(text.split())
+        assert "the bound has reached the tolerance of 40: no further mesh is needed" in said
+        assert "and restart.npz for --resume" in said and "−Δu + u = " in said
+
+
 def test_an_adaptive_run_without_a_tolerance_ends_at_its_limit(write) -> None:
     assert run("solve", write(with_("uniform", "adaptive")), "--out", "out", "-q") == (0, "", "")
 

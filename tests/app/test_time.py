@@ -169,9 +169,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
             pick(record["quantities"][name][end] for record in report["times"])
             for pick, end in ((min, "lower"), (max, "upper"))
         ]
-        told = re.search(
-            rf"certified: {name} of each step's own problem is in \[(.*?), (.*?)\]", flat
-        )
+        told = re.search(rf"certified: over all steps {name} stays within \[(.*?), (.*?)\]", flat)
         low, high = (float(text.replace("−", "-")) for text in told.groups())
         assert low <= ends[0] and ends[1] <= high
         assert (low, high) == pytest.approx(ends, rel=0.1, abs=0.1)
@@ -280,6 +278,8 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
         assert f"time step {after + 1}: so it was told {kept} finished and kept in" in error
         assert len(report_in(out)["times"]) == after and not report_in(out)["complete"]
     assert solved(path, out, "--resume") == 0
+    if COMM.rank == 0:
+        assert f"going on after step {after}, kept in {out}\n" in capfd.readouterr().out
     assert_same(out, whole)
     names = [{each.name for each in folder.iterdir()} for folder in (out, whole)]
     if draws:

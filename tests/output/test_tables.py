@@ -123,7 +123,7 @@ def test_every_column_of_the_steps_has_its_meaning():
         (
             {"active": 52, "length": 2.6, "force": 71.4537, "transitions": [[0.0151051, 0.3]],
              "force_bounds": {"lower": 0.0, "upper": 170.0, "reason": None}},
-            "length 2.6, force 71; it begins or ends at (0.02, 0.3)",
+            "length 2.6, force 71; it begins or ends at (0.015, 0.3)",
         ),
         (
             {"active": 3, "length": 0.333333, "force": 0.771593, "transitions": [[0.002, 1e-17]],
