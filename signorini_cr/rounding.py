@@ -23,13 +23,13 @@ def at_most(value: float, digits: int = 3) -> str:
 
 
 def interval(lower: float, upper: float) -> str:
-    """An interval that holds [lower, upper], with two digits of its width."""
+    """An interval that holds [lower, upper], with two digits of its width, at both ends."""
     width = upper - lower
     if not (0.0 < width < math.inf):
         return f"[{lower!r}, {upper!r}]"
     last = _last(max(width, 1e-15 * max(abs(lower), abs(upper))))
     low = _rounded(_exact(lower), last, ROUND_FLOOR)
-    return f"[{_told(low)}, {_told(_rounded(_exact(upper), last, ROUND_CEILING))}]"
+    return f"[{_placed(low)}, {_placed(_rounded(_exact(upper), last, ROUND_CEILING))}]"
 
 
 def known(value: float, within: float | None, digits: int = 6, least: int = 2) -> str:
@@ -68,6 +68,12 @@ def _last(width: float) -> int:
 
 def _rounded(value: Decimal, last: int, way: str) -> Decimal:
     return value.quantize(Decimal((0, (1,), last)), rounding=way)
+
+
+def _placed(number: Decimal) -> str:
+    """As it is rounded, with zeros at the end of its decimals."""
+    plain = number != 0 and -5 <= number.adjusted() < 10
+    return f"{number:f}" if plain else _told(number)
 
 
 def _told(number: Decimal) -> str:

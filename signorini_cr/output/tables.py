@@ -124,9 +124,10 @@ def unit_of(found: Mapping[str, Any], units: Units) -> str:
 
 
 def _interval(lower: float, upper: float, measured: str = "") -> str:
-    """An interval that holds [lower, upper], its unit, and its relative width."""
-    width, size = upper - lower, max(abs(lower), abs(upper))
-    wide = f", {at_most(100 * width / size, 2)}{GLUE}% wide" if width > 0.0 else ""
+    """An interval that holds [lower, upper], its unit, and its width in parts of the middle."""
+    width, middle = upper - lower, 0.5 * abs(lower + upper)
+    apart = 0.0 < width < 2.0 * middle  # from 0
+    wide = f", {at_most((100 - 1e-9) * width / middle, 2)}{GLUE}% wide" if apart else ""
     ends = interval(lower, upper).replace(" ", GLUE)
     return f"{ends}{measured}{wide}"
 

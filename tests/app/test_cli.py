@@ -776,7 +776,7 @@ def test_what_is_certain_stands_line_by_line(write) -> None:
         strict=True,
     ):
         assert line.startswith(f"  {words}")
-    assert told[2].endswith(" % wide (this is push)")
+    assert told[2].endswith("] (this is push)")
     level = json.loads(Path("out/report.json").read_text())["levels"][-1]
     push = level["quantities"]["push"]
     assert {end: push[end] for end in ("lower", "upper")} == {
@@ -994,9 +994,13 @@ def test_a_tolerance_out_of_reach_is_told_early(tolerance, most, warned, write) 
 def test_an_adaptive_run_that_is_good_enough_says_so(write) -> None:
     text = with_("uniform", "adaptive").replace("tolerance = 0", "tolerance = 40")
     text = text.replace("[data]\n", "[data]\nreaction = 1\n", 1)
-    status, text, err = run("solve", write(text), "--out", "out")
+    path = write(text)
+    status, text, err = run("solve", path, "--out", "out")
     assert (status, err) == (0, "")
+    again = run("solve", path, "--out", "out", "--resume")
+    assert (again[0], again[2]) == (0, "")
     if COMM.rank == 0:
+        assert "\ngoing on after level 0, kept in out\n" in again[1]
         said = " ".join(text.split())
         assert "the bound has reached the tolerance of 40: no further mesh is needed" in said
         assert "and restart.npz for --resume" in said and "−Δu + u = " in said

@@ -40,7 +40,7 @@ def test_an_interval_that_is_told_holds_it():
 def test_small_and_round_numbers_are_told_as_people_write_them():
     assert [told(x) for x in (100.0, 0.0, -0.0, 0.25, 1e-7)] == ["100", "0", "0", "0.25", "1e-7"]
     assert at_most(99.1, 2) == "100" and at_most(0.0) == "0" and at_most(float("inf")) == "inf"
-    assert interval(0.9, 1.1) == "[0.9, 1.1]" and interval(-0.0, 3.1) == "[0, 3.1]"
+    assert interval(0.9, 1.1) == "[0.90, 1.10]" and interval(-0.0, 3.1) == "[0, 3.1]"
 
 
 @pytest.mark.parametrize(

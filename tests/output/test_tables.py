@@ -75,7 +75,7 @@ def test_no_force_but_a_reason():
     inflow = {"value": 1.0, "lower": 0.9, "upper": 1.1, "reason": None}
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"inflow": inflow}}
     text = plain(certified(record))
-    assert "; the contact force has no bounds: they touch; inflow is in [0.9, 1.1]" in text
+    assert "; the contact force has no bounds: they touch; inflow is in [0.90, 1.10]" in text
 
 
 def test_what_is_certain_is_a_line_each():
@@ -94,7 +94,7 @@ def test_the_contact_force_under_another_name_is_told_once(change, once):
     push = {"kind": "force", "weighted": False, "value": 1.0, **bounds, **change}
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"push": push}}
     lines = [plain(line) for line in certified(record)]
-    told = "the contact force is in [0.9, 1.1], 19 % wide"
+    told = "the contact force is in [0.90, 1.10], 20 % wide"
     assert lines[3] == (f"{told} (this is push)" if once else told)
     assert lines[-1].startswith("push is in ") is not once
     assert len(lines) == (4 if once else 5)
@@ -159,7 +159,7 @@ def test_units_stand_where_their_figures_are():
     bounds = {"lower": 0.9, "upper": 1.1, "reason": None}
     record = RECORD | {"contact": {"active": 2, "length": 1.0, "force_bounds": bounds}}
     bare, told = plain(certified(record)), plain(certified(record, units))
-    assert told == bare.replace("1.1],", "1.1] N/mm,") != bare
+    assert told == bare.replace("1.10],", "1.10] N/mm,") != bare
     entries = dict(entry.split(": ") for entry in plain(legend(record, units)).split("; "))
     assert {name for name in entries if entries[name].endswith(" in mm")} == {"h", "contact"}
     heads = [head.strip() for head in markdown_table([record], units).split("\n")[0].split("|")]
