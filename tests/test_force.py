@@ -7,6 +7,7 @@ from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, Robin, force, solve_levels
+from signorini_cr.mesh.families import structured
 
 pytestmark = pytest.mark.slow
 
@@ -145,3 +146,20 @@ def test_a_part_without_contact_beside_one_where_contact_begins():
     assert (orders(found) > 1.5).all()
     first = widths(problem, "top", levels=3)
     assert (abs(orders(first) - 1.0) < 0.5).all()
+
+
+@pytest.mark.parametrize("top", [0.0, 0.3])
+def test_a_weight_that_vanishes_at_all_vertices(top):
+    """Of ω nothing is in P1: what it has beyond makes all of the interval, and is no less than that.
+
+    u = (y² − y)/2 + top y with λ = ½ − top on the floor; with 0.3 the top is the Dirichlet part.
+    """
+    walls = {"left": Neumann(), "right": Neumann(), "top": Dirichlet(top)}
+    problem = Problem(f=-1.0, conditions=walls | {"floor": Contact(0.0)})
+    domain = structured(SQUARE, 4, comm=MPI.COMM_WORLD)
+    (solution,) = solve_levels(problem, domain, 1)
+    for part, flow in (("floor", 0.5 - top), ("top", 0.5 + top)):
+        wave = force.flux(solution, part, weight=lambda x: ufl.sin(4.0 * np.pi * x[0]) ** 2)
+        assert wave.lower < flow / 2 < wave.upper
+        error = solution.certificate.bound_h1
+        assert 0.1 * error < wave.upper - wave.lower < 10.0 * error
