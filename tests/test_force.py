@@ -150,9 +150,9 @@ def test_a_part_without_contact_beside_one_where_contact_begins():
 
 @pytest.mark.parametrize("top", [0.0, 0.3])
 def test_a_weight_that_vanishes_at_all_vertices(top):
-    """Of ω nothing is in P1: what it has beyond makes all of the interval, and is no less than that.
+    """Of ω nothing is in P1: what it has beyond makes all of the interval, which is no shorter.
 
-    u = (y² − y)/2 + top y with λ = ½ − top on the floor; with 0.3 the top is the Dirichlet part.
+    u = (y² − y)/2 + top y with λ = ½ − top on the floor.
     """
     walls = {"left": Neumann(), "right": Neumann(), "top": Dirichlet(top)}
     problem = Problem(f=-1.0, conditions=walls | {"floor": Contact(0.0)})
