@@ -969,7 +969,7 @@ def test_slack_of_quadrature(few):
 @pytest.mark.serial
 def test_a_line_about_a_certificate():
     found = certificate.Certificate(1.25, 1.5, 2.0, (-3.0, -2.5))
-    assert repr(found) == "<Certificate: error at most 1.25, energy in [-3, -2.5]>"
+    assert repr(found) == "<Certificate: error at most 1.25, energy in [-3.00, -2.50]>"
     for found in (
         certificate.Certificate(reason="so"),
         certificate.Certificate(1.25, reason="so"),
