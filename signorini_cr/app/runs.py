@@ -92,11 +92,16 @@ def what_is_kept(kept: list[output.Record], folder: Path) -> str:
     """What a run that has been ended leaves."""
     if not kept:
         return "no level was finished, nothing was written"
-    kind = "step" if "step" in kept[0] else "level"
+    kind = _kind(kept[0])
     first, last = kept[0][kind], kept[-1][kind]
     if first == last:
         return f"{kind} {first} is finished and kept in {folder}"
     return f"{kind}s {first} to {last} are finished and kept in {folder}"
+
+
+def _kind(record: output.Record) -> str:
+    """What a record is of, which its number goes by, too."""
+    return "step" if "step" in record else "level"
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +174,7 @@ class _Run:
                         "the same is needed, or another --out"
                     )
         self.kept.extend(facts["times" if "times" in facts else "levels"])
-        kind = "step" if "times" in facts else "level"
+        kind = _kind(self.kept[-1])
         self.screen.line(f"going on after {kind} {self.kept[-1][kind]}, kept in {self.folder}\n")
         return restart
 
@@ -276,8 +281,11 @@ def _conclude(run: _Run, names: str) -> None:
     screen.line("")
     screen.text(tables.facts(records[-1], units))
     screen.items(*tables.certified(records[-1], units))
-    if (reached := _tolerance_reached(run.case, records)) is not None:
-        screen.text(reached)
+    if _tolerance_met(run.case, records):
+        tolerance = run.case.adaptive["tolerance"]
+        screen.text(
+            f"the bound has reached the tolerance of {tolerance:g}: no further mesh is needed"
+        )
     screen.text(tables.times(records))
     screen.text(f"written to {run.folder}: {names}, and {RESTART} for --resume")
 
@@ -301,22 +309,18 @@ def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None
     )
 
 
-def _tolerance_reached(case: ProblemFile, records: list[output.Record]) -> str | None:
-    """Say that an adaptive run has ended because the bound is what was asked for."""
+def _tolerance_met(case: ProblemFile, records: list[output.Record]) -> bool:
+    """Tell whether a bound was asked for, and is reached."""
     tolerance, bound = case.adaptive["tolerance"], records[-1]["bound_h1"]
-    if case.mode != "adaptive" or bound is None or bound > tolerance:
-        return None
-    return f"the bound has reached the tolerance of {tolerance:g}: no further mesh is needed"
+    return tolerance > 0.0 and bound is not None and bound <= tolerance
 
 
 def _above_tolerance(case: ProblemFile, records: list[output.Record]) -> NotConverged | None:
     """Say what stopped an adaptive run before the bound that was asked for was reached."""
     tolerance = case.adaptive["tolerance"]
-    if tolerance == 0.0 or not records:
+    if tolerance == 0.0 or not records or _tolerance_met(case, records):
         return None
     bound = records[-1]["bound_h1"]
-    if bound is not None and bound <= tolerance:
-        return None
     limits = [
         f"{key} = {value}"
         for key, value in case.adaptive.items()

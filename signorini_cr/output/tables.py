@@ -127,6 +127,7 @@ def _interval(lower: float, upper: float, measured: str = "") -> str:
     """An interval that holds [lower, upper], its unit, and its width in parts of the middle."""
     width, middle = upper - lower, 0.5 * abs(lower + upper)
     apart = 0.0 < width < 2.0 * middle  # from 0
+    # rounded up, but not for what is rounding itself: 1.1 − 0.9 is 20 % of 1
     wide = f", {at_most((100 - 1e-9) * width / middle, 2)}{GLUE}% wide" if apart else ""
     ends = interval(lower, upper).replace(" ", GLUE)
     return f"{ends}{measured}{wide}"
