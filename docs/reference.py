@@ -145,7 +145,7 @@ NAMES = {
     "The problem": """\
         Problem Material Form Domain Polygon read_gmsh Dirichlet Neumann Robin Contact
         mesh.families""",
-    "Solving": "solve solve_levels solve_adaptive solve_in_time Solver",
+    "Solving": "solve solve_levels solve_adaptive solve_in_time adapt_to_run Solver",
     "Results": """\
         Solution vi.contact.Contact vi.contact.Kkt Certificate
         force.force_bounds force.flux means.mean means.integral force.Interval""",

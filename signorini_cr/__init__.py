@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from .shown import HTML
 
 if TYPE_CHECKING:
-    from .adaptive import solve_adaptive
+    from .adaptive import adapt_to_run, solve_adaptive
     from .errors import InputError, NotConverged
     from .estimate.certificate import Certificate
     from .evolution import Solver, solve_in_time
@@ -49,6 +49,7 @@ _ROOMS = {
     "solve_levels": "levels",
     "solve_adaptive": "adaptive",
     "solve_in_time": "evolution",
+    "adapt_to_run": "adaptive",
     "Solver": "evolution",
     "Certificate": "estimate.certificate",
     "Problem": "fem.problem",
@@ -85,6 +86,7 @@ __all__ = [  # noqa: RUF022, in the order in which one meets them
     "solve_levels",
     "solve_adaptive",
     "solve_in_time",
+    "adapt_to_run",
     "Solver",
     "Solution",
     "Certificate",

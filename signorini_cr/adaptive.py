@@ -6,7 +6,8 @@ fewest cells that hold a given part of it; their sides are halved.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -78,6 +79,82 @@ def solve_adaptive(
         yield solution
 
 
+class Shares(NamedTuple):
+    """Where the error is.
+
+    Attributes:
+        bound: Of the broken error (1.6).
+        indicators: What this rank's cells hold of its square, shape (cells,).
+    """
+
+    bound: float
+    indicators: FloatArray
+
+    @classmethod
+    def of(cls, solution: Solution) -> Shares:
+        """What the certificate says; collective.
+
+        Raises:
+            InputError: There is no bound; the message says why.
+        """
+        certificate = solution.certificate
+        if certificate.bound_h1 is None or certificate.indicators is None:
+            raise InputError(
+                f"adaptive refinement goes by the certified bound, and there is none: "
+                f"{certificate.reason}"
+            )
+        return cls(certificate.bound_h1, certificate.indicators)
+
+
+def adapt_to_run(
+    run: Callable[[Sequence[Refined]], Iterator[tuple[float, Solution]]],
+    *,
+    tolerance: float = 0.0,
+    levels: int | None = None,
+    max_dofs: int = 1_000_000,
+    fraction: float = 0.5,
+    monitor: Callable[[Solution, float], None] | None = None,
+    max_time: float | None = None,
+) -> list[Refined]:
+    """Find meshes that suit all steps of a run in time; collective.
+
+    The run is made on one mesh after the other. Cells are marked by the sum of their shares over
+    all steps, each in the bound of its own problem; the mesh they lead to is that of the next run.
+    What the length of the steps does to u is in none of these bounds.
+
+    Args:
+        run: Solves step by step, as `solve_in_time` does, on the last of some refined meshes.
+        tolerance: The end: in no step a bound above it.
+        levels: The end: so many meshes, the coarsest included; None for any number.
+        max_dofs: The end: the next mesh would have more degrees of freedom.
+        fraction: Part of the sum that the marked cells hold, in (0, 1].
+        monitor: Called after each run with the solution of its last step, and the largest bound.
+        max_time: No run is begun that would end later than so many seconds from now.
+
+    Returns:
+        The refined meshes, as ``levels`` of `solve_in_time` takes them.
+
+    Raises:
+        InputError: As for `solve_adaptive`.
+        NotConverged: The same, or the run raised it.
+    """
+    step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction)
+    refined: list[Refined] = []
+    zero: FloatArray = np.zeros(1)
+    while levels is None or len(refined) + 1 < levels:
+        bound, indicators = 0.0, zero
+        for _, solution in run(refined):
+            shares = Shares.of(solution)
+            bound, indicators = max(bound, shares.bound), indicators + shares.indicators
+        if monitor is not None:
+            monitor(solution, bound)
+        following = step(solution, Shares(bound, indicators))
+        if following is None:
+            break
+        refined.append(following)
+    return refined
+
+
 def adaptively(
     limits: Limits, *, tolerance: float, levels: int | None, max_dofs: int, fraction: float
 ) -> Callable[[Solution], Refined | None]:
@@ -90,23 +167,25 @@ def adaptively(
         max_dofs: The end: the next mesh would have more degrees of freedom.
         fraction: Part of the bound's square that the marked cells hold, in (0, 1].
     """
+    step = _by_shares(limits, tolerance, levels, max_dofs, fraction)
+    return lambda solution: step(solution, Shares.of(solution))
+
+
+def _by_shares(
+    limits: Limits, tolerance: float, levels: int | None, max_dofs: int, fraction: float
+) -> Callable[[Solution, Shares], Refined | None]:
+    """The same, from what is said about where the error is."""
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None and levels < 1:
         raise InputError(f"levels is {levels}; it must be 1 or more")
 
-    def step(solution: Solution) -> Refined | None:
-        certificate = solution.certificate
-        if certificate.bound_h1 is None or certificate.indicators is None:
-            raise InputError(
-                f"adaptive refinement goes by the certified bound, and there is none: "
-                f"{certificate.reason}"
-            )
+    def step(solution: Solution, shares: Shares) -> Refined | None:
         last = levels is not None and solution.level.number + 1 >= levels
-        if last or certificate.bound_h1 <= tolerance or solution.dofs >= max_dofs:
+        if last or shares.bound <= tolerance or solution.dofs >= max_dofs:
             return None
         comm = solution.domain.mesh.comm
-        marked = mark(certificate.indicators, fraction, comm)
+        marked = mark(shares.indicators, fraction, comm)
         if _smallest(solution.domain, marked) < RESOLUTION:
             raise NotConverged(
                 "cells have become so small that rounding spoils their shape",

@@ -8,7 +8,7 @@ function of Crouzeix-Raviart, so that all its integrals are exact, the certifica
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from numbers import Real
@@ -21,7 +21,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
-from .arrays import FloatArray, Int32Array
+from .arrays import FloatArray
 from .data.admissible import check_operator
 from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
@@ -32,6 +32,7 @@ from .fem.conditions import Data
 from .fem.problem import Problem, as_expression
 from .levels import Start, check_arguments, solve_level
 from .limits import Limits
+from .mesh.balance import Refined
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.hierarchy import Hierarchy, NestedMesh
@@ -39,9 +40,6 @@ from .multigrid.parents import Layout
 from .restart import Restart
 from .solution import Solution
 from .vi.level import Level
-
-Refined = tuple[Domain, Int32Array]
-"""A mesh, and the cell of the one below that holds each of its cells."""
 
 
 class Scheme(NamedTuple):
@@ -75,31 +73,39 @@ class Solver:
     """
 
     def __init__(
-        self, problem: Problem, domain: Domain, levels: int = 1, like: Solver | None = None
+        self,
+        problem: Problem,
+        domain: Domain,
+        levels: int | Sequence[Refined] = 1,
+        like: Solver | None = None,
     ):
         """Assemble the matrix, and set up multigrid; collective.
 
         Args:
             problem: The data.
             domain: The coarsest mesh of multigrid, and its boundary parts.
-            levels: How many meshes there are; solved is on the last of them.
+            levels: How many meshes there are, each with four triangles for one of the mesh below;
+                or those above the coarsest, as `adapt_to_run` finds them. Solved is on the last.
             like: A solver for another problem on the same domain, whose meshes are taken.
 
         Raises:
             InputError: As for `solve_levels`.
         """
         check_arguments(problem, domain)
-        if levels < 1:
+        number = levels if isinstance(levels, int) else 1 + len(levels)
+        if number < 1:
             raise InputError(f"levels is {levels}; it must be 1 or more")
-        if levels > 1:
+        if number > 1:
             check_refinable(domain.mesh)
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
         self.physics, self._domain = physics, domain
-        self._refined: list[Refined] = [] if like is None else like._refined
+        self._refined: list[Refined] = [] if isinstance(levels, int) else [*levels]
         physics.check(domain)
-        if like is None:
-            for _ in range(levels - 1):
-                self._refined.append(refine(self._refined[-1][0] if self._refined else domain))
+        if like is not None:
+            self._refined = like._refined
+        while len(self._refined) + 1 < number:
+            above = self._refined[-1][0] if self._refined else domain
+            self._refined.append((*refine(above), None))
         self._stack, self._solved = ExitStack(), 0
         self._set_up()
 
@@ -122,12 +128,10 @@ class Solver:
     def _carry_down(self) -> None:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
         for function in self.physics.functions:
-            above = function
-            for fine, parents in self._refined:
-                own = fine.own(function)
-                here, there = (each.function_space.dofmap.list[:, 0] for each in (own, above))
-                own.x.array[here[: len(parents)]] = above.x.array[there[parents]]
-                above = own
+            values = function.x.array[function.function_space.dofmap.list[:, 0]]
+            for fine, *_ in self._refined:
+                values, own = fine.descent[-1].carry(values), fine.own(function)
+                own.x.array[own.function_space.dofmap.list[: len(values), 0]] = values
 
     def _changed(self) -> bool:
         """Whether a_h would be another one by now; collective."""
@@ -222,7 +226,7 @@ def solve_in_time(
     scheme: str = "euler",
     initial: Data = 0.0,
     capacity: float = 1.0,
-    levels: int = 1,
+    levels: int | Sequence[Refined] = 1,
     time: Clock | None = None,
     max_time: float | None = None,
     restart: Restart | None = None,
@@ -243,7 +247,7 @@ def solve_in_time(
         scheme: "euler", of first order, or "bdf2", of second order after a first step of Euler's.
         initial: u at the time 0; it is projected to the discrete space.
         capacity: Above 0; materials may have their own.
-        levels: How many nested meshes there are; solved is on the last of them.
+        levels: The meshes, as for `Solver`; solved is on the last of them.
         time: That Constant; it is set to the time of each step.
         max_time: No step is begun that would end later than so many seconds from now.
         restart: Where to go on, from `Restart.of_steps`: the first solution is the one it was taken
@@ -277,7 +281,10 @@ def solve_in_time(
     then: FloatArray = np.empty(0)
     before: FloatArray = then
     limits, comm = Limits(max_time), domain.mesh.comm
-    limits.begin(domain, "CR", restart, levels)
+    if isinstance(levels, int):
+        limits.begin(domain, "CR", restart, levels)
+    else:
+        limits.begin(levels[-1][0] if levels else domain, "CR", restart)
     try:
         for step in range(max(done, 1), steps + 1):
             weights = SCHEMES[scheme].weights

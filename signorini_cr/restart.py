@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,7 @@ from .errors import raise_together
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine, refine_edges
+from .multigrid.hierarchy import NestedMesh
 from .multigrid.parents import Layout
 from .solution import Solution
 
@@ -63,30 +65,28 @@ class Restart:
             return cls((), (here,))
         added = None
         if adaptive:
-            meshes = solution.level.meshes[-2:]
-            coarse, fine = (_gathered(_nodes(each.domain.mesh), comm) for each in meshes)
-            added = np.setdiff1d(fine, coarse)
+            (added,) = _added(solution.level.meshes[-2:], comm)
         return cls((*below.added, added), (here, below.u[0]))
 
     @classmethod
-    def of_steps(
-        cls, last: Sequence[fem.Function], levels: int, below: Restart | None = None
-    ) -> Restart:
+    def of_steps(cls, last: Sequence[Solution], below: Restart | None, adaptive: bool) -> Restart:
         """Take what there is after a step in time to rank 0; collective.
 
         Args:
-            last: u_h after this step and after those before it that the next ones need.
-            levels: How many meshes there are; the functions are on the last.
+            last: Of this step and of those before it that the next ones need; on the same mesh.
             below: The same for the step before, None at the first.
+            adaptive: Whether meshes were refined in parts.
 
         Returns:
             Nothing but empty arrays on the other ranks.
         """
-        V, comm = last[0].function_space, last[0].function_space.mesh.comm
+        V, comm, meshes = last[0].u.function_space, last[0].domain.mesh.comm, last[0].level.meshes
         size = V.dofmap.index_map.size_local
         at = _gathered(_places(V)[:size], comm) if below is None else below.u[0][0]
-        u = tuple((at, _gathered(_by_nodes(each), comm)) for each in last)
-        return cls((None,) * (levels - 1), u)
+        u = tuple((at, _gathered(_by_nodes(each.u), comm)) for each in last)
+        if below is not None:
+            return cls(below.added, u)
+        return cls(_added(meshes, comm) if adaptive else (None,) * (len(meshes) - 1), u)
 
     def meshes(self, domain: Domain) -> Iterator[Refined]:
         """Refine as it was done before; collective.
@@ -120,6 +120,12 @@ class Restart:
         u = fem.Function(V)
         u.x.array[:] = values[index].ravel()
         return u
+
+
+def _added(meshes: Sequence[NestedMesh], comm: MPI.Comm) -> tuple[Places, ...]:
+    """The vertices that each mesh but the first has beyond the one below it; collective."""
+    found = [_gathered(_nodes(each.domain.mesh), comm) for each in meshes]
+    return tuple(np.setdiff1d(fine, coarse) for coarse, fine in pairwise(found))
 
 
 def _corners(mesh: Mesh) -> Places:

@@ -16,13 +16,17 @@ from signorini_cr import (
     Form,
     InputError,
     Neumann,
+    Polygon,
     Problem,
     Robin,
     Solver,
+    adapt_to_run,
     solve,
+    solve_adaptive,
     solve_in_time,
     solve_levels,
 )
+from signorini_cr.compat import cell_nodes
 
 pytestmark = pytest.mark.slow
 
@@ -380,3 +384,111 @@ def test_what_is_certain_of_a_solution_is_so_when_data_have_moved_on(name):
     again = solve(problem, domain)
     assert again.energy != pytest.approx(plain.energy, rel=1e-3)
     assert [plain.certificate.bound_energy_norm, *plain.certificate.energy] == beside[:3]
+
+
+CORNER = Polygon(
+    [[0, 0], [1, 0], [1, -1], [2, -1], [2, 1], [0, 1]],
+    ["top", "top", "floor", "right", "top", "left"],
+    names=["top", "floor", "right", "left"],
+)
+"""L-shaped: at the reentrant corner, whose sides are both fixed, u is like r^(2/3)."""
+
+
+def on_meshes(problem, domain, end, steps, **others):
+    return lambda meshes: solve_in_time(
+        problem, domain, end=end, steps=steps, levels=meshes, **others
+    )
+
+
+def test_a_single_step_adapts_as_the_problem_with_a_reaction_does():
+    """The same meshes and bounds: from u = 0 a step has c + capacity/Δt and no other load."""
+    domain = CORNER.mesh(0.6)
+    problem = Problem(f=-4.0, reaction=0.5, conditions=waves(0.0).conditions)
+    told = []
+    meshes = adapt_to_run(
+        on_meshes(problem, domain, 0.25, 1, capacity=2.0),
+        max_dofs=900,
+        monitor=lambda last, bound: told.append((last.dofs, bound)),
+    )
+    still = solve_adaptive(replace(problem, reaction=8.5), domain, max_dofs=900)
+    wanted = [(each.dofs, each.certificate.bound_h1) for each in still]
+    assert [dofs for dofs, _ in told] == [dofs for dofs, _ in wanted]
+    assert [each for _, each in told] == pytest.approx([each for _, each in wanted], rel=1e-6)
+    assert len(meshes) + 1 == len(told) > 4
+
+
+def test_meshes_adapted_to_a_run_reach_the_best_order():
+    """n^(−1/2) for n dofs, where uniform meshes have the corner's n^(−1/3)."""
+    domain = CORNER.mesh(0.6)
+    t = clock(domain)
+    problem, told = waves(t), []
+    adapt_to_run(
+        on_meshes(problem, domain, 1.0, 3, time=t),
+        max_dofs=3300,
+        monitor=lambda last, bound: told.append((last.dofs, bound)),
+    )
+    uniform = []
+    for levels in (2, 3, 4, 5):
+        run = list(on_meshes(problem, domain, 1.0, 3, time=t)(levels))
+        bound = max(solution.certificate.bound_h1 for _, solution in run)
+        uniform.append((run[-1][1].dofs, bound))
+    half = [each for each in told if each[0] > 300]
+
+    def order(found):
+        n, bounds = np.log(found).T
+        return -np.polyfit(n, bounds, 1)[0]
+
+    assert order(half) == pytest.approx(0.5, abs=0.05)
+    assert order(uniform) < 0.43
+    (n, adapted), (m, refined) = half[-1], uniform[2]
+    assert n == pytest.approx(m, rel=0.1) and adapted < 0.75 * refined
+
+
+def middles(domain):
+    return fem.functionspace(domain.mesh, ("DG", 0)).tabulate_dof_coordinates()[:, :2]
+
+
+def by_place(points):
+    """Unlike for any two cells."""
+    return 3.0 + np.sin(7.0 * points[:, 0]) + np.cos(5.0 * points[:, 1])
+
+
+def holder(corners, points):
+    """The triangle that each point lies in, by barycentric coordinates."""
+    sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
+    off = points[:, None] - corners[None, :, 0]
+    first = np.linalg.solve(sides[None], off[..., None])[..., 0]
+    least = np.minimum(first.min(axis=2), 1.0 - first.sum(axis=2))
+    assert least.max(axis=1).min(initial=1.0) > 0.0
+    return least.argmax(axis=1)
+
+
+def test_functions_follow_meshes_that_are_shared_out_anew():
+    """What is given after all is set up comes down to the cells that it would have come to."""
+    domain = CORNER.mesh(0.6)
+    problem = Problem(f=-4.0, conditions=waves(0.0).conditions)
+    meshes = adapt_to_run(on_meshes(problem, domain, 0.01, 1), max_dofs=3000)
+    if WORLD.size > 1:
+        assert any(exchange is not None for _, _, exchange in meshes)
+    datum = by_cells(domain, 1.0)
+    problem = replace(problem, coefficient=datum)
+    with Solver(problem, domain, meshes) as solver:
+        first = solver.solve()
+        datum.x.array[:] = by_place(middles(domain))
+        found = solver.solve()
+    corners = domain.mesh.geometry.x[cell_nodes(domain.mesh)][..., :2]
+    corners = np.concatenate(WORLD.allgather(corners))
+    fine = meshes[-1][0]
+    last = by_cells(fine, 1.0)
+    last.x.array[:] = by_place(corners[holder(corners, middles(fine))].mean(axis=1))
+    wanted = solve(replace(problem, coefficient=last), fine)
+    assert abs(found.energy - first.energy) > 0.01 * abs(first.energy)
+    assert np.allclose(found.u.x.array, wanted.u.x.array, rtol=0, atol=1e-8)
+
+
+def test_without_a_bound_no_mesh_is_adapted():
+    domain = SQUARE.mesh(0.5)
+    form = Form(lambda u, v, dx, ds: ufl.inner(ufl.grad(u), ufl.grad(v)) * dx)
+    problem = Problem(f=-4.0, conditions=WALLS | {"floor": Contact(-0.1)}, form=form)
+    with pytest.raises(InputError, match="goes by the certified bound, and there is none"):
+        adapt_to_run(on_meshes(problem, domain, 1.0, 2), levels=2)

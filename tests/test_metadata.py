@@ -25,10 +25,11 @@ def test_one_version(file):
 
 @pytest.mark.serial
 def test_one_date():
-    """Releases have dates, the newest comes first, and CITATION.cff has its date."""
+    """Releases have dates, the newest comes first, after what is to come; CITATION.cff has its."""
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     releases = re.findall(r"^## (\d+)\.(\d+)\.(\d+) \((\d{4}-\d\d-\d\d)\)$", changes, re.MULTILINE)
-    assert len(releases) == changes.count("\n## ")
+    headings = re.findall(r"^## (.*)$", changes, re.MULTILINE)
+    assert len(releases) == len(headings) - (headings[0] == "Unreleased")
     assert sorted(releases, key=lambda each: tuple(map(int, each[:3])), reverse=True) == releases
     assert sorted((each[3] for each in releases), reverse=True) == [each[3] for each in releases]
     assert f"\ndate-released: {releases[0][3]}\n" in (ROOT / "CITATION.cff").read_text()

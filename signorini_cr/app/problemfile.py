@@ -30,6 +30,7 @@ from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
 from ..levels import check_pieces, solve_levels
 from ..means import DOMAIN
+from ..mesh.balance import Refined
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
@@ -212,13 +213,13 @@ class ProblemFile:
         ]
 
     def steps(
-        self, domain: Domain, levels: int, **arguments: Any
+        self, domain: Domain, levels: int | Sequence[Refined], **arguments: Any
     ) -> Iterator[tuple[float, Solution]]:
         """Solve step by step what has a [time]; collective.
 
         Args:
             domain: From :meth:`mesh`.
-            levels: Number of meshes; solved is on the last.
+            levels: As for `solve_in_time`.
             **arguments: What `solve_in_time` takes beside what the file says.
         """
         time = self.time
@@ -300,7 +301,7 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
         mode=mode,
         levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
         adaptive=adaptive,
-        time=None if clock is None else _time(sections, expressions, mode, clock),
+        time=None if clock is None else _time(sections, expressions, clock),
         quantities=quantities,
         units=Units(**_words(sections, "units"), names=_words(sections, "names")),
         said={
@@ -618,13 +619,10 @@ def _by_entries(given: Mapping[str, Any]) -> dict[str, Any]:
 def _time(
     sections: Mapping[str, Mapping[str, Any]],
     expressions: Mapping[str, Expression],
-    mode: str,
     clock: Clock,
 ) -> Time:
     """[time], and what goes with it."""
     table = sections["time"]
-    if mode != "uniform":
-        raise InputError('refine.mode: a problem in time needs "uniform": its meshes do not change')
     if "exact.u" in expressions:
         raise InputError("exact.u: a problem in time has none")
     initial = expressions.get("time.initial")

@@ -161,11 +161,13 @@ KEYS = (
         "are then computed, and f, g and dirichlet, where left out, are derived from it.",
         'u = "x**2 - y**2"'),
     Key("refine", "mode", '"uniform" or "adaptive"', '"uniform"', "Every triangle into four; or "
-        "where the error sits.", 'mode = "adaptive"'),
+        "where the error sits. With [time] one mesh serves all steps; it is adapted to all of them "
+        "by runs on coarser ones.", 'mode = "adaptive"'),
     Key("refine", "levels", "a whole number above 0", "1; if adaptive, as many as it takes",
         "Number of meshes, the coarsest included.", "levels = 5", ends=True),
     Key("refine", "tolerance", "a number, 0 or above", USUAL["tolerance"],
-        "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it.",
+        "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it, with [time] in each "
+        "step.",
         "tolerance = 0.05", not_negative, ends=True),
     Key("refine", "max_dofs", "a whole number above 0", USUAL["max_dofs"],
         "Adaptive: stop before a mesh with more degrees of freedom.", "max_dofs = 200000", whole,

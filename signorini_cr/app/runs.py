@@ -16,8 +16,10 @@ from typing import Any
 from petsc4py import PETSc
 
 from .. import __version__
+from ..adaptive import adapt_to_run
 from ..errors import InputError, NotConverged, naming, on_root
 from ..evolution import SCHEMES
+from ..mesh.balance import Refined
 from ..mesh.domain import Domain
 from ..options import PREFIX
 from ..output import report as output
@@ -243,7 +245,8 @@ def _solve_levels(run: _Run) -> None:
                 warned = True
     except NotConverged as error:
         failure = error
-    failure = failure or _above_tolerance(run.case, kept)
+    if kept:
+        failure = failure or _above_tolerance(run.case, kept[-1]["bound_h1"], kept[-1]["level"])
     if finest is not None:
         names = run.write(run.report(kept, failure is None), finest)
         _conclude(run, names)
@@ -281,11 +284,7 @@ def _conclude(run: _Run, names: str) -> None:
     screen.line("")
     screen.text(tables.facts(records[-1], units))
     screen.items(*tables.certified(records[-1], units))
-    if _tolerance_met(run.case, records):
-        tolerance = run.case.adaptive["tolerance"]
-        screen.text(
-            f"the bound has reached the tolerance of {tolerance:g}: no further mesh is needed"
-        )
+    _tell_of_tolerance(run.case, records[-1]["bound_h1"], screen)
     screen.text(tables.times(records))
     screen.text(f"written to {run.folder}: {names}, and {RESTART} for --resume")
 
@@ -309,28 +308,42 @@ def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None
     )
 
 
-def _tolerance_met(case: ProblemFile, records: list[output.Record]) -> bool:
+def _tolerance_met(case: ProblemFile, bound: float | None) -> bool:
     """Tell whether a bound was asked for, and is reached."""
-    tolerance, bound = case.adaptive["tolerance"], records[-1]["bound_h1"]
+    tolerance = case.adaptive["tolerance"]
     return tolerance > 0.0 and bound is not None and bound <= tolerance
 
 
-def _above_tolerance(case: ProblemFile, records: list[output.Record]) -> NotConverged | None:
-    """Say what stopped an adaptive run before the bound that was asked for was reached."""
+def _tell_of_tolerance(case: ProblemFile, bound: float | None, screen: Screen) -> None:
+    """Say so where the bound that was asked for is reached."""
+    if _tolerance_met(case, bound):
+        tolerance = case.adaptive["tolerance"]
+        screen.text(
+            f"the bound has reached the tolerance of {tolerance:g}: no further mesh is needed"
+        )
+
+
+def _above_tolerance(case: ProblemFile, bound: float, level: int) -> NotConverged | None:
+    """Say what stopped an adaptive run before the bound that was asked for was reached.
+
+    Args:
+        case: The problem.
+        bound: Of the finest mesh; if there are steps in time, the largest of all.
+        level: The finest mesh.
+    """
     tolerance = case.adaptive["tolerance"]
-    if tolerance == 0.0 or not records or _tolerance_met(case, records):
+    if tolerance == 0.0 or _tolerance_met(case, bound):
         return None
-    bound = records[-1]["bound_h1"]
     limits = [
         f"{key} = {value}"
         for key, value in case.adaptive.items()
         if f"refine.{key}" in ENDS and key != "tolerance"
     ]
-    limit = f"levels = {case.levels}" if len(records) >= case.levels else " or ".join(limits)
+    limit = f"levels = {case.levels}" if level + 1 >= case.levels else " or ".join(limits)
     return NotConverged(
         f"the certified bound is {at_most(bound)}, above the tolerance of {tolerance:g}, and"
         f" {limit} allows no further mesh",
-        records[-1]["level"],
+        level,
     )
 
 
@@ -348,10 +361,13 @@ class _Steps:
         self._number = case.time.steps
         self._back = len(SCHEMES[case.time.scheme].weights)  # so many steps are behind the next
         self._said = {**run.said(), "refine.levels (or --levels)": case.levels}
+        if case.mode == "adaptive":  # the mesh depends on where the search for it ends, too
+            self._said |= {f"refine.{key}": value for key, value in case.adaptive.items()}
         self._restart = run.resumed(self._said)
         self._records: list[output.Record] = []
         self._moments: list[strip.Moment] = []
         self._last: list[Solution] = []
+        self._stopped: NotConverged | None = None  # on the way to the mesh
         if self._restart is not None:
             with naming("--resume"):
                 self._moments = series.read_moments(run.folder, run.comm)
@@ -363,26 +379,79 @@ class _Steps:
             NotConverged: After steps that are kept.
         """
         run, failure = self._run, None
+        meshes = self._meshes()
         for record in run.kept:
             self._tell(record)
         try:
-            self._solve_on()
+            self._solve_on(meshes)
         except NotConverged as error:
             failure = NotConverged(f"time step {len(self._records) + 1}: {error}")
         if self._last:
             if len(run.kept) < len(self._records):
                 keep(self._write_steps, run.kept, self._records[len(run.kept) :])
+            failure = failure or self._stopped or self._above_tolerance()
             self._conclude(complete=failure is None)
         if failure is not None:
             raise NotConverged(f"{failure}\n{what_is_kept(run.kept, run.folder)}")
 
-    def _solve_on(self) -> None:
+    def _meshes(self) -> int | Sequence[Refined]:
+        """The meshes to solve on; an adaptive run finds them first, as far as it gets; collective.
+
+        Raises:
+            NotConverged: It does not get beyond the coarsest.
+        """
+        run, case, screen = self._run, self._run.case, self._run.screen
+        if case.mode == "uniform":
+            return case.levels
+        if self._restart is not None:
+            return [*self._restart.meshes(run.domain)]
+        if case.levels > 1:
+            screen.text("the mesh is sought by runs through all steps, on one mesh after the other")
+            screen.line(series.mesh_header())
+        begun: list[Refined] = []
+        known: list[list[Refined]] = []
+
+        def through(meshes: Sequence[Refined]) -> Iterator[tuple[float, Solution]]:
+            begun[:] = meshes
+            steps = case.steps(run.domain, meshes, max_time=run.time_left)
+            for number, found in enumerate(steps, 1):
+                screen.progress(f"level {len(meshes)}, step {number} of {self._number}")
+                yield found
+
+        def tell(last: Solution, bound: float) -> None:
+            known.append([*begun])
+            screen.line(series.mesh_row(last, bound))
+
+        try:
+            meshes = adapt_to_run(
+                through, levels=case.levels, **case.adaptive, monitor=tell, max_time=run.time_left
+            )
+        except NotConverged as error:
+            level = len(begun) if error.level is None else error.level
+            failure = NotConverged(f"no finer mesh: level {level}: {error.reason}")
+            if not known:
+                raise NotConverged(f"{failure}\n{what_is_kept([], run.folder)}") from None
+            self._stopped, meshes = failure, known[-1]
+        screen.line("")
+        return meshes
+
+    def _above_tolerance(self) -> NotConverged | None:
+        """Say what stopped the search for a mesh before the tolerance was reached."""
+        return _above_tolerance(self._run.case, self._bound, self._last[0].level.number)
+
+    @property
+    def _bound(self) -> float:
+        """The largest of all steps; infinite where one of them has none."""
+        bounds = [record["bound_h1"] for record in self._records]
+        return max(math.inf if bound is None else bound for bound in bounds)
+
+    def _solve_on(self, meshes: int | Sequence[Refined]) -> None:
         """Solve what is left, and keep what is worth it."""
         run, done = self._run, len(self._run.kept)
         run.screen.progress(f"step {done + 1}")
         steps = run.case.steps(
             run.domain,
-            run.case.levels,
+            meshes,
             max_time=run.time_left,
             restart=self._restart,
             done=max(done, 1),
@@ -408,7 +477,7 @@ class _Steps:
         self._records.append(record)
         if len(self._records) == 1:
             self._run.screen.line(series.header())
-        self._run.screen.line(series.row(record))
+        self._run.screen.line(series.row(record, self._records[0]))
 
     def _report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
         return {**self._run.report(levels, complete), "times": self._records}
@@ -417,8 +486,7 @@ class _Steps:
         """Write what a run goes on from, and the tables; collective."""
         run, last = self._run, self._last
         with naming("--out"):
-            fields = [each.u for each in last]
-            self._restart = Restart.of_steps(fields, run.case.levels, self._restart)
+            self._restart = Restart.of_steps(last, self._restart, run.case.mode == "adaptive")
             series.write_steps(
                 run.folder, self._report([]), last[0], self._restart, self._said, self._moments
             )
@@ -437,6 +505,7 @@ class _Steps:
             screen.text(sentence)
         head, *figures = tables.certified(finest, units)
         screen.items(f"the last step's own problem, {head}", *figures)
+        _tell_of_tolerance(run.case, self._bound, screen)
         screen.text(series.times(records))
         screen.text(
             f"written to {run.folder}: {names}, times.csv, series.pvd and its fields,"

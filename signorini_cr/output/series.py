@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 TABLE, SERIES, FIELDS = "times.csv", "series.pvd", "step_*.vtu"
 COLUMNS: tuple[Column, ...] = (
     ("step", 5, lambda r: str(r["step"])),
-    ("time", 10, lambda r: f"{r['time']:.5g}"),
+    ("time", 10, lambda r: r["told"]),
     ("newton", 6, lambda r: str(r["newton_iterations"])),
     ("cg", 4, lambda r: str(r["linear_iterations"])),
     ("active", 6, lambda r: str(r["active"])),
@@ -39,6 +39,14 @@ COLUMNS: tuple[Column, ...] = (
     ("bound", 9, lambda r: "none" if r["bound_h1"] is None else at_most(r["bound_h1"])),
 )
 """The printed table."""
+
+MESHES: tuple[Column, ...] = (
+    ("level", 5, lambda r: str(r["level"])),
+    ("cells", 8, lambda r: str(r["cells"])),
+    ("dofs", 8, lambda r: str(r["dofs"])),
+    ("bound", 9, lambda r: at_most(r["bound_h1"])),
+)
+"""What is printed of the meshes that an adaptive run in time tries."""
 
 MEASURED = {"time": "time", "contact": "x", "force": "force"}
 """The columns whose unit may be told."""
@@ -85,14 +93,43 @@ def header() -> str:
     return " ".join(f"{name:>{width}}" for name, width, _ in COLUMNS)
 
 
-def row(record: Mapping[str, Any]) -> str:
-    """A row of the printed table."""
-    return " ".join(f"{cell(record):>{width}}" for _, width, cell in COLUMNS)
+def row(record: Mapping[str, Any], first: Mapping[str, Any]) -> str:
+    """A row of the printed table, whose times have the digits of the first step's."""
+    told = _told(record, first)
+    return " ".join(f"{cell(told):>{width}}" for _, width, cell in COLUMNS)
+
+
+def _told(record: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]:
+    """A record, and its time in digits that suit the whole table."""
+    usual = f"{first['time']:.5g}"
+    _, _, decimals = usual.partition(".")
+    told = f"{record['time']:.{len(decimals)}f}"
+    if "e" in usual or len(told) > 10:
+        told = f"{record['time']:.5g}"
+    return {**record, "told": told}
+
+
+def mesh_header() -> str:
+    """The head of what is told of meshes that are tried."""
+    return " ".join(f"{name:>{width}}" for name, width, _ in MESHES)
+
+
+def mesh_row(last: Solution, bound: float) -> str:
+    """What is told of a mesh that was tried; collective.
+
+    Args:
+        last: Of the last step on it.
+        bound: The largest of all steps.
+    """
+    topology = last.domain.mesh.topology
+    cells = topology.index_map(topology.dim).size_global
+    known = {"level": last.level.number, "cells": cells, "dofs": last.dofs, "bound_h1": bound}
+    return " ".join(f"{cell(known):>{width}}" for _, width, cell in MESHES)
 
 
 def table_rows(records: Sequence[Mapping[str, Any]], units: Units) -> list[list[str]]:
     """The cells of the printed table, its head first, which has the units."""
-    return rows_of(COLUMNS, records, MEASURED, units)
+    return rows_of(COLUMNS, [_told(record, records[0]) for record in records], MEASURED, units)
 
 
 def legend(units: Units) -> str:

@@ -3,6 +3,7 @@
 import csv
 import functools
 import json
+import math
 import re
 import xml.etree.ElementTree as ET
 from itertools import pairwise
@@ -66,12 +67,15 @@ def undrawn(monkeypatch):
 
 
 def in_scheme(scheme):
+    """The case by the name of its scheme; "adaptive" is bdf2 on a mesh that is adapted to it."""
+    if scheme == "adaptive":
+        return in_scheme("bdf2") + '[refine]\nmode = "adaptive"\nmax_dofs = 300\n'
     return CASE.replace("steps = 6", f'steps = 6\nscheme = "{scheme}"')
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Gives what a run that nothing ends leaves behind, made once for a scheme."""
+    """Gives what a run that nothing ends leaves behind, made once for a scheme; one is drawn."""
     folder = COMM.bcast(tmp_path_factory.mktemp("whole"), root=0)
 
     @functools.cache
@@ -80,7 +84,10 @@ def whole(tmp_path_factory):
         if COMM.rank == 0:
             path.parent.mkdir()
             path.write_text(in_scheme(scheme), encoding="utf-8")
-        assert solved(path, path.parent / "out") == 0
+        with pytest.MonkeyPatch.context() as patch:
+            if scheme != "bdf2":
+                patch.setattr(plots, "can_draw", lambda comm: False)
+            assert solved(path, path.parent / "out") == 0
         return path.parent / "out"
 
     return made
@@ -197,7 +204,6 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         ),
         ("[data]", '[data]\nreaction = "x - t"', "it must not be below 0, at the time 0.25"),
         ("wave =", "t = 1\nwave =", "define.t: t is the time"),
-        ("[time]", '[refine]\nmode = "adaptive"\n[time]', "refine.mode: a problem in time needs"),
         ("[time]", '[exact]\nu = "x"\n[time]', "exact.u: a problem in time has none"),
     ],
 )
@@ -247,7 +253,7 @@ def assert_same(one, other):
     assert (one["complete"], one["title"]) == (other["complete"], other["title"])
 
 
-@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+@pytest.mark.parametrize("scheme", ["euler", "bdf2", "adaptive"])
 @pytest.mark.parametrize("after", [1, 2, 4])
 def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
     scheme, after, case, whole, shared_tmp_path, monkeypatch, capfd
@@ -261,15 +267,20 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
     if not draws:
         monkeypatch.setattr(plots, "can_draw", lambda comm: False)
     with monkeypatch.context() as patch:
-        original = evolution.Solver.solve
-        calls = []
+        original, begin = evolution.Solver.solve, runs._Steps._solve_on
+        left = [math.inf]  # until the mesh is found
 
         def solve(self, *arguments):
-            calls.append(1)
-            if len(calls) > after:
+            left[0] -= 1
+            if left[0] < 0:
                 raise NotConverged("so it was told")
             return original(self, *arguments)
 
+        def solve_on(self, meshes):
+            left[0] = after
+            begin(self, meshes)
+
+        patch.setattr(runs._Steps, "_solve_on", solve_on)
         patch.setattr(evolution.Solver, "solve", solve)
         assert solved(path, out) == 3
     if COMM.rank == 0:
@@ -291,23 +302,29 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("first, then", [(1, 2), (2, 1)])
-def test_on_another_number_of_ranks(first, then, case, whole, shared_tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "first, then, scheme", [(1, 2, "bdf2"), (2, 1, "bdf2"), (2, 1, "adaptive")]
+)
+def test_on_another_number_of_ranks(first, then, scheme, case, whole, shared_tmp_path, monkeypatch):
     """Three of six steps are done, with two steps behind each as bdf2 has them."""
-    text, whole, out = in_scheme("bdf2"), whole("bdf2"), shared_tmp_path / "out"
+    text, whole, out = in_scheme(scheme), whole(scheme), shared_tmp_path / "out"
     (shared_tmp_path / "run.py").write_text(
         "import sys\n"
         "from signorini_cr import evolution\n"
-        "from signorini_cr.app import cli\n"
+        "from signorini_cr.app import cli, runs\n"
         "from signorini_cr.errors import NotConverged\n"
         "from signorini_cr.output import plots\n"
         "plots.can_draw = lambda comm: False\n"
-        "def stop(self, *arguments, calls=[], solve=evolution.Solver.solve):\n"
-        "    calls.append(1)\n"
-        "    if len(calls) > 3 and '--resume' not in sys.argv:\n"
+        "found = []\n"
+        "def solve_on(self, meshes, begin=runs._Steps._solve_on):\n"
+        "    found.append(0)\n"
+        "    begin(self, meshes)\n"
+        "def stop(self, *arguments, solve=evolution.Solver.solve):\n"
+        "    found[:] = [each + 1 for each in found]\n"
+        "    if max(found, default=0) > 3 and '--resume' not in sys.argv:\n"
         "        raise NotConverged('told')\n"
         "    return solve(self, *arguments)\n"
-        "evolution.Solver.solve = stop\n"
+        "runs._Steps._solve_on, evolution.Solver.solve = solve_on, stop\n"
         "sys.exit(cli.main())\n"
     )
     words = ["solve", case(text), "--out", out, "-q"]
@@ -372,6 +389,90 @@ def test_a_mesh_that_memory_does_not_hold_is_refused_before_the_first_step(
     if COMM.rank == 0:
         error = " ".join(capfd.readouterr().err.split())
         assert "time step 1: level 2: its" in error and "degrees of freedom would take" in error
+        assert not out.exists()
+
+
+LIMITED = CASE + '[refine]\nmode = "adaptive"\n'
+
+
+def test_a_mesh_adapted_to_all_steps(case, undrawn, shared_tmp_path, capfd):
+    """The last mesh that was tried is the one that is solved on, and its bound what was found."""
+    out = shared_tmp_path / "out"
+    path = case(LIMITED + "max_dofs = 300\n[units]\n")
+    assert main(["solve", str(path), "--out", str(out)]) == 0
+    report = report_in(out)
+    if COMM.rank == 0:
+        told = capfd.readouterr().out
+        tried = re.search(r"level +cells +dofs +bound\n((?: +[\d.]+)+\n)+\n", told)
+        level, cells, dofs, bound = tried[0].split("\n")[-3].split()
+        (finest,) = report["levels"]
+        assert (int(cells), int(dofs)) == (finest["cells"], finest["dofs"])
+        assert int(level) == finest["level"] > 1 and int(dofs) <= 300
+        assert f"above {bound}\n" in told
+        largest = max(step["bound_h1"] for step in report["times"])
+        assert float(bound) == pytest.approx(largest, rel=0.01)
+        assert len(report["times"]) == 6 and report["complete"]
+
+
+@pytest.mark.parametrize(
+    ("limits", "status", "said"),
+    [
+        ("tolerance = 1.0\n", 0, "the bound has reached the tolerance of 1: no further mesh"),
+        ("tolerance = 0.1\nlevels = 3\n", 3, "the tolerance of 0.1, and levels = 3 allows no"),
+        ("tolerance = 0.1\nmax_dofs = 150\n", 3, "and max_dofs = 150 allows no further mesh"),
+        ("levels = 1\n", 0, "in no step is"),
+    ],
+)
+def test_where_the_search_for_a_mesh_ends(
+    limits, status, said, case, undrawn, shared_tmp_path, capfd
+):
+    out = shared_tmp_path / "out"
+    assert main(["solve", str(case(LIMITED + limits)), "--out", str(out)]) == status
+    if COMM.rank == 0:
+        assert said in " ".join("".join(capfd.readouterr()).split())
+    report = report_in(out)
+    bound = max(step["bound_h1"] for step in report["times"])
+    assert len(report["times"]) == 6 and report["complete"] == (status == 0)
+    if "tolerance" in limits:
+        assert (bound <= float(limits.split()[2])) == (status == 0)
+    for changed in ("fraction = 0.4\n", "max_dofs = 200\n"):
+        text = LIMITED + re.sub(rf"{changed.split()[0]}.*\n", "", limits) + changed
+        assert solved(case(text), out, "--resume") == 2
+
+
+def test_a_mesh_that_does_not_fit_leaves_the_one_below(
+    case, undrawn, shared_tmp_path, monkeypatch, capfd
+):
+    def full(self, solution, dofs):
+        if solution.level.number == 1:
+            raise NotConverged("too large", 2)
+
+    monkeypatch.setattr(limits.Limits, "admit", full)
+    out = shared_tmp_path / "out"
+    assert solved(case(LIMITED), out) == 3
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        assert "no finer mesh: level 2: too large steps 1 to 6 are finished and kept in" in error
+    report = report_in(out)
+    assert (report["levels"][0]["level"], report["complete"]) == (1, False)
+
+
+def test_no_mesh_at_all(case, shared_tmp_path, monkeypatch, capfd):
+    """The first run does not get to its end."""
+    original, calls = evolution.Solver.solve, []
+
+    def solve(self, *arguments):
+        calls.append(1)
+        if len(calls) > 3:
+            raise NotConverged("so it was told", 0)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(evolution.Solver, "solve", solve)
+    out = shared_tmp_path / "out"
+    assert solved(case(LIMITED), out) == 3
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        assert "level 0: so it was told" in error and "nothing was written" in error
         assert not out.exists()
 
 

@@ -64,8 +64,8 @@ def test_what_is_not_known_is_not_told(value, within, text):
 def test_the_table_of_steps_tells_bounds():
     record = {"step": 1, "time": 0.5, "newton_iterations": 1, "linear_iterations": 2, "active": 0,
               "length": 0.0, "force": 0.0, "energy": -1.0, "bound_h1": 0.12345}  # fmt: skip
-    assert series.row(record).split()[-1] == "0.124"
-    assert series.row(record | {"bound_h1": None}).split()[-1] == "none"
+    assert series.row(record, record).split()[-1] == "0.124"
+    assert series.row(record | {"bound_h1": None}, record).split()[-1] == "none"
 
 
 def test_nothing_certain_is_formatted_otherwise():
