@@ -28,8 +28,9 @@ from ..output.checkpoint import NAME as RESTART
 from ..output.checkpoint import read_checkpoint
 from ..output.files import write_files, write_text
 from ..output.page import run_page
+from ..output.units import GLUE
 from ..restart import Restart
-from ..rounding import at_most
+from ..rounding import at_most, known
 from ..solution import Solution
 from . import problemfile
 from .problemfile import ProblemFile
@@ -198,6 +199,14 @@ class _Run:
                 names.append(self._write_page(report))
         return ", ".join(names)
 
+    def tell_the_end(self, names: str) -> None:
+        """Say which files there are, and how long it all has taken."""
+        seconds = known(time.perf_counter() - self.args.began, None, 2)
+        self.screen.text(
+            f"written to {self.folder}: {names}, and {RESTART} for --resume;"
+            f" {seconds}{GLUE}s with start, pictures and files"
+        )
+
     def _write_page(self, report: output.Record) -> str:
         """The run as one page; collective."""
 
@@ -286,7 +295,7 @@ def _conclude(run: _Run, names: str) -> None:
     screen.items(*tables.certified(records[-1], units))
     _tell_of_tolerance(run.case, records[-1]["bound_h1"], screen)
     screen.text(tables.times(records))
-    screen.text(f"written to {run.folder}: {names}, and {RESTART} for --resume")
+    run.tell_the_end(names)
 
 
 def _out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None:
@@ -507,7 +516,4 @@ class _Steps:
         screen.items(f"the last step's own problem, {head}", *figures)
         _tell_of_tolerance(run.case, self._bound, screen)
         screen.text(series.times(records))
-        screen.text(
-            f"written to {run.folder}: {names}, times.csv, series.pvd and its fields,"
-            f" and {RESTART} for --resume"
-        )
+        run.tell_the_end(f"{names}, times.csv, series.pvd and its fields")
