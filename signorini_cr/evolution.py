@@ -70,49 +70,41 @@ class Solver:
     Between solves dolfinx Constants, and Functions of degree 0, in the data may get other values,
     and there may be a source of its own. What they change is assembled anew and nothing else: the
     matrix and multigrid only where a_h holds one of them, in κ, c or b.
+
+    Attributes:
+        refined: The meshes above the coarsest, and where the parents of their cells are.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        domain: Domain,
-        levels: int | Sequence[Refined] = 1,
-        like: Solver | None = None,
-    ):
+    def __init__(self, problem: Problem, domain: Domain, levels: int | Sequence[Refined] = 1):
         """Assemble the matrix, and set up multigrid; collective.
 
         Args:
             problem: The data.
             domain: The coarsest mesh of multigrid, and its boundary parts.
             levels: How many meshes there are, each with four triangles for one of the mesh below;
-                or those above the coarsest, as `adapt_to_run` finds them. Solved is on the last.
-            like: A solver for another problem on the same domain, whose meshes are taken.
+                or those above the coarsest, as `adapt_to_run` finds them, or another solver has
+                them in `refined`. Solved is on the last.
 
         Raises:
             InputError: As for `solve_levels`.
         """
         check_arguments(problem, domain)
-        number = levels if isinstance(levels, int) else 1 + len(levels)
-        if number < 1:
+        known, more = ([*levels], 0) if isinstance(levels, Sequence) else ([], levels - 1)
+        if more < 0:
             raise InputError(f"levels is {levels}; it must be 1 or more")
-        if number > 1:
+        if more > 0:
             check_refinable(domain.mesh)
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
         self.physics, self._domain = physics, domain
-        self._refined: list[Refined] = [] if isinstance(levels, int) else [*levels]
         physics.check(domain)
-        if like is not None:
-            self._refined = like._refined
-        while len(self._refined) + 1 < number:
-            above = self._refined[-1][0] if self._refined else domain
-            self._refined.append((*refine(above), None))
+        self.refined = [*known, *_uniform(domain, more)]
         self._stack, self._solved = ExitStack(), 0
         self._set_up()
 
     def _set_up(self) -> None:
         """Assemble the matrix with the data as they are, and set up multigrid; collective."""
         self._hierarchy = Hierarchy(self.physics, self._domain)
-        for refined in self._refined:
+        for refined in self.refined:
             self._hierarchy.add(*refined)
         self._carry_down()
         self._level = Level(self._hierarchy.meshes)
@@ -129,7 +121,7 @@ class Solver:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
         for function in self.physics.functions:
             values = function.x.array[function.function_space.dofmap.list[:, 0]]
-            for fine, *_ in self._refined:
+            for fine, *_ in self.refined:
                 values, own = fine.descent[-1].carry(values), fine.own(function)
                 own.x.array[own.function_space.dofmap.list[: len(values), 0]] = values
 
@@ -217,6 +209,14 @@ class Solver:
         return found
 
 
+def _uniform(domain: Domain, number: int) -> Iterator[Refined]:
+    """So many meshes, each with four triangles for one of that below; collective."""
+    for _ in range(number):
+        refined: Refined = (*refine(domain), None)
+        yield refined
+        domain = refined[0]
+
+
 def solve_in_time(
     problem: Problem,
     domain: Domain,
@@ -281,10 +281,10 @@ def solve_in_time(
     then: FloatArray = np.empty(0)
     before: FloatArray = then
     limits, comm = Limits(max_time), domain.mesh.comm
-    if isinstance(levels, int):
-        limits.begin(domain, "CR", restart, levels)
-    else:
+    if isinstance(levels, Sequence):
         limits.begin(levels[-1][0] if levels else domain, "CR", restart)
+    else:
+        limits.begin(domain, "CR", restart, levels)
     try:
         for step in range(max(done, 1), steps + 1):
             weights = SCHEMES[scheme].weights
@@ -293,7 +293,8 @@ def solve_in_time(
             if solver is None or needed != factor:
                 factor, former = needed, solver
                 added = {name: factor * each for name, each in {"": capacity, **own}.items()}
-                solver = Solver(_stepping(problem, reactions, added), domain, levels, former)
+                meshes = levels if former is None else former.refined
+                solver = Solver(_stepping(problem, reactions, added), domain, meshes)
                 rates = factor * solver.by_material(capacity, own)
                 if former is not None:
                     former.close()
