@@ -400,6 +400,7 @@ def on_meshes(problem, domain, end, steps, **others):
     )
 
 
+@pytest.mark.ranks
 def test_a_single_step_adapts_as_the_problem_with_a_reaction_does():
     """The same meshes and bounds: from u = 0 a step has c + capacity/Δt and no other load."""
     domain = CORNER.mesh(0.6)
@@ -463,6 +464,7 @@ def holder(corners, points):
     return least.argmax(axis=1)
 
 
+@pytest.mark.ranks
 def test_functions_follow_meshes_that_are_shared_out_anew():
     """What is given after all is set up comes down to the cells that it would have come to."""
     domain = CORNER.mesh(0.6)
