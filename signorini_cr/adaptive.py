@@ -6,7 +6,7 @@ fewest cells that hold a given part of it; their sides are halved.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,9 @@ from .solution import Solution
 ALIKE = 1e-6
 """Part by which indicators may differ that count as one: the solver leaves 1e-9 to 1e-7 of them,
 and where a problem is symmetric, cells are twins but for that."""
+
+RUNS = 3.0
+"""What a run in time, the one on the mesh that is found, and what that writes take, in runs."""
 
 RESOLUTION = 1e-11
 """Least diameter of a cell to be refined, in parts of the largest coordinate."""
@@ -106,21 +109,36 @@ class Shares(NamedTuple):
         return cls(certificate.bound_h1, certificate.indicators)
 
 
+class Tried(NamedTuple):
+    """A mesh on which all steps of a run in time have been solved.
+
+    Attributes:
+        meshes: Those above the coarsest, as ``levels`` of `solve_in_time` takes them; it is the
+            last of these, or the coarsest.
+        last: The solution of the last step.
+        bound: The largest of the bounds of the steps.
+    """
+
+    meshes: list[Refined]
+    last: Solution
+    bound: float
+
+
 def adapt_to_run(
-    run: Callable[[Sequence[Refined]], Iterator[tuple[float, Solution]]],
+    run: Callable[[Sequence[Refined]], Iterable[tuple[float, Solution]]],
     *,
     tolerance: float = 0.0,
     levels: int | None = None,
     max_dofs: int = 1_000_000,
     fraction: float = 0.5,
-    monitor: Callable[[Solution, float], None] | None = None,
     max_time: float | None = None,
-) -> list[Refined]:
-    """Find meshes that suit all steps of a run in time; collective.
+    meshes: Sequence[Refined] = (),
+) -> Iterator[Tried]:
+    """Find a mesh that suits all steps of a run in time, by runs on one after the other.
 
-    The run is made on one mesh after the other. Cells are marked by the sum of their shares over
-    all steps, each in the bound of its own problem; the mesh they lead to is that of the next run.
-    What the length of the steps does to u is in none of these bounds.
+    Cells are marked by the sum of their shares over all steps, each in the bound of its own
+    problem; the mesh they lead to is that of the next run. What the length of the steps does to u
+    is in none of these bounds.
 
     Args:
         run: Solves step by step, as `solve_in_time` does, on the last of some refined meshes.
@@ -128,31 +146,34 @@ def adapt_to_run(
         levels: The end: so many meshes, the coarsest included; None for any number.
         max_dofs: The end: the next mesh would have more degrees of freedom.
         fraction: Part of the sum that the marked cells hold, in (0, 1].
-        monitor: Called after each run with the solution of its last step, and the largest bound.
-        max_time: No run is begun that would end later than so many seconds from now.
+        max_time: No run is begun unless it and another one on the mesh that is found, with what
+            that writes, would end in so many seconds from now.
+        meshes: Where to begin, coarsest first; on none but the coarsest if left out.
 
-    Returns:
-        The refined meshes, as ``levels`` of `solve_in_time` takes them.
+    Yields:
+        What was tried, the mesh to stay on last.
 
     Raises:
-        InputError: As for `solve_adaptive`.
-        NotConverged: The same, or the run raised it.
+        InputError: As for `solve_adaptive`; or the run has no steps, or is on another mesh.
+        NotConverged: As for `solve_adaptive`, or the run raised it.
     """
-    step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction)
-    refined: list[Refined] = []
-    zero: FloatArray = np.zeros(1)
-    while levels is None or len(refined) + 1 < levels:
-        bound, indicators = 0.0, zero
-        for _, solution in run(refined):
-            shares = Shares.of(solution)
+    step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction, runs=RUNS)
+    refined, zero = [*meshes], np.zeros(1)
+    while True:
+        bound, last = 0.0, None
+        indicators: FloatArray = zero
+        for _, last in run(refined):
+            shares = Shares.of(last)
             bound, indicators = max(bound, shares.bound), indicators + shares.indicators
-        if monitor is not None:
-            monitor(solution, bound)
-        following = step(solution, Shares(bound, indicators))
+        if last is None:
+            raise InputError("the run has no steps")
+        if last.level.number != len(refined):
+            raise InputError("the run is to be on the meshes that it is given, as its levels")
+        yield Tried([*refined], last, bound)
+        following = step(last, Shares(bound, indicators))
         if following is None:
             break
         refined.append(following)
-    return refined
 
 
 def adaptively(
@@ -172,9 +193,14 @@ def adaptively(
 
 
 def _by_shares(
-    limits: Limits, tolerance: float, levels: int | None, max_dofs: int, fraction: float
+    limits: Limits,
+    tolerance: float,
+    levels: int | None,
+    max_dofs: int,
+    fraction: float,
+    runs: float = 1.0,
 ) -> Callable[[Solution, Shares], Refined | None]:
-    """The same, from what is said about where the error is."""
+    """The same, from what is said about where the error is; for ``runs`` see `Limits.admit`."""
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None and levels < 1:
@@ -196,7 +222,7 @@ def _by_shares(
         dofs = facets * solution.u.function_space.dofmap.index_map_bs
         if dofs > max_dofs:
             return None
-        limits.admit(solution, dofs)
+        limits.admit(solution, dofs, runs)
         return balance(fine, parent_cell)
 
     return step

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
-from numbers import Real
+from numbers import Integral, Real
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -30,7 +30,7 @@ from .diffusion import Diffusion
 from .errors import InputError
 from .fem.conditions import Data
 from .fem.problem import Problem, as_expression
-from .levels import Start, check_arguments, solve_level
+from .levels import LevelMonitor, Start, check_arguments, solve_level
 from .limits import Limits
 from .mesh.balance import Refined
 from .mesh.domain import Domain
@@ -89,9 +89,7 @@ class Solver:
             InputError: As for `solve_levels`.
         """
         check_arguments(problem, domain)
-        known, more = ([*levels], 0) if isinstance(levels, Sequence) else ([], levels - 1)
-        if more < 0:
-            raise InputError(f"levels is {levels}; it must be 1 or more")
+        known, more = _given(levels, domain)
         if more > 0:
             check_refinable(domain.mesh)
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
@@ -156,6 +154,7 @@ class Solver:
         source: fem.Function | None = None,
         before: Solution | fem.Function | None = None,
         rate: FloatArray | float = 1.0,
+        monitor: LevelMonitor | None = None,
     ) -> Solution:
         """Solve with the data as they are now; collective.
 
@@ -164,6 +163,7 @@ class Solver:
             before: What to start from, with its active set; from this solver or one like it.
             rate: What the source is multiplied by, one number or one for each owned cell, see
                 `by_material`.
+            monitor: Called after each step of the solver.
 
         Raises:
             InputError: As for `solve`.
@@ -181,7 +181,7 @@ class Solver:
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
         level = Level((*meshes[:-1], renewed), self._held, self._level.system)
         start = Start(known=before.u if isinstance(before, Solution) else before)
-        return solve_level(level, lambda _: nullcontext(self._cycle), start, None, {"mesh": 0.0})
+        return solve_level(level, lambda _: nullcontext(self._cycle), start, monitor, {"mesh": 0.0})
 
     def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
         """Numbers of materials on owned cells, shape (cells,), or () where all are the same."""
@@ -209,6 +209,22 @@ class Solver:
         return found
 
 
+def _given(levels: object, domain: Domain) -> tuple[list[Refined], int]:
+    """The meshes above the coarsest that are there, and how many are to be made."""
+    if isinstance(levels, Integral) and int(levels) >= 1:
+        return [], int(levels) - 1
+    if not isinstance(levels, Sequence) or not all(isinstance(each, tuple) for each in levels):
+        raise InputError(
+            f"levels is {levels!r}; it must be a number, 1 or more, or meshes from adapt_to_run"
+        )
+    above = domain
+    for fine, *_ in levels:
+        if not fine.descent or fine.descent[-1].mesh() is not above.mesh:
+            raise InputError("levels: meshes that were not refined from this domain, in this order")
+        above = fine
+    return [*levels], 0
+
+
 def _uniform(domain: Domain, number: int) -> Iterator[Refined]:
     """So many meshes, each with four triangles for one of that below; collective."""
     for _ in range(number):
@@ -228,6 +244,7 @@ def solve_in_time(
     capacity: float = 1.0,
     levels: int | Sequence[Refined] = 1,
     time: Clock | None = None,
+    monitor: LevelMonitor | None = None,
     max_time: float | None = None,
     restart: Restart | None = None,
     done: int = 0,
@@ -249,6 +266,7 @@ def solve_in_time(
         capacity: Above 0; materials may have their own.
         levels: The meshes, as for `Solver`; solved is on the last of them.
         time: That Constant; it is set to the time of each step.
+        monitor: Called after each step of the solver.
         max_time: No step is begun that would end later than so many seconds from now.
         restart: Where to go on, from `Restart.of_steps`: the first solution is the one it was taken
             from, once more.
@@ -281,10 +299,8 @@ def solve_in_time(
     then: FloatArray = np.empty(0)
     before: FloatArray = then
     limits, comm = Limits(max_time), domain.mesh.comm
-    if isinstance(levels, Sequence):
-        limits.begin(levels[-1][0] if levels else domain, "CR", restart)
-    else:
-        limits.begin(domain, "CR", restart, levels)
+    known, more = _given(levels, domain)
+    limits.begin(known[-1][0] if known else domain, "CR", restart, 1 + more)
     try:
         for step in range(max(done, 1), steps + 1):
             weights = SCHEMES[scheme].weights
@@ -308,7 +324,7 @@ def solve_in_time(
             t = end * step / steps
             if time is not None:
                 time.value = t
-            solution = solver.solve(source, start, rates)
+            solution = solver.solve(source, start, rates, monitor)
             before, then = then, solution.u.x.array
             start = fem.Function(solver.V)
             start.x.array[:] = 2.0 * then - before

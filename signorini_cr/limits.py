@@ -61,7 +61,7 @@ class Limits:
             number, dofs = len(restart.added), restart.u[0][1].size
         _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
 
-    def admit(self, solution: Solved, dofs: int) -> None:
+    def admit(self, solution: Solved, dofs: int, runs: float = 1.0) -> None:
         """Look, when a level is done, whether the next one fits; collective.
 
         Time and peak memory are taken to grow with the dofs as between the last two levels, time
@@ -70,6 +70,7 @@ class Limits:
         Args:
             solution: Of the level that is done.
             dofs: Of the next one.
+            runs: How many times as long as the next one all takes that is left.
 
         Raises:
             NotConverged: It does not; the message has the figures.
@@ -81,7 +82,7 @@ class Limits:
         before = self._before or last
         self._before, self._passed = last, passed
         more, grown = dofs - n, max(n - before.dofs, 1)
-        seconds = last.seconds + max(last.seconds - before.seconds, 0.0) * more / grown
+        seconds = runs * (last.seconds + max(last.seconds - before.seconds, 0.0) * more / grown)
         growth = BYTES * dofmap.index_map.size_local * dofmap.index_map_bs / n
         if grown >= TELLING:
             growth = max(growth, (last.peak - before.peak) / grown)

@@ -69,24 +69,33 @@ class Restart:
         return cls((*below.added, added), (here, below.u[0]))
 
     @classmethod
-    def of_steps(cls, last: Sequence[Solution], below: Restart | None, adaptive: bool) -> Restart:
+    def of_meshes(cls, solution: Solution) -> Restart:
+        """Take how the meshes of a solution were made, refined in parts, to rank 0; collective.
+
+        Returns:
+            Nothing but empty arrays on the other ranks; no function.
+        """
+        return cls(_added(solution.level.meshes, solution.domain.mesh.comm), ())
+
+    @classmethod
+    def of_steps(cls, last: Sequence[Solution], below: Restart | None = None) -> Restart:
         """Take what there is after a step in time to rank 0; collective.
 
         Args:
             last: Of this step and of those before it that the next ones need; on the same mesh.
-            below: The same for the step before, None at the first.
-            adaptive: Whether meshes were refined in parts.
+            below: The same for the step before, or `of_meshes`; None at the first, where every
+                triangle was cut into four.
 
         Returns:
             Nothing but empty arrays on the other ranks.
         """
-        V, comm, meshes = last[0].u.function_space, last[0].domain.mesh.comm, last[0].level.meshes
+        V, comm = last[0].u.function_space, last[0].domain.mesh.comm
         size = V.dofmap.index_map.size_local
-        at = _gathered(_places(V)[:size], comm) if below is None else below.u[0][0]
+        known = () if below is None else below.u
+        at = known[0][0] if known else _gathered(_places(V)[:size], comm)
         u = tuple((at, _gathered(_by_nodes(each.u), comm)) for each in last)
-        if below is not None:
-            return cls(below.added, u)
-        return cls(_added(meshes, comm) if adaptive else (None,) * (len(meshes) - 1), u)
+        uniform = (None,) * last[0].level.number
+        return cls(uniform if below is None else below.added, u)
 
     def meshes(self, domain: Domain) -> Iterator[Refined]:
         """Refine as it was done before; collective.

@@ -16,11 +16,13 @@ from signorini_cr import (
     Form,
     InputError,
     Neumann,
+    NotConverged,
     Polygon,
     Problem,
     Robin,
     Solver,
     adapt_to_run,
+    limits,
     solve,
     solve_adaptive,
     solve_in_time,
@@ -405,29 +407,25 @@ def test_a_single_step_adapts_as_the_problem_with_a_reaction_does():
     """The same meshes and bounds: from u = 0 a step has c + capacity/Δt and no other load."""
     domain = CORNER.mesh(0.6)
     problem = Problem(f=-4.0, reaction=0.5, conditions=waves(0.0).conditions)
-    told = []
-    meshes = adapt_to_run(
-        on_meshes(problem, domain, 0.25, 1, capacity=2.0),
-        max_dofs=900,
-        monitor=lambda last, bound: told.append((last.dofs, bound)),
-    )
+    run = on_meshes(problem, domain, 0.25, 1, capacity=2.0)
+    tried = list(adapt_to_run(run, max_dofs=900))
+    told = [(each.last.dofs, each.bound) for each in tried]
     still = solve_adaptive(replace(problem, reaction=8.5), domain, max_dofs=900)
     wanted = [(each.dofs, each.certificate.bound_h1) for each in still]
     assert [dofs for dofs, _ in told] == [dofs for dofs, _ in wanted]
     assert [each for _, each in told] == pytest.approx([each for _, each in wanted], rel=1e-6)
-    assert len(meshes) + 1 == len(told) > 4
+    assert [len(each.meshes) for each in tried] == list(range(len(wanted))) and len(wanted) > 4
+    first, *_ = adapt_to_run(run, max_dofs=900, meshes=tried[2].meshes)
+    assert (first.last.dofs, first.bound) == pytest.approx(told[2], rel=1e-9)
 
 
 def test_meshes_adapted_to_a_run_reach_the_best_order():
     """n^(−1/2) for n dofs, where uniform meshes have the corner's n^(−1/3)."""
     domain = CORNER.mesh(0.6)
     t = clock(domain)
-    problem, told = waves(t), []
-    adapt_to_run(
-        on_meshes(problem, domain, 1.0, 3, time=t),
-        max_dofs=3300,
-        monitor=lambda last, bound: told.append((last.dofs, bound)),
-    )
+    problem = waves(t)
+    tried = adapt_to_run(on_meshes(problem, domain, 1.0, 3, time=t), max_dofs=3300)
+    told = [(each.last.dofs, each.bound) for each in tried]
     uniform = []
     for levels in (2, 3, 4, 5):
         run = list(on_meshes(problem, domain, 1.0, 3, time=t)(levels))
@@ -469,7 +467,8 @@ def test_functions_follow_meshes_that_are_shared_out_anew():
     """What is given after all is set up comes down to the cells that it would have come to."""
     domain = CORNER.mesh(0.6)
     problem = Problem(f=-4.0, conditions=waves(0.0).conditions)
-    meshes = adapt_to_run(on_meshes(problem, domain, 0.01, 1), max_dofs=3000)
+    *_, tried = adapt_to_run(on_meshes(problem, domain, 0.01, 1), max_dofs=3000)
+    meshes = tried.meshes
     if WORLD.size > 1:
         assert any(exchange is not None for _, _, exchange in meshes)
     datum = by_cells(domain, 1.0)
@@ -493,4 +492,48 @@ def test_without_a_bound_no_mesh_is_adapted():
     form = Form(lambda u, v, dx, ds: ufl.inner(ufl.grad(u), ufl.grad(v)) * dx)
     problem = Problem(f=-4.0, conditions=WALLS | {"floor": Contact(-0.1)}, form=form)
     with pytest.raises(InputError, match="goes by the certified bound, and there is none"):
-        adapt_to_run(on_meshes(problem, domain, 1.0, 2), levels=2)
+        next(adapt_to_run(on_meshes(problem, domain, 1.0, 2), levels=2))
+
+
+def test_what_makes_no_sense_to_adapt_is_refused():
+    domain, other = CORNER.mesh(0.6), SQUARE.mesh(0.6)
+    problem = waves(0.4)
+    run = on_meshes(problem, domain, 1.0, 2)
+    *_, tried = adapt_to_run(run, levels=3)
+    for levels, said in (
+        ("3", "levels is '3'; it must be a number"),
+        (2.0, "levels is 2.0; it must be a number"),
+        (tried.meshes[::-1], "not refined from this domain, in this order"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Solver(problem, domain, levels)
+    with pytest.raises(InputError, match="not refined from this domain"):
+        next(solve_in_time(problem, other, end=1.0, steps=1, levels=tried.meshes))
+    with pytest.raises(InputError, match="the run has no steps"):
+        next(adapt_to_run(lambda meshes: []))
+    with pytest.raises(InputError, match="on the meshes that it is given"):
+        list(adapt_to_run(lambda meshes: run([])))
+
+
+def test_what_was_found_before_time_ran_out_is_there(monkeypatch):
+    """A run takes a second; a third one, and what is to follow it, would end after five."""
+    domain = CORNER.mesh(0.6)
+
+    class Clock:
+        now = 0.0
+
+        @classmethod
+        def perf_counter(cls):
+            return cls.now
+
+    monkeypatch.setattr(limits, "time", Clock)
+
+    def run(meshes):
+        yield from on_meshes(waves(0.4), domain, 1.0, 2)(meshes)
+        Clock.now += 1.0
+
+    found = []
+    with pytest.raises(NotConverged, match="would take about 3 s, and of --max-time there"):
+        for tried in adapt_to_run(run, max_time=4.5):
+            found.append(len(tried.meshes))
+    assert found == [0, 1]

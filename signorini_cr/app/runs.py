@@ -157,14 +157,18 @@ class _Run:
             said["domain.mesh, the file"] = hashlib.sha256(content).hexdigest()[:16]
         return said
 
-    def resumed(self, said: dict[str, Any]) -> Restart | None:
-        """Find where a run goes on, if it is to, and fill in what is kept of it; collective."""
+    def resumed(self, said: dict[str, Any]) -> tuple[Restart | None, dict[str, Any]]:
+        """Find where a run goes on, if it is to, and fill in what is kept of it; collective.
+
+        Returns:
+            From `read_checkpoint`; None and nothing where it begins.
+        """
         if not self.args.resume:
-            return None
+            return None, {}
         with naming("--resume"):
             found = read_checkpoint(self.folder, self.comm)
             if found is None:
-                return None
+                return None, {}
             restart, facts = found
             for key in sorted({*said, *facts["said"]}):
                 was, now = (each.get(key) for each in (facts["said"], said))
@@ -176,10 +180,10 @@ class _Run:
                         f"{self.folder} has results of another run: {key} was {was} and is {now}; "
                         "the same is needed, or another --out"
                     )
-        self.kept.extend(facts["times" if "times" in facts else "levels"])
+        self.kept.extend(facts["levels" if "levels" in facts else "times"])
         kind = _kind(self.kept[-1])
         self.screen.line(f"going on after {kind} {self.kept[-1][kind]}, kept in {self.folder}\n")
-        return restart
+        return restart, facts
 
     def report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
         """What report.json is made of; collective."""
@@ -225,7 +229,7 @@ class _Run:
 def _solve_levels(run: _Run) -> None:
     """Solve on one mesh after the other; collective."""
     said, kept, screen = run.said(), run.kept, run.screen
-    restart = run.resumed(said)
+    restart, _ = run.resumed(said)
     for record in kept:
         _tell(record, kept[0], screen)
     finest: Solution | None = None
@@ -357,7 +361,7 @@ def _above_tolerance(case: ProblemFile, bound: float, level: int) -> NotConverge
 
 
 class _Steps:
-    """A run in time.
+    """A run in time; an adaptive one seeks its mesh first.
 
     Args:
         run: Its problem and its folder.
@@ -369,15 +373,20 @@ class _Steps:
         assert case.time is not None
         self._number = case.time.steps
         self._back = len(SCHEMES[case.time.scheme].weights)  # so many steps are behind the next
-        self._said = {**run.said(), "refine.levels (or --levels)": case.levels}
+        levels = None if case.levels == problemfile.ENOUGH else case.levels
+        self._said = {**run.said(), "refine.levels (or --levels)": levels}
         if case.mode == "adaptive":  # the mesh depends on where the search for it ends, too
             self._said |= {f"refine.{key}": value for key, value in case.adaptive.items()}
-        self._restart = run.resumed(self._said)
+        self._restart, facts = run.resumed(self._said)
+        self._tried: list[output.Record] = facts.get("search", [])
         self._records: list[output.Record] = []
         self._moments: list[strip.Moment] = []
         self._last: list[Solution] = []
-        self._stopped: NotConverged | None = None  # on the way to the mesh
-        if self._restart is not None:
+        self._cut_short: NotConverged | None = None  # the search
+        self._done = len(facts.get("times", []))
+        if "levels" in facts:  # the search is to go on, whatever may have been solved by then
+            self._tried, self._done = facts["levels"], 0
+        if self._done:
             with naming("--resume"):
                 self._moments = series.read_moments(run.folder, run.comm)
 
@@ -388,81 +397,104 @@ class _Steps:
             NotConverged: After steps that are kept.
         """
         run, failure = self._run, None
-        meshes = self._meshes()
-        for record in run.kept:
+        meshes = run.case.levels if run.case.mode == "uniform" else self._meshes()
+        for record in run.kept[: self._done]:
             self._tell(record)
         try:
             self._solve_on(meshes)
         except NotConverged as error:
             failure = NotConverged(f"time step {len(self._records) + 1}: {error}")
         if self._last:
-            if len(run.kept) < len(self._records):
-                keep(self._write_steps, run.kept, self._records[len(run.kept) :])
-            failure = failure or self._stopped or self._above_tolerance()
-            self._conclude(complete=failure is None)
-        if failure is not None:
-            raise NotConverged(f"{failure}\n{what_is_kept(run.kept, run.folder)}")
+            self._keep()
+            bound = max(
+                math.inf if record["bound_h1"] is None else record["bound_h1"]
+                for record in self._records
+            )
+            if failure is None and self._cut_short is None:
+                failure = _above_tolerance(run.case, bound, self._last[0].level.number)
+            self._conclude(bound, complete=failure is None and self._cut_short is None)
+        reasons = [str(each) for each in (self._cut_short, failure) if each is not None]
+        if reasons:
+            raise NotConverged("\n".join([*reasons, what_is_kept(run.kept, run.folder)]))
 
-    def _meshes(self) -> int | Sequence[Refined]:
-        """The meshes to solve on; an adaptive run finds them first, as far as it gets; collective.
+    def _meshes(self) -> list[Refined]:
+        """Find the meshes to solve on, as far as it gets; collective.
 
         Raises:
-            NotConverged: It does not get beyond the coarsest.
+            NotConverged: It does not get beyond the first run.
         """
         run, case, screen = self._run, self._run.case, self._run.screen
-        if case.mode == "uniform":
-            return case.levels
-        if self._restart is not None:
-            return [*self._restart.meshes(run.domain)]
-        if case.levels > 1:
-            screen.text("the mesh is sought by runs through all steps, on one mesh after the other")
-            screen.line(series.mesh_header())
-        begun: list[Refined] = []
-        known: list[list[Refined]] = []
+        known = [] if self._restart is None else [*self._restart.meshes(run.domain)]
+        if self._done:
+            return known
+        screen.text("the mesh is sought by runs through all steps, on one mesh after the other")
+        screen.line(series.search_header())
+        for record in self._tried:
+            screen.line(series.search_row(record))
+        begun = len(known)
 
         def through(meshes: Sequence[Refined]) -> Iterator[tuple[float, Solution]]:
-            begun[:] = meshes
+            nonlocal begun
+            begun = len(meshes)
             steps = case.steps(run.domain, meshes, max_time=run.time_left)
             for number, found in enumerate(steps, 1):
-                screen.progress(f"level {len(meshes)}, step {number} of {self._number}")
+                screen.progress(f"level {begun}, step {number} of {self._number}")
                 yield found
 
-        def tell(last: Solution, bound: float) -> None:
-            known.append([*begun])
-            screen.line(series.mesh_row(last, bound))
-
         try:
-            meshes = adapt_to_run(
-                through, levels=case.levels, **case.adaptive, monitor=tell, max_time=run.time_left
-            )
+            for tried in adapt_to_run(
+                through,
+                levels=case.levels,
+                **case.adaptive,
+                max_time=run.time_left,
+                meshes=known,
+            ):
+                known = tried.meshes
+                if begun >= len(self._tried):  # else it is the one that it goes on from
+                    self._add(series.search_record(tried.last, tried.bound), tried.last)
         except NotConverged as error:
-            level = len(begun) if error.level is None else error.level
-            failure = NotConverged(f"no finer mesh: level {level}: {error.reason}")
-            if not known:
-                raise NotConverged(f"{failure}\n{what_is_kept([], run.folder)}") from None
-            self._stopped, meshes = failure, known[-1]
+            level = begun if error.level is None else error.level
+            failure = NotConverged(
+                f"the search for a mesh stopped on level {level}: {error.reason}"
+            )
+            if not self._tried:
+                words = what_is_kept(run.kept, run.folder)
+                raise NotConverged(f"{failure}\n{words}") from None
+            self._cut_short = failure
         screen.line("")
-        return meshes
+        return known
 
-    def _above_tolerance(self) -> NotConverged | None:
-        """Say what stopped the search for a mesh before the tolerance was reached."""
-        return _above_tolerance(self._run.case, self._bound, self._last[0].level.number)
+    def _add(self, record: output.Record, last: Solution) -> None:
+        """Keep a mesh that was tried, and tell of it; collective."""
+        run, tried = self._run, [*self._tried, record]
+        self._restart = restart = Restart.of_meshes(last)
+        report = {**run.report([]), "search": tried, "times": []}
 
-    @property
-    def _bound(self) -> float:
-        """The largest of all steps; infinite where one of them has none."""
-        bounds = [record["bound_h1"] for record in self._records]
-        return max(math.inf if bound is None else bound for bound in bounds)
+        def write() -> None:
+            with naming("--out"):
+                series.write_search(run.folder, report, restart, self._said, run.comm)
+
+        keep(write, run.kept, [record])
+        self._tried = tried
+        run.screen.line(series.search_row(record))
+        if len(tried) == SURE and (doubt := _out_of_reach(run.case, tried)) is not None:
+            run.screen.warn(f"{run.args.file}: {doubt}")
 
     def _solve_on(self, meshes: int | Sequence[Refined]) -> None:
         """Solve what is left, and keep what is worth it."""
-        run, done = self._run, len(self._run.kept)
+        run, done = self._run, self._done
         run.screen.progress(f"step {done + 1}")
+
+        def monitor(step: int, residual: float, active: int, linear: int) -> None:
+            facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}"
+            run.screen.line(f"  time step {len(self._records) + 1}  {facts}  cg {linear:4d}")
+
         steps = run.case.steps(
             run.domain,
             meshes,
+            monitor=(lambda _, *facts: monitor(*facts)) if run.screen.verbose else None,
             max_time=run.time_left,
-            restart=self._restart,
+            restart=self._restart if done else None,
             done=max(done, 1),
         )
         for moment, solution in steps:
@@ -476,7 +508,7 @@ class _Steps:
             if chosen:
                 self._moments.append(strip.moment(moment, solution))
             if chosen or series.is_kept(number):
-                keep(self._write_steps, run.kept, self._records[len(run.kept) :])
+                self._keep()
             else:
                 with naming("--out"):
                     series.write_step(run.folder, number, solution)
@@ -489,18 +521,32 @@ class _Steps:
         self._run.screen.line(series.row(record, self._records[0]))
 
     def _report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
-        return {**self._run.report(levels, complete), "times": self._records}
+        search = {"search": self._tried} if self._tried else {}
+        return {**self._run.report(levels, complete), **search, "times": self._records}
+
+    def _keep(self) -> None:
+        """Keep the steps that are not yet safe; collective."""
+        kept = self._run.kept
+        if self._done < len(self._records):
+            keep(self._write_steps, kept, self._records[self._done :])
+            self._done = len(self._records)
 
     def _write_steps(self) -> None:
         """Write what a run goes on from, and the tables; collective."""
         run, last = self._run, self._last
+        self._restart = Restart.of_steps(last, self._restart)
+        facts = {"said": self._said, "times": self._records}
+        if self._tried:
+            # where the search was cut short it goes on from there
+            facts["search" if self._cut_short is None else "levels"] = self._tried
         with naming("--out"):
-            self._restart = Restart.of_steps(last, self._restart, run.case.mode == "adaptive")
             series.write_steps(
-                run.folder, self._report([]), last[0], self._restart, self._said, self._moments
+                run.folder, self._report([]), last[0], self._restart, facts, self._moments
             )
+        if not self._done:  # meshes that were tried, so far
+            run.kept.clear()
 
-    def _conclude(self, complete: bool) -> None:
+    def _conclude(self, bound: float, complete: bool) -> None:
         """Write what comes at the end, and say what has come out; collective."""
         run, records, units = self._run, self._records, self._run.case.units
         finest = output.level_record(self._last[0]) | {"quantities": records[-1]["quantities"]}
@@ -514,6 +560,6 @@ class _Steps:
             screen.text(sentence)
         head, *figures = tables.certified(finest, units)
         screen.items(f"the last step's own problem, {head}", *figures)
-        _tell_of_tolerance(run.case, self._bound, screen)
+        _tell_of_tolerance(run.case, bound, screen)
         screen.text(series.times(records))
         run.tell_the_end(f"{names}, times.csv, series.pvd and its fields")

@@ -36,10 +36,9 @@ def write_checkpoint(path: Path, restart: Restart, facts: dict[str, Any], comm: 
         arrays: dict[str, Any] = {
             f"added{k}": at for k, at in enumerate(restart.added) if at is not None
         }
-        first = restart.u[0][0]
         for k, (at, values) in enumerate(restart.u):
             arrays[f"u{k}"] = values
-            if k == 0 or at is not first:
+            if at is not restart.u[0][0] or k == 0:
                 arrays[f"at{k}"] = at
         sizes = {"meshes": len(restart.added), "functions": len(restart.u)}
         arrays["facts"] = _letters({**sizes, "facts": facts})

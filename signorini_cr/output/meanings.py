@@ -83,7 +83,10 @@ REPORT = {
     "force_bounds.lower": "The contact force ∫_Γ1 λ of u itself is not below it.",
     "force_bounds.upper": "The contact force of u itself is not above it.",
     "force_bounds.reason": "Why the force has no bounds; null where it has.",
-    "levels": "The levels, coarsest first, with the figures below.",
+    "levels": "The levels, coarsest first, with the figures below; in time the one that is solved "
+    "on, as it is after the last step.",
+    "search": "Only of runs in time on an adapted mesh: the meshes that were tried, coarsest "
+    "first, each with level, cells, dofs and, as bound_h1, the largest bound of all steps.",
 }
 """The keys of report.json, those of an object behind a dot."""
 

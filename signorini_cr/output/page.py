@@ -91,6 +91,7 @@ def run_page(
             for name, what in PICTURES.items()
             if (folder / name).exists()
         ),
+        *_search(report.get("search", [])),
         *(_levels(report["levels"], units) if steps is None else _steps(steps, units)),
         "<h2>Problem file</h2>",
         f"<pre>{escape(source)}</pre>",
@@ -121,6 +122,14 @@ def _levels(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
         _paragraph(tables.legend(records[0], units)),
         _paragraph(tables.times(records)),
     ]
+
+
+def _search(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The meshes that were tried."""
+    if not records:
+        return []
+    words = "Meshes on which all steps were solved, to find the last: bound is the largest of all."
+    return ["<h2>Search for the mesh</h2>", _table(series.search_rows(records)), _paragraph(words)]
 
 
 def _steps(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:

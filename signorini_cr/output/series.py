@@ -18,7 +18,7 @@ from .meanings import OF_STEPS
 from .report import FILES, bounded, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
 from .tables import Column, explained, levels_csv, rows_of, unit_of
-from .units import GLUE, Units
+from .units import GLUE, PLAIN, Units
 from .vtu import write_solution
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ COLUMNS: tuple[Column, ...] = (
 )
 """The printed table."""
 
-MESHES: tuple[Column, ...] = (
+SEARCH: tuple[Column, ...] = (
     ("level", 5, lambda r: str(r["level"])),
     ("cells", 8, lambda r: str(r["cells"])),
     ("dofs", 8, lambda r: str(r["dofs"])),
@@ -109,22 +109,31 @@ def _told(record: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]
     return {**record, "told": told}
 
 
-def mesh_header() -> str:
+def search_header() -> str:
     """The head of what is told of meshes that are tried."""
-    return " ".join(f"{name:>{width}}" for name, width, _ in MESHES)
+    return " ".join(f"{name:>{width}}" for name, width, _ in SEARCH)
 
 
-def mesh_row(last: Solution, bound: float) -> str:
-    """What is told of a mesh that was tried; collective.
+def search_row(record: Mapping[str, Any]) -> str:
+    """What is told of a mesh that was tried; the record is from `search_record`."""
+    return " ".join(f"{cell(record):>{width}}" for _, width, cell in SEARCH)
+
+
+def search_rows(records: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """The cells of these rows, their head first."""
+    return rows_of(SEARCH, records, {}, PLAIN)
+
+
+def search_record(last: Solution, bound: float) -> dict[str, Any]:
+    """What is known of a mesh on which all steps were solved; collective.
 
     Args:
-        last: Of the last step on it.
+        last: Of the last step.
         bound: The largest of all steps.
     """
     topology = last.domain.mesh.topology
     cells = topology.index_map(topology.dim).size_global
-    known = {"level": last.level.number, "cells": cells, "dofs": last.dofs, "bound_h1": bound}
-    return " ".join(f"{cell(known):>{width}}" for _, width, cell in MESHES)
+    return {"level": last.level.number, "cells": cells, "dofs": last.dofs, "bound_h1": bound}
 
 
 def table_rows(records: Sequence[Mapping[str, Any]], units: Units) -> list[list[str]]:
@@ -160,8 +169,8 @@ def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
         lower, upper = min(each["lower"] for each in found), max(each["upper"] for each in found)
         ends = interval(lower, upper).replace(" ", GLUE)
         said.append(
-            f"certified: over all steps {name} stays within {ends}{unit_of(last, units)};"
-            f" the interval of each step's own problem is in {TABLE}"
+            f"certified: in each step's own problem, in which the steps before are data, {name} is"
+            f" in {ends}{unit_of(last, units)}; its interval in each step is in {TABLE}"
         )
     return said
 
@@ -196,12 +205,48 @@ def write_step(folder: str | os.PathLike[str], step: int, solution: Solution) ->
     write_files(folder, {_field(step): lambda path: write_solution(solution, path)}, comm=comm)
 
 
+def write_search(
+    folder: str | os.PathLike[str],
+    report: Mapping[str, Any],
+    restart: Restart,
+    said: Mapping[str, Any],
+    comm: MPI.Comm,
+) -> None:
+    """Write how far the search for a mesh has come, for a run that is resumed; collective.
+
+    With the first mesh what a former run has left goes.
+
+    Args:
+        folder: Made if it is not there.
+        report: From `make_report`, with records from `search_record` as ``search``.
+        restart: `Restart.of_meshes` of the last one.
+        said: What the run was told to solve; nothing but what JSON knows.
+        comm: The ranks.
+
+    Raises:
+        InputError: The folder can't be written to.
+    """
+    facts = {"said": said, "levels": report["search"]}
+    removed = _of_former_runs(folder, comm) if len(report["search"]) == 1 else set()
+    writers: dict[str, Writer] = {
+        "report.json": lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
+        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
+    }
+    write_files(folder, writers, removed=removed, comm=comm)
+
+
+def _of_former_runs(folder: str | os.PathLike[str], comm: MPI.Comm) -> set[str]:
+    """Names of what runs leave, in time or not; collective."""
+    found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
+    return {*FILES, *found}
+
+
 def write_steps(
     folder: str | os.PathLike[str],
     report: Mapping[str, Any],
     solution: Solution,
     restart: Restart,
-    said: Mapping[str, Any],
+    facts: Mapping[str, Any],
     moments: Sequence[Moment],
 ) -> None:
     """Write the last step's field, and all that tells of the steps so far; collective.
@@ -214,18 +259,14 @@ def write_steps(
         report: From `make_report`, with records from `step_record` as ``times``.
         solution: The last step's.
         restart: From there.
-        said: What the run was told to solve; nothing but what JSON knows.
+        facts: What else a run that is resumed is to know; nothing but what JSON knows.
         moments: So far, for the strip.
 
     Raises:
         InputError: The folder can't be written to.
     """
     comm, records = solution.domain.mesh.comm, report["times"]
-    removed: set[str] = set()
-    if len(records) == 1:
-        found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
-        removed = {*FILES, *found}
-    facts = {"said": said, "times": records}
+    removed = _of_former_runs(folder, comm) if len(records) == 1 else set()
 
     def text(make: Callable[[], str]) -> Writer:
         return lambda path: on_root(comm, write_text, path, make)
@@ -234,7 +275,7 @@ def write_steps(
         "report.json": text(lambda: report_json(report)),
         TABLE: text(lambda: levels_csv(records)),
         SERIES: text(lambda: _series(records)),
-        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
+        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, {**facts}, comm),
         _field(len(records)): lambda path: write_solution(solution, path),
     }
     if moments and moments[-1].time == records[-1]["time"]:

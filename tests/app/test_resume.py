@@ -277,10 +277,10 @@ def test_a_level_that_would_end_too_late_is_not_begun(mode: str, case, monkeypat
     monkeypatch.setattr(limits, "time", Clock)
     admit = limits.Limits.admit
 
-    def after(self, solution, dofs) -> None:
+    def after(self, solution, dofs, *others) -> None:
         nonlocal now
         now += solution.dofs
-        admit(self, solution, dofs)
+        admit(self, solution, dofs, *others)
 
     monkeypatch.setattr(limits.Limits, "admit", after)
     case(mode)

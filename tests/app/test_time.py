@@ -4,7 +4,10 @@ import csv
 import functools
 import json
 import math
+import os
 import re
+import shutil
+import signal
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 
@@ -15,7 +18,7 @@ from helpers import is_picture
 from mpi4py import MPI
 
 from signorini_cr import evolution, limits, memory
-from signorini_cr.app import runs
+from signorini_cr.app import cli, runs
 from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
@@ -176,7 +179,8 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
             pick(record["quantities"][name][end] for record in report["times"])
             for pick, end in ((min, "lower"), (max, "upper"))
         ]
-        told = re.search(rf"certified: over all steps {name} stays within \[(.*?), (.*?)\]", flat)
+        certain = "certified: in each step's own problem, in which the steps before are data,"
+        told = re.search(rf"{certain} {name} is in \[(.*?), (.*?)\]", flat)
         low, high = (float(text.replace("−", "-")) for text in told.groups())
         assert low <= ends[0] and ends[1] <= high
         assert (low, high) == pytest.approx(ends, rel=0.1, abs=0.1)
@@ -411,6 +415,8 @@ def test_a_mesh_adapted_to_all_steps(case, undrawn, shared_tmp_path, capfd):
         assert f"above {bound}\n" in told
         largest = max(step["bound_h1"] for step in report["times"])
         assert float(bound) == pytest.approx(largest, rel=0.01)
+        assert report["search"][-1]["bound_h1"] == pytest.approx(largest, rel=1e-6)
+        assert [each["level"] for each in report["search"]] == list(range(int(level) + 1))
         assert len(report["times"]) == 6 and report["complete"]
 
 
@@ -443,7 +449,7 @@ def test_where_the_search_for_a_mesh_ends(
 def test_a_mesh_that_does_not_fit_leaves_the_one_below(
     case, undrawn, shared_tmp_path, monkeypatch, capfd
 ):
-    def full(self, solution, dofs):
+    def full(self, solution, dofs, runs):
         if solution.level.number == 1:
             raise NotConverged("too large", 2)
 
@@ -452,9 +458,65 @@ def test_a_mesh_that_does_not_fit_leaves_the_one_below(
     assert solved(case(LIMITED), out) == 3
     if COMM.rank == 0:
         error = " ".join(capfd.readouterr().err.split())
-        assert "no finer mesh: level 2: too large steps 1 to 6 are finished and kept in" in error
+        stopped = "the search for a mesh stopped on level 2: too large"
+        assert f"{stopped} steps 1 to 6 are finished and kept in" in error
     report = report_in(out)
     assert (report["levels"][0]["level"], report["complete"]) == (1, False)
+    assert [each["level"] for each in report["search"]] == [0, 1]
+    assert solved(case(LIMITED), out, "--resume") == 3  # the reason is the same as before
+    assert not report_in(out)["complete"]
+    monkeypatch.undo()
+    monkeypatch.setattr(plots, "can_draw", lambda comm: False)
+    limited = LIMITED + "max_dofs = 300\n"
+    whole = shared_tmp_path / "whole"
+    assert solved(case(limited), whole) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(limits.Limits, "admit", full)
+        shutil.rmtree(out) if COMM.rank == 0 else None
+        assert solved(case(limited), out) == 3
+    assert solved(case(limited), out, "--resume") == 0
+    assert_same(out, whole)
+    assert report_in(out)["search"] == report_in(whole)["search"]
+
+
+@pytest.mark.serial
+def test_a_search_that_is_interrupted_goes_on(
+    case, undrawn, whole, shared_tmp_path, monkeypatch, capfd
+):
+    """On the third mesh; two have been tried, and that is kept."""
+    path, out = case(in_scheme("adaptive")), shared_tmp_path / "out"
+    progress = cli.Screen.progress
+
+    def interrupted(self, text):
+        progress(self, text)
+        if text.startswith("level 2, step 3"):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cli.Screen, "progress", interrupted)
+        assert solved(path, out) == 143
+    words = " ".join(capfd.readouterr().err.split())
+    assert words == f"signorini-cr: terminated; levels 0 to 1 are finished and kept in {out}"
+    assert {each.name for each in out.iterdir()} == {"report.json", "restart.npz"}
+    report = report_in(out)
+    assert (len(report["search"]), report["times"], report["complete"]) == (2, [], False)
+    assert main(["solve", str(path), "--out", str(out), "--resume"]) == 0
+    told = capfd.readouterr().out
+    assert f"going on after level 1, kept in {out}" in " ".join(told.split())
+    assert_same(out, whole("adaptive"))
+    assert report_in(out)["search"] == report_in(whole("adaptive"))["search"]
+
+
+def test_steps_of_the_solver_are_told(case, undrawn, shared_tmp_path, capsys):
+    out = shared_tmp_path / "out"
+    assert main(["solve", str(case()), "--out", str(out), "-v"]) == 0
+    if COMM.rank == 0:
+        told = capsys.readouterr().out
+        steps = re.findall(r"^  time step (\d+)  step +(\d+)  residual", told, re.MULTILINE)
+        newton = [step["newton_iterations"] for step in report_in(out)["times"]]
+        last = {int(time): int(step) for time, step in steps}
+        assert list(last) == [1, 2, 3, 4, 5, 6]
+        assert all(last[k + 1] >= n for k, n in enumerate(newton))
 
 
 def test_no_mesh_at_all(case, shared_tmp_path, monkeypatch, capfd):
