@@ -16,6 +16,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
+from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -665,3 +666,38 @@ def test_contact_that_does_not_press_holds_nothing():
     solution = solve(problem, polygon.mesh(0.3))
     solution.u.x.array[:] = 1.0
     assert "no contact whose force" in certify(solution).reason
+
+
+def test_forces_that_may_be_less_hold_less(monkeypatch):
+    """What contact may have to give up, a weak loss being a dear way out, does not keep u on α."""
+    walls = {side: Robin(coefficient=1e-9) for side in ("left", "right")}
+    problem = Problem(f=-2.0, conditions=walls | {"floor": Contact(0.0), "top": Contact(0.0)})
+    monkeypatch.setattr(module, "DEAR", -1.0)
+    carry, widths = module.carried_to_contact, []
+    for part in (0.0, 0.6):
+
+        def more(cells, flux, *rest, part=part):
+            norm, change = carry(cells, flux, *rest)
+            return norm, change + part / 2 * flux.contact  # for what is left and for what is missed
+
+        monkeypatch.setattr(module, "carried_to_contact", more)
+        solution = solve(problem, structured(SQUARE, 12, comm=WORLD))
+        _, low, high = solution.flux("floor")  # u is y² − y, nearly
+        assert solution.certificate._made.on_contact_alone
+        assert low <= 1.0 <= high
+        widths.append(high - low)
+    assert widths[1] > 1.2 * widths[0]
+
+
+@pytest.mark.parametrize("height", [0.0, 0.3])
+def test_obstacles_that_meet_or_cross(height):
+    """They meet in a corner, where rounding is not told from a step; or cross where none looks."""
+
+    def low(x):
+        return ufl.cos(x[0]) - 1.0 + height * ufl.exp(-1e6 * (x[0] - 0.011) ** 2)
+
+    conditions = {"floor": Contact(low, upper=lambda x: x[0] ** 2), "top": Dirichlet(0.0)}
+    problem = Problem(f=-1.0, conditions=conditions | {"left": Neumann(), "right": Neumann()})
+    certificate = solve(problem, structured(SQUARE, 3)).certificate
+    assert (certificate.bound_h1 is None) == (height > 0.0), certificate.reason
+    assert height == 0.0 or "nowhere above the upper bound" in certificate.reason
