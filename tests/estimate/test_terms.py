@@ -691,12 +691,15 @@ def test_forces_that_may_be_less_hold_less(monkeypatch):
 
 @pytest.mark.parametrize("height", [0.0, 0.3])
 def test_obstacles_that_meet_or_cross(height):
-    """They meet in a corner, where rounding is not told from a step; or cross where none looks."""
+    """They meet in a point, where rounding is allowed for; or cross where nothing looks."""
 
     def low(x):
-        return ufl.cos(x[0]) - 1.0 + height * ufl.exp(-1e6 * (x[0] - 0.011) ** 2)
+        return height * ufl.exp(-1e6 * (x[0] - 0.511) ** 2)
 
-    conditions = {"floor": Contact(low, upper=lambda x: x[0] ** 2), "top": Dirichlet(0.0)}
+    def high(x):  # (x − 0.37)²
+        return x[0] ** 2 - 0.74 * x[0] + 0.1369
+
+    conditions = {"floor": Contact(low, upper=high), "top": Dirichlet(0.0)}
     problem = Problem(f=-1.0, conditions=conditions | {"left": Neumann(), "right": Neumann()})
     certificate = solve(problem, structured(SQUARE, 3)).certificate
     assert (certificate.bound_h1 is None) == (height > 0.0), certificate.reason
