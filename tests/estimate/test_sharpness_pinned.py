@@ -234,6 +234,8 @@ SMALL = {
         case(P, contact(b=1.0), robin(50.0), GIVEN, FREE, c=60.0, **QUICK), 2, 60,
         asked=("flux top",),
     ),
+    "thin, v is solved for around the foremost": Small(case(P, contact(), *BESIDE), 8, 400),
+    "thin, and everywhere": Small(case(P, contact(), *BESIDE), 4, 240),
     "thin, κ varies": Small(case(terms.Waving, contact(), *BESIDE, **BEATS), 3, 60),
 }  # fmt: skip
 
@@ -273,6 +275,8 @@ TODAY: dict[str, tuple[float, ...]] = {
     "adapted": (1.09106, 1.09106, 1.06032, 1.09463, 0.610848),
     "thin": (1.80369, 1.80369, 1.57657, 1.39097, 1.13794, 1.91815, 2.43787),
     "thin, c and b": (2.04656, 2.10606, 2.85551, 1.86654, 3.32727, 2.98386),
+    "thin, v is solved for around the foremost": (1.40637, 1.40637, 1.10927, 1.34233, 0.609971),
+    "thin, and everywhere": (1.50611, 1.50611, 1.26926, 1.3352, 0.683487),
     "thin, κ varies": (1.38482, 1.63656, 1.17602, 1.28406, 0.719045),
 }
 BOUNDS = 5
