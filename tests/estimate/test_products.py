@@ -1287,6 +1287,29 @@ def test_forces_take_up_what_a_flux_is_bettered_by(sign, some):
 
 
 @pytest.mark.serial
+def test_forces_that_would_pull_once_others_are_let_go():
+    """They are 0 as well, with nothing left to b: Γ1 all around, touched from either side."""
+    domain = square(2)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), ())
+    side, number = BoundaryFacets.joined(list(cells.sides.values()), 2), cells.number
+    edge = Known(side, np.zeros((2, 8)), np.full(8, 9.0), np.ones(8, dtype=bool))
+    touching, c, late = np.ones(8, dtype=bool), np.full(number, 3000.0), 0
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        excess, left = rng.normal(size=(3, number)), rng.normal(size=number)
+        before, signs = rng.uniform(0, 1, 8), rng.choice([-1.0, 1.0], 8)
+        y = flux.Flux(excess.copy(), before.copy(), touching, left.copy(), None)
+        flux.relax(cells, np.ones(number), y, c, edge, side, signs)
+        change = y.excess - excess
+        own = change[side.local, side.cells]
+        assert np.all(y.contact >= 0.0)
+        assert np.allclose(own, signs * (y.contact - before) - y.shed)
+        assert np.allclose(y.left, left + change.sum(axis=0))
+        late += np.sum((y.contact == 0.0) & (y.shed == 0.0))
+    assert late > 0
+
+
+@pytest.mark.serial
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("curved", [False, True])
 def test_how_far_v_is_off_its_bounds(sign, curved):

@@ -236,6 +236,7 @@ SMALL = {
     ),
     "thin, v is solved for around the foremost": Small(case(P, contact(), *BESIDE), 8, 400),
     "thin, and everywhere": Small(case(P, contact(), *BESIDE), 4, 240),
+    "thin, pressed": Small(case(P, contact(wave=PRESSED), *BESIDE, kappa=30.0), 4, 240),
     "thin, κ varies": Small(case(terms.Waving, contact(), *BESIDE, **BEATS), 3, 60),
 }  # fmt: skip
 
@@ -277,6 +278,7 @@ TODAY: dict[str, tuple[float, ...]] = {
     "thin, c and b": (2.04656, 2.10606, 2.85551, 1.86654, 3.32727, 2.98386),
     "thin, v is solved for around the foremost": (1.40637, 1.40637, 1.10927, 1.34233, 0.609971),
     "thin, and everywhere": (1.50611, 1.50611, 1.26926, 1.3352, 0.683487),
+    "thin, pressed": (1.19273, 1.19273, 0.893246, 1.22642, 0.372932),
     "thin, κ varies": (1.38482, 1.63656, 1.17602, 1.28406, 0.719045),
 }
 BOUNDS = 5

@@ -704,3 +704,15 @@ def test_obstacles_that_meet_or_cross(height):
     certificate = solve(problem, structured(SQUARE, 3)).certificate
     assert (certificate.bound_h1 is None) == (height > 0.0), certificate.reason
     assert height == 0.0 or "nowhere above the upper bound" in certificate.reason
+
+
+@pytest.mark.parametrize("of_g", [False, True])
+def test_what_is_missed_of_f_or_g_alone_is_kept_for_intervals(of_g):
+    """A wave of one of them, the other a number."""
+    wave = lambda x: ufl.exp(2.0 * x[0] - 3.0 * x[1])  # noqa: E731
+    solution = solve(Problem(f=1.0, g=wave) if of_g else Problem(f=wave, g=1.0), square(jitter=0.0))
+    missed = solution.certificate._made.missed
+    at = solution.domain.mesh.geometry.x[cell_nodes(solution.domain.mesh)].mean(axis=1)
+    west = missed[at[: len(missed), 0] < 0.5]
+    assert WORLD.allreduce(missed.sum()) > 0.0
+    assert (WORLD.allreduce(west.sum()) == 0.0) == of_g  # Γg is on the right
