@@ -19,14 +19,16 @@ from .estimate.force import (
     against,
     interval,
     made_of,
+    of_bumps,
     square,
     through,
     unsure,
 )
 from .estimate.settled import Settled, in_p1, left_by
+from .estimate.weights import Beyond, Weight, ranges, scalar
 from .fem.cells import measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin
-from .fem.problem import Problem
+from .fem.problem import Forms, Problem
 from .mesh.domain import named
 
 __all__ = ["Interval", "flux", "force_bounds"]
@@ -71,15 +73,15 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
                 f"{part!r} is no Dirichlet or contact part of the boundary; {meant(part, known)}"
             )
     conditions = [known[name] for name in names]
-    if weight is not None:
-        return interval(solution, conditions, weight)
-    return _interval(solution, conditions)
+    return _interval(solution, conditions, weight)
 
 
-def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
+def _interval(
+    solution: Certified, conditions: Sequence[Condition], weight: Data | None = None
+) -> Interval:
     """Take the better ends of both intervals; collective."""
-    found = interval(solution, conditions)
-    other = _corrected(made_of(solution), solution, conditions)
+    found = interval(solution, conditions, weight)
+    other = _corrected(made_of(solution), solution, conditions, weight)
     if other is None:
         return found
     lower, upper = max(found.lower, other[0]), min(found.upper, other[1])
@@ -87,78 +89,96 @@ def _interval(solution: Certified, conditions: Sequence[Condition]) -> Interval:
 
 
 def _corrected(
-    made: Made, solution: Certified, conditions: Sequence[Condition]
+    made: Made, solution: Certified, conditions: Sequence[Condition], weight: Data | None
 ) -> tuple[float, float] | None:
     """Bound ∫ λ over parts by a(v, φ) − χ(φ), a-harmonic φ; None where contact begins or ends.
 
     Parts without contact are bounded for themselves, whatever there is on others.
 
     a(u − v, φ) is a product of two errors, and what Γ1 leaves: y·n of φ's flux times u − v where
-    there is contact, φ times λ where there is none.
+    there is contact, φ times λ where there is none. With a weight ω φ has its values at vertices,
+    and ℓ is what it lacks, as in `interval`.
     """
     cells = made.cells()
     settled = Settled.of(made, cells)
-    if settled.mixed and any(condition not in settled.free for condition in conditions):
+    known = [condition for condition in conditions if condition not in settled.free]
+    if settled.mixed and known:
         return None
     bound = solution.certificate.bound_companion
     assert bound is not None
     middle, reach = 0.0, 0.0
     at: FloatArray = np.zeros((cells.tdim + 1, cells.number))
     flows = np.zeros_like(at)
-    if any(condition not in settled.free for condition in conditions):
-        forms = diffusion(made.level.data).forms
-        problem = _harmonic(forms.problem, forms.conditions, conditions, settled.free)
+    data = diffusion(made.level.data)
+    omega = None if weight is None else scalar(weight, data.forms)
+    if known:
+        problem = _harmonic(data.forms, conditions, settled.free, 1.0 if omega is None else omega)
         dual = certified(problem, made.level)
-        of_phi = in_p1(dual, cells)
+        of_phi = in_p1(dual, cells, bent=weight is not None)
         if of_phi is None:
             return None
         assert dual.bound_companion is not None
         at, flows = of_phi.vertices[cells.vertices], of_phi.through(cells)
-        product = bound * dual.bound_companion
+        apart, beyond = 0.0, Beyond(force=sum(through(made, cells, c) for c in known))
+        if weight is not None:
+            given, own = Weight.of(made, cells, known, weight, settled.free), at
+            at = given.put_into(own)
+            *off_companion, size = np.sqrt(
+                cells.total(
+                    square(made, cells, at - own), of_bumps(of_phi, cells), square(made, cells, at)
+                )
+            )
+            apart = float(sum(off_companion))
+            beyond = given.beyond(made, cells, float(size))
+        product = bound * (dual.bound_companion + apart)
         if settled.held:
             product += bound * left_by(of_phi, made)
             if not np.isfinite(product):
                 return None
         work, missed, slack = against(made, cells, at)
-        own, work, energy, more = cells.total(
-            sum(through(made, cells, c) for c in conditions if c not in settled.free),
+        force, work, energy, lifted, more = cells.total(
+            beyond.force,
             work,
             square(made, cells, at),
-            missed + unsure(made, at, slack),
+            beyond.square,
+            missed + unsure(made, at, slack, beyond) + beyond.unsure,
         )
-        middle, reach = own + work, made.loose * np.sqrt(energy) + more + product
+        middle, reach = force + work, made.loose * np.sqrt(energy) + more + product
+        reach += 2.0 * made.reach * np.sqrt(lifted)
     through_facets, off = np.zeros((2, len(cells.exterior)))
     loss = np.zeros((2, len(cells.exterior)))
     loss[:, made.segments.facets.dofs] = made.segments.loss, made.segments.most
     for condition in (*settled.held, *settled.free):
         side, chosen = cells.sides[condition.number], float(condition in conditions)
-        lost = loss[:, side.dofs] * measures(cells, side) * chosen
-        through_facets[side.dofs] = np.abs(flows[side.local, side.cells] + lost).max(axis=0)
-        off[side.dofs] = np.abs(trace_of(cells, side, at) - chosen).max(axis=0)
+        trace = trace_of(cells, side, at)
+        ends: Sequence[float | FloatArray] = (chosen,)
+        lost = loss[:, None, side.dofs] * measures(cells, side) * trace
+        through_facets[side.dofs] = np.abs(flows[side.local, side.cells] + lost).max(axis=(0, 1))
+        if omega is not None and chosen and condition in settled.free:
+            ends = ranges(data.compiled.trace(omega), cells, side)
+        off[side.dofs] = np.max([np.abs(trace - end).max(axis=0) for end in ends], axis=0)
     reach += settled.unknown(made, cells, through_facets, off)
     return float(middle - reach), float(middle + reach)
 
 
 def _harmonic(
-    problem: Problem,
-    conditions: Sequence[Condition],
-    chosen: Sequence[Condition],
-    free: Sequence[Condition],
+    forms: Forms, chosen: Sequence[Condition], free: Sequence[Condition], value: Data
 ) -> Problem:
-    """Return the linear problem whose solution is 1 on some parts and 0 on the rest of Γ0 and Γ1.
+    """Return the linear problem whose solution is set on some parts, 0 on the rest of Γ0 and Γ1.
 
     Elsewhere its flux is 0.
 
     Args:
-        problem: What a comes from.
-        conditions: All conditions.
-        chosen: Where it is 1.
+        forms: What a comes from.
+        chosen: Where it is set.
         free: Parts of Γ1 on which it is neither: there is no contact.
+        value: What it is there, 1 or a weight.
     """
+    problem = forms.problem
     found: dict[str, Condition] = {}
-    for each in conditions:
+    for each in forms.conditions:
         if (each.fixed is not None or each.bounds) and each not in free:
-            found[each.part] = Dirichlet(float(each in chosen))
+            found[each.part] = Dirichlet(value if each in chosen else 0.0)
         else:
             found[each.part] = Robin(0.0, coefficient=0.0 if each.loss is None else each.loss)
     return Problem(

@@ -3,20 +3,33 @@
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, Robin, force, solve_levels
+from signorini_cr.dual import certified
+from signorini_cr.estimate.force import of_bumps
 from signorini_cr.mesh.families import structured
 
 pytestmark = pytest.mark.slow
 
 
-def widths(problem, *parts, levels=4, inside=None):
+BESIDE = {"left": Neumann(), "right": Neumann()}
+
+WEIGHTS = {
+    "x": (lambda x: x[0], 1 / 2),
+    "x(1-x)": (lambda x: x[0] * (1 - x[0]), 1 / 6),
+    "sin2": (lambda x: ufl.sin(np.pi * x[0]) ** 2, 1 / 2),
+}
+"""With their means on the floor and on top."""
+
+
+def widths(problem, *parts, levels=4, inside=None, weight=None, size=0.25):
     """Widths of the intervals on four meshes, each twice as fine as the one before."""
     found = []
-    for solution in solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), levels):
-        value, lower, upper = force.flux(solution, *parts)
+    for solution in solve_levels(problem, SQUARE.mesh(size, MPI.COMM_WORLD), levels):
+        value, lower, upper = force.flux(solution, *parts, weight=weight)
         assert inside is None or lower <= inside <= upper
         assert lower <= upper and abs(value - lower) < 1.0
         found.append(upper - lower)
@@ -127,6 +140,10 @@ def test_where_all_data_vary_within_cells(touching):
     for part, exact in (("floor", pressure), ("top", top)):
         found = widths(problem, part, inside=exact)
         assert (orders(found) > 1.7).all() and found[-1] < 0.02
+    top = 0.5 * weights @ (x * (2.0 + np.sin(3.0 * x - 1.0)) * np.cos(2.0 * x + 1.0))
+    for part, exact in (("floor", pressure / 2), ("top", top)):
+        found = widths(problem, part, inside=exact, weight=WEIGHTS["x"][0])
+        assert orders(found)[-1] > 1.8 and found[-1] < 0.03
 
 
 @pytest.mark.slow
@@ -134,8 +151,12 @@ def test_contact_that_begins_somewhere():
     """h: nothing is corrected."""
     conditions = {"floor": Contact(0.0), "top": Dirichlet(0.0), "left": Neumann()}
     load = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), -8.0, 8.0)  # noqa: E731
-    found = widths(Problem(f=load, conditions=conditions | {"right": Neumann()}), "floor", levels=3)
+    problem = Problem(f=load, conditions=conditions | {"right": Neumann()})
+    found = widths(problem, "floor", levels=3)
     assert (orders(found) < 1.7).all()
+    for weight, _ in WEIGHTS.values():
+        found = widths(problem, "floor", levels=3, weight=weight)
+        assert (orders(found) > 0.5).all() and (orders(found) < 1.7).all()
 
 
 def test_a_part_without_contact_beside_one_where_contact_begins():
@@ -146,6 +167,71 @@ def test_a_part_without_contact_beside_one_where_contact_begins():
     assert (orders(found) > 1.5).all()
     first = widths(problem, "top", levels=3)
     assert (abs(orders(first) - 1.0) < 0.5).all()
+
+
+@pytest.mark.parametrize("weight, mean", WEIGHTS.values(), ids=WEIGHTS)
+@pytest.mark.parametrize("part", ["floor", "top"])
+@pytest.mark.parametrize("floor", ["below", "above", "lossy", "nowhere"])
+def test_weights_are_as_good_as_none(part, floor, weight, mean):
+    """h² where contact is everywhere or nowhere; what flows through a part is the same all along.
+
+    u = ± (5 y² − 6 y) with λ = ± 6; or −u'' + 9 u = 1 with u'(0) = 0 and u(1) = 1.
+    """
+    if floor == "nowhere":
+        below = Contact(-3.0)
+        problem = Problem(
+            f=1.0, reaction=9.0, conditions={"floor": below, "top": Dirichlet(1.0)} | BESIDE
+        )
+        flow = {"floor": 0.0, "top": 8 / 3 * np.tanh(3.0)}[part]
+    else:
+        sign = -1.0 if floor == "above" else 1.0
+        below = Contact(upper=0.0) if sign < 0 else Contact(coefficient=5.0 * (floor == "lossy"))
+        sides = {"floor": below, "top": Dirichlet(-sign)} | BESIDE
+        problem = Problem(f=-10.0 * sign, conditions=sides)
+        flow = {"floor": 6.0, "top": 4.0}[part] * sign
+    found = widths(problem, part, inside=flow * mean, weight=weight, size=0.125)
+    assert (orders(found) > 1.7).all()
+
+
+def test_a_weight_on_a_part_in_contact_and_one_without():
+    """It goes on from the floor, with λ = 6, to where there is no contact, and need not vanish."""
+    sides = {"floor": Contact(0.0), "right": Contact(upper=9.0)}
+    problem = Problem(f=-10.0, conditions=sides | {"top": Dirichlet(-1.0), "left": Neumann()})
+
+    def weight(x):
+        return (1.0 - x[1]) * (1.0 + x[0])
+
+    found = widths(problem, "floor", "right", inside=9.0, weight=weight, size=0.125)
+    assert (orders(found) > 1.7).all()
+    found = widths(problem, "right", inside=0.0, weight=lambda x: x[1] * (1.0 - x[1]))
+    assert (orders(found) > 1.7).all()
+
+
+@pytest.mark.parametrize("tilted", [False, True])
+def test_what_bumps_of_a_dual_solution_cost(tilted):
+    """‖Aβ‖² by the assembled forms; of a tensor it is no less."""
+    problem = Problem(f=-10.0, conditions={"floor": Contact(0.0), "top": Dirichlet(-1.0)} | BESIDE)
+    (solution,) = solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), 1)
+    kappa = [[3.0, 1.0], [1.0, 2.0]] if tilted else [[2.0, 0.0], [0.0, 2.0]]
+    wave = Dirichlet(lambda x: ufl.sin(5.0 * x[0]))
+    dual = Problem(
+        f=0.0,
+        coefficient=lambda x: ufl.as_matrix(kappa) if tilted else 2.0,
+        reaction=3.0,
+        conditions={"floor": wave, "top": Dirichlet(0.0)} | BESIDE,
+    )
+    certificate = certified(dual, solution.level)
+    beta = certificate.companion
+    P1 = fem.Function(fem.functionspace(beta.function_space.mesh, ("Lagrange", 1)))
+    P1.interpolate(beta)
+    beta = beta - P1
+    flow = ufl.dot(ufl.as_matrix(kappa), ufl.grad(beta))
+    form = fem.form((ufl.inner(flow, ufl.grad(beta)) + 3.0 * beta**2) * ufl.dx)
+    exact = MPI.COMM_WORLD.allreduce(fem.assemble_scalar(form))
+    made = certificate._made
+    found = MPI.COMM_WORLD.allreduce(of_bumps(made, made.cells()))
+    assert exact > 1e-3
+    assert exact < found < 4.0 * exact if tilted else found == pytest.approx(exact)
 
 
 @pytest.mark.parametrize("top", [0.0, 0.3])

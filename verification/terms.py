@@ -751,6 +751,7 @@ FLAT = "no c, no b: strips of cells 8 to 60 times as wide as high"
 FLUXES = "Forces and fluxes of parts, c and b up to 1e8, contact anywhere"
 SETTLED = "Forces and fluxes of parts, c and b up to 1e8, contact everywhere or nowhere"
 WEIGHTED = "The same with weights of either sign, also where contact and Dirichlet parts meet"
+WEIGHTED_SETTLED = "The same with weights where contact is everywhere or nowhere"
 MEANS = "Means of parts and of the domain"
 INTEGRALS = "Integrals and means with weights, of parts, materials and the domain"
 UNEVEN = "the same with c that varies within cells: waves, down to 0 or cut off along a slant line"
@@ -978,6 +979,11 @@ def terms(seed: int, quick: bool) -> Group:
             told(_intervals(FLUXES, seed, 2 if quick else 100, 78, apart, _fluxes)),
             told(_intervals(SETTLED, seed, 2 if quick else 100, 78, settled, _fluxes)),
             told(_intervals(WEIGHTED, seed, 2 if quick else 50, 80, mixed, _weighted_fluxes)),
+            told(
+                _intervals(
+                    WEIGHTED_SETTLED, seed, 2 if quick else 50, 83, settled, _weighted_fluxes
+                )
+            ),
             told(_intervals(MEANS, seed, 1 if quick else 50, 79, Case, _means)),
             told(_intervals(INTEGRALS, seed, 1 if quick else 50, 81, mixed, _integrals)),
             told(_intervals(VARYING, seed, 1 if quick else 60, 82, varying, _all_of_them)),

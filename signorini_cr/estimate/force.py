@@ -23,6 +23,7 @@ from ..jit import compiled
 from ..options import ESTIMATE_PREFIX, LINEAR, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
+from .companion import bend_squares
 from .gap import apart
 from .heights import distance
 from .weights import Beyond, Weight
@@ -207,6 +208,21 @@ def square(made: Made, cells: Cells, at: FloatArray) -> float:
     found += float(masses @ (total**2 + dot_rows(at, at))) / 12.0
     (a, b), measure = trace_of(cells, edge.facets, at), measures(cells, edge.facets)
     return found + float(np.sum(edge.most * measure * (a**2 + a * b + b**2))) / 3.0
+
+
+def of_bumps(dual: Made, cells: Cells) -> float:
+    """Bound ‖Aβ‖² of the bumps β that a linear problem's companion has; this rank's share.
+
+    They are those of facets on which it is set, where it loses nothing.
+    """
+    height, plain = dual.bumps[cells.facets], cells.unstretched()
+    everywhere = slice(0, cells.number)
+    # the mean of ∇β is that of −4/3 the heights' P1 function
+    steep = 16 / 9 * dot_rows(height, plain.apply(height, everywhere))
+    steep += bend_squares(plain, height, everywhere)
+    found = float(np.sum(dual.most * steep))
+    area = cells.volume * distance(np.zeros_like(height), height)
+    return found + float(np.sum(dual.most_reaction * area))
 
 
 def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:

@@ -98,11 +98,19 @@ def left_by(dual: Made, made: Made) -> float:
     return found
 
 
-def in_p1(dual: Certificate, cells: Cells) -> Made | None:
-    """What a dual's certificate is made of, if v is in P1 and y·n a number a facet; collective."""
+def in_p1(dual: Certificate, cells: Cells, bent: bool = False) -> Made | None:
+    """What a dual's certificate is made of, if v is in P1 and y·n a number a facet; collective.
+
+    Args:
+        dual: The certificate.
+        cells: The mesh.
+        bent: Whether v may have bumps beside that.
+    """
     made = dual._made
     if made is None or dual.bound_companion is None:
         return None
     if made.thirds is not None or made.beyond is not None:
         return None
+    if bent:
+        return made
     return None if cells.total(float(np.abs(made.bumps).sum()))[0] > 0.0 else made

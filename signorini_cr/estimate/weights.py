@@ -71,8 +71,22 @@ class Weight:
     scale: float
 
     @classmethod
-    def of(cls, made: Made, cells: Cells, conditions: Sequence[Condition], weight: Data) -> Weight:
+    def of(
+        cls,
+        made: Made,
+        cells: Cells,
+        conditions: Sequence[Condition],
+        weight: Data,
+        free: Sequence[Condition] = (),
+    ) -> Weight:
         """Evaluate a weight on the parts of some conditions; collective.
+
+        Args:
+            made: Whose data there are.
+            cells: The mesh.
+            conditions: They.
+            weight: ω.
+            free: Parts of Γ1 that are not among the rest: φ may be anything there.
 
         Raises:
             InputError: It is no scalar, or not 0 where the parts meet the rest of Γ0 and Γ1.
@@ -88,21 +102,27 @@ class Weight:
             shared_sum(domain.mesh.comm, V.dofmap.index_map, function.x.array)
         chosen = marks.x.array > 0.0
         values.x.array[chosen] /= marks.x.array[chosen]
+        known = (*conditions, *free)
         others = facets_of(
-            domain, [c for c in (*data.forms.fixed, *data.forms.bounded) if c not in conditions]
+            domain, [c for c in (*data.forms.fixed, *data.forms.bounded) if c not in known]
         )
         marks.x.array[:] = 0.0
         marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, others)] = 1.0
         rest = shared_sum(domain.mesh.comm, V.dofmap.index_map, marks.x.array) > 0.0
         found = [np.ravel(row) for p in parts.parts for row in (p.ends, p.middle, p.inside)]
-        known = np.concatenate(found or [np.zeros(0)])
-        largest = float(np.abs(known[np.isfinite(known)]).max(initial=0.0))
+        seen = np.concatenate(found or [np.zeros(0)])
+        largest = float(np.abs(seen[np.isfinite(seen)]).max(initial=0.0))
         scale = max(domain.mesh.comm.allgather(largest if np.isfinite(ends).all() else np.inf))
         if not np.isfinite(scale):
             raise InputError("the weight is not finite at a vertex of the part")
         _insist_on_zero(values, chosen & rest, scale)
         values.x.array[rest] = 0.0
         return cls(trace, parts, values, np.flatnonzero(chosen | rest).astype(np.int32), scale)
+
+    def put_into(self, at: FloatArray) -> FloatArray:
+        """Give a P1 function the known values: it at the cells' vertices, shape (3, cells)."""
+        dofs = self.values.function_space.dofmap.list[: at.shape[1]].T
+        return np.where(np.isin(dofs, self.known), self.values.x.array[dofs], at)
 
     def beyond(self, made: Made, cells: Cells, size: float) -> Beyond:
         """Integrate it against y, and bound what it has beyond P1; collective.
@@ -143,7 +163,7 @@ class Weight:
             _square(made, cells, side, coarse),
             float(left @ over_cells),
             float(np.bincount(side.cells, over_cells).max(initial=0.0)),
-            _least(self.trace, cells, side),
+            float(np.min(ranges(self.trace, cells, side)[0], initial=np.inf)),
         )
 
 
@@ -182,13 +202,15 @@ def _square(made: Made, cells: Cells, side: BoundaryFacets, lifted: Lift) -> flo
     return float(found + loss[side.dofs] @ lifted.edge**2)
 
 
-def _least(trace: Trace, cells: Cells, side: BoundaryFacets) -> float:
-    """A lower bound of a weight on facets of this rank."""
+def ranges(trace: Trace, cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, FloatArray]:
+    """Bound a weight on facets from below and from above, shapes (n,)."""
+    none = np.zeros(len(side.cells))
     if trace.constant is not None:
-        return trace.constant
+        return none + trace.constant, none + trace.constant
     boxes = Pieces.of_facets(cells, side).boxes(cells, decide=True)
-    low = Enclosure(boxes)(trace.deviation.expression).low + np.zeros(len(side.cells))
-    return float(np.min(np.nan_to_num(low, nan=-np.inf), initial=np.inf))
+    found = Enclosure(boxes)(trace.deviation.expression)
+    low, high = found.low + none, found.high + none
+    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
 
 def _insist_on_zero(values: fem.Function, where: FloatArray, scale: float) -> None:

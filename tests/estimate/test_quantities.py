@@ -107,7 +107,9 @@ def test_a_weight_is_what_is_needed_where_contact_meets_dirichlet():
             assert lower <= exact_value <= upper
             assert abs(value - exact_value) < 0.2 * 0.5**solution.level.number
             widths[-1].append(upper - lower)
-    assert np.all(np.log2(np.array(widths[1:-1]) / widths[2:]) > 0.85)
+    # weights at the sides rise from where λ is 0: h
+    rates = np.log2(np.array(widths[1:-1]) / widths[2:])
+    assert (rates[:, :4] > 1.7).all() and (rates > 0.85).all()
     with pytest.raises(InputError, match=r"the weight is 1 at \(-1, 0\), where the part touches"):
         solution.flux("floor", weight=1.0)
     with pytest.raises(InputError, match="the weight jumps on a boundary facet"):
