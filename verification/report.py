@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -91,14 +92,26 @@ figures are those of RANKS, each row's figure that of its worst case;
 """
 
 
-def document(groups: Sequence[Group]) -> str:
+def document(sections: Iterable[str]) -> str:
     """The whole page."""
-    body = [line for group in groups for line in group.lines()]
     size = MPI.COMM_WORLD.size
     ranks = "one rank" if size == 1 else f"{size} ranks"
-    return HEAD.replace("RANKS", ranks) + "\n" + "\n".join(body)
+    return HEAD.replace("RANKS", ranks) + "\n" + "\n".join(sections)
 
 
-def write(groups: Sequence[Group], path: Path) -> None:
-    """Keep the page."""
-    path.write_text(document(groups), encoding="utf-8")
+def write(groups: Sequence[Group], names: Sequence[str], path: Path) -> None:
+    """Put groups into the page; the tables of others stay as they are.
+
+    Args:
+        groups: Some.
+        names: Of all groups, in their order on the page.
+        path: The page; made if it is not there.
+    """
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    found = {}
+    for section in re.split(r"^(?=## )", before, flags=re.MULTILINE)[1:]:
+        command = re.search(r"^    .* verification --only (\w+)$", section, re.MULTILINE)
+        if command is not None:
+            found[command[1]] = section.rstrip("\n") + "\n"
+    found |= {group.name: "\n".join(group.lines()) for group in groups}
+    path.write_text(document(found[name] for name in names if name in found), encoding="utf-8")

@@ -961,8 +961,8 @@ def terms(seed: int, quick: bool) -> Group:
         "Reaction, loss of heat, several parts",
         "−∇·(κ∇u) + c u = f on the unit square, each edge a part of its own: Dirichlet, Neumann, "
         "Robin, or contact from below, from above or both, with a flux or a loss of heat of its "
-        "own. Passed: no bound below the error in either norm, J(u), what flows through the parts "
-        f"and integrals of u inside their intervals, at most {MISSING:.0%} without bounds.",
+        "own. Passed: no bound below the error in either norm, J(u) inside its bracket, at most "
+        f"{MISSING:.0%} without bounds.",
         [
             told(_drawn(seed, 4 if quick else 500, Case, DRAWN)),
             told(_drawn(seed, 2 if quick else 150, Anisotropic, TENSORS)),
@@ -976,6 +976,18 @@ def terms(seed: int, quick: bool) -> Group:
                 told(_smooth(1 if quick else 4, bounds))
                 for bounds in (None, "lower", "upper", "both")
             ),
+        ],
+    )
+
+
+def quantities(seed: int, quick: bool) -> Group:
+    """What flows through parts, and integrals, of such problems."""
+    return Group(
+        "quantities",
+        "Forces, fluxes, means and integrals",
+        "Of problems like those above. Passed: each is inside its interval, and at most "
+        f"{MISSING:.0%} of the cases are without any.",
+        [
             told(_intervals(FLUXES, seed, 2 if quick else 100, 78, apart, _fluxes)),
             told(_intervals(SETTLED, seed, 2 if quick else 100, 78, settled, _fluxes)),
             told(_intervals(WEIGHTED, seed, 2 if quick else 50, 80, mixed, _weighted_fluxes)),

@@ -3,6 +3,7 @@
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import helpers
 import numpy as np
@@ -20,6 +21,7 @@ import manufactured  # noqa: E402
 import reference  # noqa: E402
 import sharpness  # noqa: E402
 import solves  # noqa: E402
+from report import Group, Row, document, write  # noqa: E402
 
 from signorini_cr import solve  # noqa: E402
 
@@ -153,3 +155,25 @@ def test_a_bound_that_is_too_low_and_a_bracket_that_misses_are_told():
     row = tally.row("forged", "")
     assert not row.passed
     assert "1 bounds too low, 1 brackets miss" in row.worst
+
+
+@pytest.mark.serial
+def test_a_table_made_anew_leaves_the_others(tmp_path):
+    def group(name, worst):
+        return Group(name, name.upper(), "Passed.", [Row("a case", 1, worst, "known")])
+
+    page, names = tmp_path / "page.md", ["first", "second", "third"]
+    write([group("third", "3"), group("first", "1")], names, page)
+    write([group("second", "2")], names, page)
+    whole = document("\n".join(group(*each).lines()) for each in zip(names, "123", strict=True))
+    assert page.read_text(encoding="utf-8") == whole
+    write([group("second", "4")], names, page)
+    assert page.read_text(encoding="utf-8") == whole.replace("| 2 |", "| 4 |")
+
+
+@pytest.mark.serial
+def test_make_verify_runs_all_groups():
+    text = (Path(__file__).parents[2] / "Makefile").read_text(encoding="utf-8")
+    (found,) = re.findall(r"^groups := (.*)$", text, re.MULTILINE)
+    code = (Path(__file__).parents[2] / "verification" / "__main__.py").read_text(encoding="utf-8")
+    assert found.split() == re.findall(r'^    "(\w+)": \w+\.\w+,$', code, re.MULTILINE)
