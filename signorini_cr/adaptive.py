@@ -158,10 +158,10 @@ def adapt_to_run(
         NotConverged: As for `solve_adaptive`, or the run raised it.
     """
     step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction, runs=RUNS)
-    refined, zero = [*meshes], np.zeros(1)
+    refined = [*meshes]
     while True:
         bound, last = 0.0, None
-        indicators: FloatArray = zero
+        indicators: FloatArray = np.zeros(1)
         for _, last in run(refined):
             shares = Shares.of(last)
             bound, indicators = max(bound, shares.bound), indicators + shares.indicators

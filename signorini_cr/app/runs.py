@@ -267,10 +267,14 @@ def _solve_levels(run: _Run) -> None:
         raise NotConverged(stopped(failure, kept, run.folder))
 
 
+def _step_of_solver(step: int, residual: float, active: int, linear: int) -> str:
+    """What `-v` tells of a step of the active set method."""
+    return f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
+
+
 def _solutions(run: _Run, restart: Restart | None) -> Iterator[Solution]:
-    def monitor(level: int, step: int, residual: float, active: int, linear: int) -> None:
-        facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"
-        run.screen.step(f"  level {level}  {facts}")
+    def monitor(level: int, *facts: Any) -> None:
+        run.screen.step(f"  level {level}  {_step_of_solver(*facts)}")
 
     run.screen.progress("level 0")
     return run.case.solutions(
@@ -485,14 +489,13 @@ class _Steps:
         run, done = self._run, self._done
         run.screen.progress(f"step {done + 1}")
 
-        def monitor(step: int, residual: float, active: int, linear: int) -> None:
-            facts = f"step {step:2d}  residual {residual:9.2e}  active {active:5d}"
-            run.screen.line(f"  time step {len(self._records) + 1}  {facts}  cg {linear:4d}")
+        def monitor(_: int, *facts: Any) -> None:
+            run.screen.line(f"  time step {len(self._records) + 1}  {_step_of_solver(*facts)}")
 
         steps = run.case.steps(
             run.domain,
             meshes,
-            monitor=(lambda _, *facts: monitor(*facts)) if run.screen.verbose else None,
+            monitor=monitor if run.screen.verbose else None,
             max_time=run.time_left,
             restart=self._restart if done else None,
             done=max(done, 1),

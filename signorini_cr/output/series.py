@@ -246,7 +246,7 @@ def write_steps(
     report: Mapping[str, Any],
     solution: Solution,
     restart: Restart,
-    facts: Mapping[str, Any],
+    facts: dict[str, Any],
     moments: Sequence[Moment],
 ) -> None:
     """Write the last step's field, and all that tells of the steps so far; collective.
@@ -275,7 +275,7 @@ def write_steps(
         "report.json": text(lambda: report_json(report)),
         TABLE: text(lambda: levels_csv(records)),
         SERIES: text(lambda: _series(records)),
-        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, {**facts}, comm),
+        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
         _field(len(records)): lambda path: write_solution(solution, path),
     }
     if moments and moments[-1].time == records[-1]["time"]:
