@@ -34,6 +34,9 @@ INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 FRAMES = 10_000
 """Calls within one another: UFL differentiates by recursion, 40 calls at most for each of the 250
 operations that `expressions.LONGEST_CHAIN` allows one upon the other."""
+PASSED_ON = 0.3
+"""Seconds for mpirun to pass on what a rank has printed, before that rank ends them all: MPICH's
+drops what it has not read by then."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -117,28 +120,30 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         if asked or isinstance(error, KeyboardInterrupt):
             status = status_of(asked)
             if not screen.root:  # which tells and ends all, if it was asked and can
-                time.sleep(0.3 * min(1 + comm.rank, 5))
+                time.sleep(PASSED_ON + 0.3 * min(1 + comm.rank, 5))
                 screen.root = True
             word = "terminated" if status == TERMINATED else "interrupted"
             screen.complain(f"{word}{kept and f'; {kept}'}")
-            if comm.size > 1:
-                comm.Abort(status)
-            return status
+            return _end_all(comm, status)
         if ran_out_of_memory(error):  # while it began, or while it wrote
             screen.root = True
             screen.complain(f"{args.file}: {NO_MEMORY}" + (kept and f"\n{kept}"))
-            if comm.size > 1:
-                comm.Abort(NOT_CONVERGED)
-            return NOT_CONVERGED
+            return _end_all(comm, NOT_CONVERGED)
         import traceback
 
         where = f" on rank {comm.rank}" if comm.size > 1 else ""
         with suppress(OSError):  # whether or not it can be told
             traceback.print_exc()
             print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
-        if comm.size > 1:
-            comm.Abort(FAULT)
-        return FAULT
+        return _end_all(comm, FAULT)
+
+
+def _end_all(comm: Any, status: int) -> int:
+    """End the other ranks, which know nothing of it; alone, return the status."""
+    if comm.size > 1:
+        time.sleep(PASSED_ON)
+        comm.Abort(status)
+    return status
 
 
 def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
@@ -166,7 +171,7 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     if comm.size > 1:  # the other ranks know nothing of it
         screen.root = True
         screen.complain(f"{args.file}: {stopped(failure, records, folder)}")
-        comm.Abort(NOT_CONVERGED)
+        _end_all(comm, NOT_CONVERGED)
     raise NotConverged(stopped(failure, records, folder))
 
 
