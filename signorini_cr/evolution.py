@@ -106,7 +106,7 @@ class Solver:
             self._hierarchy.add(*refined)
         self._carry_down()
         self._level = Level(self._hierarchy.meshes)
-        self._held = self._level.loose is None
+        self._held = self._level.floating is None
         system = self._level.system
         self._stack.callback(self._hierarchy.free)
         # what has served a single solve will not stay for many

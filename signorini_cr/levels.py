@@ -25,7 +25,7 @@ from .solution import Solution
 from .vi.contact import contact_facts
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
-from .vi.pieces import Loose
+from .vi.pieces import Floating
 from .vi.solver import Data, solve_vi
 from .vi.system import System
 
@@ -167,7 +167,7 @@ def solve_physics(
         for refined in restart.meshes(domain):
             level.tidy()
             hierarchy.add(*refined)
-            level = Level(hierarchy.meshes, held=level.loose is None)
+            level = Level(hierarchy.meshes, held=level.floating is None)
         start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:
@@ -179,7 +179,7 @@ def solve_physics(
             break
         level.tidy()
         hierarchy.add(*following)
-        level = Level(hierarchy.meshes, held=level.loose is None)
+        level = Level(hierarchy.meshes, held=level.floating is None)
         start = Start()
         if nested:
             start, before = Start(solution, before), solution.u
@@ -204,9 +204,9 @@ def check_pieces(physics: Diffusion, domain: Domain) -> None:
     fixed = fem.locate_dofs_topological(
         level.V, domain.mesh.topology.dim - 1, facets_of(domain, physics.fixed)
     )
-    # without a loose piece nothing needs to be assembled
-    if Loose.of(level.V, fixed).count and level.loose is not None:
-        level.loose.check(level.system, level.data.inflow())
+    # without a floating piece nothing needs to be assembled
+    if Floating.of(level.V, fixed).count and level.floating is not None:
+        level.floating.check(level.system, level.data.inflow())
 
 
 class Start(NamedTuple):
@@ -243,15 +243,15 @@ def solve_level(
     system = level.system
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
     u, residual = system.start(), fem.Function(level.V)
-    if level.loose is not None:
-        level.loose.check(system, level.data.inflow())
+    if level.floating is not None:
+        level.floating.check(system, level.data.inflow())
     if not system.is_trivial:  # or u is the solution already
         if start.known is not None:
             known_start(start.known, level, u)
         elif start.coarser is not None:
             nested_start(start.coarser, level, u, start.before)
-    if level.loose is not None:
-        level.loose.hold(system, u)
+    if level.floating is not None:
+        level.floating.hold(system, u)
     told = None if monitor is None else lambda *facts: monitor(level.number, *facts)
     try:
         with (

@@ -82,11 +82,16 @@ def _best(
         As `solved`, E, and whether v is settled, as far as more of the mesh would make it so.
     """
     cells, kappa, bounded = functional.cells, functional.kappa, floors.side.dofs
-    v, bumps, loose, free = draft.vertices, draft.bumps, draft.loose, draft.free
+    v, bumps, free_vertices, free_facets = (
+        draft.vertices,
+        draft.bumps,
+        draft.free_vertices,
+        draft.free_facets,
+    )
     excess = functional.excess(v)
     slopes = Slopes.of(functional, excess, bumps)
     cusps: Cusps | None = None
-    near = promise.near(slopes, loose, free, layers)
+    near = promise.near(slopes, free_vertices, free_facets, layers)
     if near is not None:
         # v is good enough but for some places; elsewhere cusps would be for what v is to become
         cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
@@ -95,12 +100,12 @@ def _best(
     local = falling = False
     for turn in range(ROUNDS):
         if turn > 0:
-            near = promise.near(slopes, loose, free, layers)
+            near = promise.near(slopes, free_vertices, free_facets, layers)
         local |= near is not None
-        some, heights, at = near or (loose, free, slice(None))
+        some, heights, at = near or (free_vertices, free_facets, slice(None))
         step = nearest(cells, kappa, slopes, some, heights, functional.masses)
-        v, bumps, free = v + step[0], bumps + step[1], free.copy()
-        down = np.zeros_like(loose)
+        v, bumps, free_facets = v + step[0], bumps + step[1], free_facets.copy()
+        down = np.zeros_like(free_vertices)
         for sign, limit in floors.at_vertices:
             down |= some & (sign * v <= limit)
             v = np.where(some, sign * np.maximum(sign * v, limit), v)
@@ -108,8 +113,8 @@ def _best(
         out = np.unique(bounded[heights[bounded] & ((bumps <= low) | (bumps >= high))[bounded]])
         # also where they are held since an earlier round: the facet's ends may have come down
         bumps[bounded] = np.clip(bumps, low, high)[bounded]
-        free[out] = False
-        loose = loose & ~down
+        free_facets[out] = False
+        free_vertices = free_vertices & ~down
         if cusps is not None and not isinstance(at, slice):
             at = np.union1d(at, cusps.at)
         excess[:, at] = v[cells.vertices[:, at]] - functional.w[:, at]
@@ -126,7 +131,11 @@ def _best(
             break
     if not local:
         return best, least, True
-    return best, least, not falling and promise.total(slopes, loose, free) <= LEFT * least
+    return (
+        best,
+        least,
+        not falling and promise.total(slopes, free_vertices, free_facets) <= LEFT * least,
+    )
 
 
 def _fitted(
@@ -175,14 +184,14 @@ class Promise:
         return cls(functional.cells, *curvatures(functional))
 
     def of_values(
-        self, slopes: Slopes, loose: BoolArray, free: BoolArray
+        self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
         """What each value promises, ghosts included; collective.
 
         Args:
             slopes: Those of v.
-            loose: Which values at vertices may be changed.
-            free: Which heights may be changed.
+            free_vertices: Which values at vertices may be changed.
+            free_facets: Which heights may be changed.
 
         Returns:
             By vertex and by facet dof.
@@ -190,16 +199,16 @@ class Promise:
         cells = self.cells
         promises = cells.over_vertices(slopes.vertices), cells.over_facets(slopes.facets)
         for promise, weight, may in zip(
-            promises, (self.vertices, self.facets), (loose, free), strict=True
+            promises, (self.vertices, self.facets), (free_vertices, free_facets), strict=True
         ):
             promise *= promise
             promise /= weight
             promise *= may
         return promises
 
-    def total(self, slopes: Slopes, loose: BoolArray, free: BoolArray) -> float:
+    def total(self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray) -> float:
         """What all of them promise; collective."""
-        vertices, facets = self.of_values(slopes, loose, free)
+        vertices, facets = self.of_values(slopes, free_vertices, free_facets)
         own = (
             vertices[: self.cells.owned_vertices()].sum()
             + facets[: self.cells.owned_facets()].sum()
@@ -207,7 +216,7 @@ class Promise:
         return float(self.cells.total(float(own))[0])
 
     def near(
-        self, slopes: Slopes, loose: BoolArray, free: BoolArray, layers: int | None
+        self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray, layers: int | None
     ) -> tuple[BoolArray, BoolArray, IndexArray] | None:
         """Choose values that are worth being solved for; collective.
 
@@ -215,8 +224,8 @@ class Promise:
 
         Args:
             slopes: Those of v.
-            loose: Which values at vertices may be changed.
-            free: Which heights may be changed.
+            free_vertices: Which values at vertices may be changed.
+            free_facets: Which heights may be changed.
             layers: How many layers of cells around them; None for all.
 
         Returns:
@@ -227,7 +236,7 @@ class Promise:
             return None
         cells = self.cells
         owned = cells.owned_vertices(), cells.owned_facets()
-        promises = self.of_values(slopes, loose, free)
+        promises = self.of_values(slopes, free_vertices, free_facets)
         limit = _limit(cells, *(p[:n] for p, n in zip(promises, owned, strict=True)))
         chosen, much = (promise > limit for promise in promises)
         local, at = np.nonzero(much[cells.facets])
@@ -238,10 +247,10 @@ class Promise:
             return None
         at = np.flatnonzero(chosen[cells.vertices].any(axis=0))
         facets, inside = cells.facets[:, at], chosen[cells.vertices[:, at]]
-        there = np.zeros(len(free), dtype=bool)
+        there = np.zeros(len(free_facets), dtype=bool)
         for facet, (j, k) in zip(facets, cells.others, strict=True):
             there[facet[inside[j] | inside[k]]] = True
-        return loose & chosen, free & there, at
+        return free_vertices & chosen, free_facets & there, at
 
 
 def _limit(cells: Cells, *promises: FloatArray) -> float:

@@ -389,10 +389,10 @@ def _closed(
     """
     if flux.taken_up is not None and not c.ndim:
         return 0.0, 0.0
-    left = unbalanced(level, cells, flux.loose, kappa.least, size, c)
+    left = unbalanced(level, cells, flux.unbalanced, kappa.least, size, c)
     carried = balance(cells, flux, kappa.low, size, left)
     if carried:
-        left = unbalanced(level, cells, flux.loose, kappa.least, size, c)
+        left = unbalanced(level, cells, flux.unbalanced, kappa.least, size, c)
     return left, carried
 
 
@@ -410,7 +410,7 @@ def _carried_to_contact(
         What that adds to the bound, infinite where the force is too small.
     """
     left, flux.carried = 0.0, np.zeros_like(flux.contact)
-    for amounts, signed in ((flux.loose, True), (missed, False)):
+    for amounts, signed in ((flux.unbalanced, True), (missed, False)):
         norm, change = carried_to_contact(cells, flux, amounts, kappa.least, contact, c, signed)
         left += norm
         flux.carried += change

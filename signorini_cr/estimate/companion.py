@@ -203,10 +203,10 @@ def _improved(
         Whether much would be gained by solving for v.
     """
     contact, bumps = floors.side, draft.bumps
-    energy, promise = sweep(functional, excess, bumps, draft.free, (fixed, contact), sweeps)
+    energy, promise = sweep(functional, excess, bumps, draft.free_facets, (fixed, contact), sweeps)
     low, high = (limit[contact.dofs] for limit in floors.heights(draft.vertices))
     bumps[contact.dofs] = np.clip(bumps[contact.dofs], low, high)
-    promise += promise_of_vertices(functional, excess, bumps, draft.loose)
+    promise += promise_of_vertices(functional, excess, bumps, draft.free_vertices)
     return promise > PROMISE * energy
 
 

@@ -27,14 +27,14 @@ class Draft:
     Attributes:
         vertices: v at the vertices, ghosts included.
         bumps: Heights of v's bumps by facet dof, ghosts included.
-        loose: Which values at vertices may be changed.
-        free: Which heights may be changed.
+        free_vertices: Which values at vertices may be changed.
+        free_facets: Which heights may be changed.
     """
 
     vertices: FloatArray
     bumps: FloatArray
-    loose: BoolArray
-    free: BoolArray
+    free_vertices: BoolArray
+    free_facets: BoolArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,7 +66,7 @@ class Flux:
     carried: FloatArray | None = None
 
     @property
-    def loose(self) -> FloatArray:
+    def unbalanced(self) -> FloatArray:
         """What is left and not taken up, shape (cells,)."""
         return self.left if self.taken_up is None else np.where(self.taken_up, 0.0, self.left)
 
@@ -401,7 +401,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
     """
     if bound <= WORTH * size or cells.sinks:
         return 0.0
-    fluxes, all_reached = _carry(cells, flux.loose)
+    fluxes, all_reached = _carry(cells, flux.unbalanced)
     if not all_reached:
         return 0.0
     squares = field_squares(cells, fluxes) / kappa_min

@@ -14,7 +14,7 @@ def sweep(
     functional: Functional,
     excess: FloatArray,
     bumps: FloatArray,
-    free: BoolArray,
+    free_facets: BoolArray,
     bumped: tuple[BoundaryFacets, ...],
     steps: int,
 ) -> tuple[float, float]:
@@ -24,14 +24,14 @@ def sweep(
         functional: E.
         excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
         bumps: Heights, improved in place.
-        free: Which of them may be.
+        free_facets: Which of them may be.
         bumped: The facets on which there are some to begin with.
         steps: How many steps.
 
     Returns:
         E, and what it would fall by if each height were put right as if it were alone.
     """
-    cells, held = functional.cells, np.flatnonzero(~free)
+    cells, held = functional.cells, np.flatnonzero(~free_facets)
     matrix = _OfHeights(functional)
     energy, local = matrix.without_bumps(excess)
     energy += matrix.with_bumps(bumps, bumped, local)
@@ -172,7 +172,7 @@ def _of_vertices(functional: Functional) -> FloatArray:
 
 
 def promise_of_vertices(
-    functional: Functional, excess: FloatArray, bumps: FloatArray, loose: BoolArray
+    functional: Functional, excess: FloatArray, bumps: FloatArray, free_vertices: BoolArray
 ) -> float:
     """Return what E would fall by if each vertex were put right alone.
 
@@ -180,7 +180,7 @@ def promise_of_vertices(
         functional: E.
         excess: v − u_h at the cells' vertices without the bumps, shape (d + 1, cells).
         bumps: Their heights.
-        loose: Which values at vertices may be changed.
+        free_vertices: Which values at vertices may be changed.
     """
     cells, kappa, masses = functional.cells, functional.kappa, functional.masses
     slope = np.empty_like(excess)
@@ -197,7 +197,7 @@ def promise_of_vertices(
     np.subtract.at(slope, ends, masses.fall_on_facets(cells, excess, bumps, slice(None))[0])
     owned = slice(cells.owned_vertices())
     down, weight = cells.over_vertices(slope)[owned], _of_vertices(functional)[owned]
-    return float(cells.total(np.sum(down**2 * loose[owned] / weight))[0])
+    return float(cells.total(np.sum(down**2 * free_vertices[owned] / weight))[0])
 
 
 def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:

@@ -37,8 +37,8 @@ def nearest(
     cells: Cells,
     kappa: FloatArray,
     slopes: Slopes,
-    loose: BoolArray,
-    free: BoolArray,
+    free_vertices: BoolArray,
+    free_facets: BoolArray,
     masses: Masses | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """The way from v to the function of degree 2 that is nearest to u_h; collective.
@@ -47,8 +47,8 @@ def nearest(
         cells: The mesh, d = 2.
         kappa: Mean of κ, shape (cells,) or ().
         slopes: Those of v.
-        loose: Which values at vertices are free.
-        free: Which heights are free.
+        free_vertices: Which values at vertices are free.
+        free_facets: Which heights are free.
         masses: What E has beside gradients, if anything.
 
     Returns:
@@ -56,7 +56,9 @@ def nearest(
     """
     mesh, d = cells.domain.mesh, cells.tdim
     patch: slice | IndexArray = slice(None)
-    some = np.flatnonzero(loose[cells.vertices].any(axis=0) | free[cells.facets].any(axis=0))
+    some = np.flatnonzero(
+        free_vertices[cells.vertices].any(axis=0) | free_facets[cells.facets].any(axis=0)
+    )
     few, all_ = cells.total(float(len(some)), float(cells.number))
     if 0.0 < few <= LARGEST * all_:
         mesh, parents = compat.submesh(mesh, d, some.astype(np.int32))
@@ -66,8 +68,8 @@ def nearest(
     dofs = V.dofmap.list[: vertices.shape[1]].T
     b, x = fem.Function(V), fem.Function(V)
     held = np.zeros_like(b.x.array)
-    held[dofs[: d + 1][~loose[vertices]]] = 1.0
-    held[dofs[d + 1 :][~free[facets]]] = 1.0
+    held[dofs[: d + 1][~free_vertices[vertices]]] = 1.0
+    held[dofs[d + 1 :][~free_facets[facets]]] = 1.0
     shared_maximum(V, held)
     fixed = np.flatnonzero(held > 0.0).astype(np.int32)
     # A nodal function of a vertex is λ_i less half the bumps of the two facets it belongs to
@@ -94,7 +96,7 @@ def nearest(
     x.x.scatter_forward()
     nodal = x.x.array[dofs]
     corners, middles = nodal[: d + 1], nodal[d + 1 :]
-    at_vertices, heights = np.zeros(len(loose)), np.zeros(len(free))
+    at_vertices, heights = np.zeros(len(free_vertices)), np.zeros(len(free_facets))
     at_vertices[vertices] = corners
     heights[facets] = middles - 0.5 * (sum_rows(corners) - corners)
     return at_vertices, heights

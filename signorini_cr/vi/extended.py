@@ -102,7 +102,7 @@ class Extended:
         stiffness.exact = True
         stiffness.sort(vectors.x, vectors.b)
 
-    def settle(self, rounding: DataRounding, loads: FloatArray, loose: float) -> Settled:
+    def settle(self, rounding: DataRounding, loads: FloatArray, slack: float) -> Settled:
         """Find active set and forces, and how well they are known; collective.
 
         On return x and the residual are those that contact is read from.
@@ -110,12 +110,12 @@ class Extended:
         Args:
             rounding: Draws what rounding may have done to the data.
             loads: χ in the bounded dofs, shape (n,).
-            loose: How many times more than usual may be wrong with the forces.
+            slack: How many times more than usual may be wrong with the forces.
 
         Raises:
             NotConverged: No active set is that of its own solution.
         """
-        left = self._find_set(loose * FORCES)
+        left = self._find_set(slack * FORCES)
         open_by_data = np.max([self._answer(*rounding(n), n) for n in range(SAMPLES)], axis=0)
         errors = 2.0 * left + open_by_data
         forces, made_of = self._stiffness.totals(self._forces()), self._stiffness.made_of
@@ -126,9 +126,9 @@ class Extended:
         # against all forces, or against what flows where the domain is softest: where u touches
         # without pressing, its own rows may be made of rounding alone
         none = (forces <= LOST * errors) & (
-            (errors <= loose * TOUCHING * made_of)
-            | (errors * len(errors) <= loose * FORCES * total)
-            | (errors <= loose * TOUCHING * flow)
+            (errors <= slack * TOUCHING * made_of)
+            | (errors * len(errors) <= slack * FORCES * total)
+            | (errors <= slack * TOUCHING * flow)
         )
         sizes = self._sizes(forces)
         sizes[none] = np.maximum(made_of, max(total, flow))[none]

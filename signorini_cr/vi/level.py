@@ -15,7 +15,7 @@ from ..fem.physics import OnMesh, Physics
 from ..mesh.domain import Domain
 from ..multigrid.hierarchy import NestedMesh
 from ..multigrid.parents import Parents
-from .pieces import Loose
+from .pieces import Floating
 from .system import System
 
 
@@ -87,11 +87,11 @@ class Level:
         return System(self.data, self.like)
 
     @cached_property
-    def loose(self) -> Loose | None:
+    def floating(self) -> Floating | None:
         """Pieces without a Dirichlet facet, None if there are none."""
         if self.held:
             return None
-        found = Loose.of(self.V, self.system.dirichlet)
+        found = Floating.of(self.V, self.system.dirichlet)
         if found.count:  # what else may hold them takes a form of its own to be known
-            found = Loose.of(self.V, self.system.held)
+            found = Floating.of(self.V, self.system.held)
         return found if found.count else None

@@ -35,7 +35,7 @@ DOUBT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Loose:
+class Floating:
     """Pieces without a Dirichlet facet.
 
     Attributes:
@@ -47,7 +47,7 @@ class Loose:
     piece: IndexArray
 
     @classmethod
-    def of(cls, V: fem.FunctionSpace, dirichlet: Int32Array) -> Loose:
+    def of(cls, V: fem.FunctionSpace, dirichlet: Int32Array) -> Floating:
         """Find them; collective.
 
         Args:
@@ -59,10 +59,10 @@ class Loose:
             np.unique(np.concatenate(comm.allgather(np.unique(found))))
             for found in (labels[dirichlet], labels)
         )
-        loose = np.setdiff1d(own, held)
-        number = np.searchsorted(loose, labels)
-        found = np.append(loose, np.inf)[number] == labels
-        return cls(len(loose), np.where(found, number + 1, 0))
+        floating = np.setdiff1d(own, held)
+        number = np.searchsorted(floating, labels)
+        found = np.append(floating, np.inf)[number] == labels
+        return cls(len(floating), np.where(found, number + 1, 0))
 
     def check(self, system: System, inflow: FloatArray | None) -> None:
         """Insist on pieces that are pressed onto the obstacle; collective.

@@ -115,7 +115,7 @@ class ReducedSolver:
         vectors: Vectors,
         atol: float,
         stiffness: Stiffness,
-        loose: float = 1.0,
+        slack: float = 1.0,
     ):
         """Set the inner solver up.
 
@@ -126,11 +126,11 @@ class ReducedSolver:
             vectors: Right-hand side, and where SNES keeps the iterate and the residual.
             atol: What the linear solver may leave at the end.
             stiffness: Classes of these dofs.
-            loose: How many times more than usual may be wrong with the forces.
+            slack: How many times more than usual may be wrong with the forces.
         """
         self._cycle, self.bounds, self._snes = cycle, bounds, snes
         self._x, self._residual, self._b = vectors.x, vectors.residual, vectors.b
-        self._stiffness, self._share = stiffness, loose * FORCES
+        self._stiffness, self._share = stiffness, slack * FORCES
         self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(bounds.lower), dtype=bool))
         self.reached, self.reduction, self.iterations = np.inf, SET_SHARE, 0
         self._cut, self._comm = True, snes.getComm().tompi4py()

@@ -278,7 +278,7 @@ class NewtonTest:
         """Start the tests; target is what the residual may be unless options say otherwise."""
         self._cycle, self._b, self._target = cycle, b, target
         self._linear, self._stiffness, self._data = linear, stiffness, data
-        self._start, self._loose = np.inf, 1.0
+        self._start, self._slack = np.inf, 1.0
         self._for_the_set = self._passes = self._swaps = 0
         self._forces = linear.forces()
         self.force_error = self.imbalance = np.inf
@@ -301,7 +301,7 @@ class NewtonTest:
         if self._is_large(snes, step, norm, small) or self._looks_at_the_set(step, small, facts):
             return Reason.ITERATING
         noise = self._measure(snes, norm, facts)
-        if self.force_error <= self._loose * FORCES and self.imbalance <= self._loose * FLOWS:
+        if self.force_error <= self._slack * FORCES and self.imbalance <= self._slack * FLOWS:
             return Reason.CONVERGED_FNORM_ABS
         if self._has_another_set(facts, noise) or self._refines(force_error, imbalance):
             return Reason.ITERATING
@@ -313,12 +313,12 @@ class NewtonTest:
             self._start = norm
         rtol, atol, _, _ = snes.getTolerances()
         small = max(atol, rtol * self._start)
-        self._loose = max(1.0, small / self._target)
+        self._slack = max(1.0, small / self._target)
         return float(small)
 
     def _is_solved_by_the_start(self, norm: float, small: float) -> bool:
         """Whether no step is needed: by our own tolerance one is made, to look at the set."""
-        enough = norm == 0.0 or (self._loose > 1.0 and norm <= small)
+        enough = norm == 0.0 or (self._slack > 1.0 and norm <= small)
         if enough:
             self.force_error = self.imbalance = 0.0
         return enough
@@ -356,7 +356,7 @@ class NewtonTest:
 
     def _has_another_set(self, facts: _ContactFacts, noise: FloatArray) -> bool:
         """Whether dofs in the wrong set are what is wrong, and it has not been so too often."""
-        allowed = np.maximum(self._loose * FORCES * facts.sizes, noise)
+        allowed = np.maximum(self._slack * FORCES * facts.sizes, noise)
         if not (facts.misclassified > allowed).any():
             return False
         self._swaps += 1
@@ -374,10 +374,10 @@ class NewtonTest:
         """
         self._passes += 1
         figures = (self.force_error, force_error, FORCES), (self.imbalance, imbalance, FLOWS)
-        gains = any(self._loose * most < now <= GAIN * last for now, last, most in figures)
+        gains = any(self._slack * most < now <= GAIN * last for now, last, most in figures)
         if not gains or self._passes >= PASSES:
             return False
-        reduction = min(1.0, self._loose * FLOWS / max(self.imbalance, 1e-300))
+        reduction = min(1.0, self._slack * FLOWS / max(self.imbalance, 1e-300))
         self._linear.reduction = SET_SHARE * reduction
         return True
 
@@ -386,7 +386,7 @@ class NewtonTest:
         if self._data is not None:
             self.doubtful = True
             return int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS)
-        if max(self.force_error, self.imbalance) <= self._loose * ROUNDED:
+        if max(self.force_error, self.imbalance) <= self._slack * ROUNDED:
             return int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS)
         self.failure = self._lost_in_rounding(x)
         return DIVERGED_ROUNDING
@@ -397,7 +397,7 @@ class NewtonTest:
         there = self._linear, self._cycle.operator, bounds, self._stiffness, vectors
         extended = Extended(*there, self._masses, self._data.offset)
         try:
-            settled = extended.settle(self._data.rounding, self._data.loads, self._loose)
+            settled = extended.settle(self._data.rounding, self._data.loads, self._slack)
             active = extended.active.dofs
         except NotConverged as failure:
             self.failure = failure.reason
@@ -407,14 +407,14 @@ class NewtonTest:
         self.force_error = settled.error
         x, b, residual = vectors.x, vectors.b, vectors.residual
         self.imbalance = self._stiffness.imbalance(x, b, residual, active)
-        if not max(self.force_error, self.imbalance) <= self._loose * ROUNDED:  # NaN is neither
+        if not max(self.force_error, self.imbalance) <= self._slack * ROUNDED:  # NaN is neither
             self.failure = self._lost_in_rounding(x, settled.from_data)
 
     def _force_errors(
         self, x: PETSc.Vec, norm: float, facts: _ContactFacts
     ) -> tuple[FloatArray, FloatArray]:
         """What may be wrong with the forces of each class, in parts, and what is their rounding."""
-        stiffness, loose = self._stiffness, self._loose
+        stiffness, slack = self._stiffness, self._slack
         # the linear solver knows what it left, unless rounding has added to the residual; a
         # misclassified dof has its force there, its neighbours as much, and so may other forces
         left, reached = self._linear.force_errors, self._linear.reached
@@ -429,16 +429,16 @@ class NewtonTest:
                 errors / np.maximum(facts.sizes, 1e-300), of_data / max(total, 1e-300)
             )
         noise = np.zeros_like(errors)
-        if (relative > loose * FORCES).any():
+        if (relative > slack * FORCES).any():
             noise = LOST * NOISE * stiffness.magnitude(x)
             # what is lost in rounding is nothing beside all forces, or where there are none
             lost = (errors <= noise) & (facts.forces <= noise)
             beside = np.where(lost, noise.sum(), np.inf) / max(total, 1e-300)
-            relative = np.where(beside <= loose * FORCES, beside, relative)
+            relative = np.where(beside <= slack * FORCES, beside, relative)
             if sure and not stiffness.varied and lost.all():
                 made_of = np.maximum(stiffness.made_of, 1e-300)
                 touching = noise / made_of
-                if (touching <= loose * TOUCHING).all():
+                if (touching <= slack * TOUCHING).all():
                     relative, self.touching = touching, True
         return relative, noise
 

@@ -766,7 +766,7 @@ def test_what_is_worth_carrying(size):
     domain = square(3, ("contact", "neumann", "dirichlet", "neumann"))
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
     left = np.random.default_rng(WORLD.rank).normal(size=cells.number)
-    y = SimpleNamespace(excess=np.ones((3, cells.number)), left=left.copy(), loose=left.copy())
+    y = SimpleNamespace(excess=np.ones((3, cells.number)), left=left.copy(), unbalanced=left.copy())
     kappa = np.array(2.0)
     found = flux.balance(cells, y, kappa, size, 1e3)
     if size == 1e9:

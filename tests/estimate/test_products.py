@@ -965,9 +965,9 @@ def test_what_v_is_to_make_small(plain):
 def test_what_is_left_and_not_taken_up():
     left, none = np.array([1.0, 2.0, 3.0]), np.zeros(0)
     y = flux.Flux(none, none, none > 0, left, none)
-    assert np.array_equal(y.loose, left)
+    assert np.array_equal(y.unbalanced, left)
     y.taken_up = np.array([False, True, False])
-    assert np.array_equal(y.loose, [1.0, 0.0, 3.0])
+    assert np.array_equal(y.unbalanced, [1.0, 0.0, 3.0])
 
 
 @pytest.mark.serial
