@@ -21,8 +21,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
-from .arrays import FloatArray
-from .data.admissible import check_operator
+from .arrays import FloatArray, summed
+from .data.admissible import check_boundary, check_operator
 from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
 from .data.moments import Rule, Volume
@@ -33,7 +33,7 @@ from .fem.problem import Problem, as_expression
 from .levels import LevelMonitor, Start, check_arguments, solve_level
 from .limits import Limits
 from .mesh.balance import Refined
-from .mesh.domain import Domain
+from .mesh.domain import Domain, get_by_cells, set_by_cells
 from .mesh.refinement import check_refinable, refine
 from .multigrid.hierarchy import Hierarchy, NestedMesh
 from .multigrid.parents import Layout
@@ -95,8 +95,9 @@ class Solver:
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
         self.physics, self._domain = physics, domain
         physics.check(domain)
+        self._checked = physics.moment_of_holding()
         self.refined = [*known, *_uniform(domain, more)]
-        self._stack, self._solved = ExitStack(), 0
+        self._stack, self._solved, self._closed = ExitStack(), 0, False
         self._set_up()
 
     def _set_up(self) -> None:
@@ -118,14 +119,16 @@ class Solver:
     def _carry_down(self) -> None:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
         for function in self.physics.functions:
-            values = function.x.array[function.function_space.dofmap.list[:, 0]]
+            values = get_by_cells(function)
             for fine, *_ in self.refined:
-                values, own = fine.descent[-1].carry(values), fine.own(function)
-                own.x.array[own.function_space.dofmap.list[: len(values), 0]] = values
+                values = fine.descent[-1].carry(values)
+                set_by_cells(fine.own(function), values)
 
-    def _changed(self) -> bool:
-        """Whether a_h would be another one by now; collective."""
-        return self._domain.mesh.comm.allreduce(not self._assembled.lasts, op=MPI.LOR)
+    def _have_changed(self) -> tuple[bool, bool]:
+        """Whether a_h, and u_D or bounds, would be others by now; collective."""
+        comm, moments = self._domain.mesh.comm, (self._assembled, self._checked)
+        changed = summed(comm, np.array([not moment.lasts for moment in moments], dtype=float))
+        return bool(changed[0]), bool(changed[1])
 
     def __enter__(self) -> Self:
         """Begin."""
@@ -142,6 +145,7 @@ class Solver:
 
     def close(self) -> None:
         """Free matrix and multigrid; collective."""
+        self._closed = True
         self._stack.close()
 
     @property
@@ -166,22 +170,46 @@ class Solver:
             monitor: Called after each step of the solver.
 
         Raises:
-            InputError: As for `solve`.
+            InputError: As for `solve`; or the solver is closed, or what it is to start from is of
+                another one.
             NotConverged: As for `solve`.
         """
+        own, start = self._of_this(source, before)
         self._carry_down()
-        if self._changed():
+        operator, boundary = self._have_changed()
+        if boundary:
+            check_boundary(self.physics, self._domain)
+            self._checked = self.physics.moment_of_holding()
+        if operator:
             check_operator(self.physics, self._domain)
-            self.close()
+            self._stack.close()
             self._set_up()
         self._solved += 1
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
-        own = None if source is None else source.x.array
         data = diffusion(self._level.data).renewed(own, np.asarray(rate, dtype=np.float64))
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
         level = Level((*meshes[:-1], renewed), self._held, self._level.system)
-        start = Start(known=before.u if isinstance(before, Solution) else before)
         return solve_level(level, lambda _: nullcontext(self._cycle), start, monitor, {"mesh": 0.0})
+
+    def _of_this(
+        self, source: fem.Function | None, before: Solution | fem.Function | None
+    ) -> tuple[FloatArray | None, Start]:
+        """The source's values, and the start, if they are what this solver can do with; collective.
+
+        Raises:
+            InputError: They are not, or it is closed.
+        """
+        if self._closed:
+            raise InputError("the solver is closed, and what it had is freed")
+        known = before.u if isinstance(before, Solution) else before
+        size = len(self._level.system.u_D.x.array)
+        for name, given in (("source", source), ("before", known)):
+            if given is not None and not isinstance(given, fem.Function):
+                raise InputError(f"{name} is {given!r}; a dolfinx Function is needed")
+            another = given is not None and len(given.x.array) != size
+            if self._domain.mesh.comm.allreduce(another, op=MPI.LOR):
+                raise InputError(f"{name}: a Function on another mesh than that which is solved on")
+        return None if source is None else source.x.array, Start(known=known)
 
     def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
         """Numbers of materials on owned cells, shape (cells,), or () where all are the same."""
@@ -286,6 +314,8 @@ def solve_in_time(
         raise InputError(f"steps is {steps}; it must be 1 or more")
     if scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
+    if not (time is None or hasattr(time, "value")):
+        raise InputError(f"time is {time!r}; it must be a dolfinx Constant, which data hold")
     check_arguments(problem, domain)
     own = _capacities(problem, capacity)
     if problem.exact is not None and problem.f is None:
@@ -306,6 +336,9 @@ def solve_in_time(
             weights = SCHEMES[scheme].weights
             method = SCHEMES[scheme if step >= len(weights) else "euler"]
             needed = method.factor * steps / end
+            t = end * step / steps
+            if time is not None:
+                time.value = t
             if solver is None or needed != factor:
                 factor, former = needed, solver
                 added = {name: factor * each for name, each in {"": capacity, **own}.items()}
@@ -315,15 +348,12 @@ def solve_in_time(
                 if former is not None:
                     former.close()
                 elif restart is None:
-                    then = solver.projected(initial).x.array
+                    then = _at_first(solver, initial, time)
                 else:
-                    start, then, before = _gone_on(solver, restart, initial, step)
+                    start, then, before = _gone_on(solver, restart, initial, step, time)
             source = fem.Function(solver.V)
             for weight, former_u in zip(method.weights, (then, before), strict=False):
                 source.x.array[:] += weight * former_u
-            t = end * step / steps
-            if time is not None:
-                time.value = t
             solution = solver.solve(source, start, rates, monitor)
             before, then = then, solution.u.x.array
             start = fem.Function(solver.V)
@@ -380,11 +410,21 @@ def _stepping(
 
 
 def _gone_on(
-    solver: Solver, restart: Restart, initial: Data, step: int
+    solver: Solver, restart: Restart, initial: Data, step: int, time: Clock | None
 ) -> tuple[fem.Function, FloatArray, FloatArray]:
     """Read u_h after a step, and what u was one and two steps before; collective."""
     known = [restart.function(solver.V, k) for k in range(len(restart.u))]
     former = [each.x.array for each in known[1:]]
     if len(former) < 2:
-        former.append(solver.projected(initial).x.array if step <= 2 else np.empty(0))
+        former.append(_at_first(solver, initial, time) if step <= 2 else np.empty(0))
     return known[0], former[0], former[-1]
+
+
+def _at_first(solver: Solver, initial: Data, time: Clock | None) -> FloatArray:
+    """u_h at the time 0, shape (dofs,); collective."""
+    if time is None:
+        return solver.projected(initial).x.array
+    now, time.value = float(time.value), 0.0
+    found = solver.projected(initial).x.array
+    time.value = now
+    return found

@@ -331,6 +331,7 @@ def test_what_goes_on_for_long_stands_still():
         ({"capacity": -1.0}, "capacity is -1.0; it must be a number above 0"),
         ({"capacity": lambda x: x[0]}, "capacity is <function .*>; it must be a number above 0"),
         ({"levels": 0}, "levels is 0"),
+        ({"time": 0.5}, "time is 0.5; it must be a dolfinx Constant"),
     ],
 )
 def test_what_makes_no_sense_is_refused(wrong, said):
@@ -341,6 +342,66 @@ def test_what_makes_no_sense_is_refused(wrong, said):
     problem = Problem(exact=lambda x: x[0], conditions=waves(0.0).conditions)
     with pytest.raises(InputError, match="f: a problem in time derives none from exact"):
         next(solve_in_time(problem, domain, end=1.0, steps=1))
+
+
+def test_bounds_that_come_to_contradict_one_another_are_refused():
+    domain = SQUARE.mesh(0.5)
+    low, held = clock(domain), clock(domain)
+    held.value = 1.0
+    problem = Problem(
+        f=-1.0,
+        conditions={
+            "floor": Contact(low, upper=0.5),
+            "right": Neumann(),
+            "top": Dirichlet(held),
+            "left": Contact(-1.0),
+        },
+    )
+    with Solver(problem, domain, levels=2) as solver:
+        solver.solve()
+        low.value = 0.75
+        with pytest.raises(InputError, match=r"floor.obstacle: at .* it is 0.25 above the upper"):
+            solver.solve()
+        low.value, held.value = 0.25, -2.0
+        with pytest.raises(InputError, match=r"the obstacle is -1 but the dirichlet value is only"):
+            solver.solve()
+        held.value = 1.0
+        assert solver.solve().contact.kkt.min_gap >= 0.0
+    held.value, low.value = 1.0, 0.0
+    steps = solve_in_time(problem, domain, end=1.0, steps=2, time=low)
+    assert next(steps)[0] == 0.5
+    with pytest.raises(InputError, match=r"it is 0.5 above the upper bound"):
+        next(steps)
+
+
+def test_no_time_counts_but_those_of_the_steps():
+    """Neither the one a run before has left, nor the first, at which data may have no value."""
+    domain = SQUARE.mesh(0.5)
+    t = clock(domain)
+    problem = Problem(
+        f=lambda x: -1.0 / ufl.sqrt(t),
+        coefficient=lambda x: 2.0 - t,
+        conditions=waves(t).conditions | {"top": Dirichlet(lambda x: 1.0 - 0.9 * t)},
+    )
+    found = []
+    for stale in (0.0, 5.0):
+        t.value = stale
+        run = solve_in_time(problem, domain, end=1.0, steps=2, time=t, initial=lambda x: 1.0 + t)
+        found.append([solution.energy for _, solution in run])
+    assert found[0] == pytest.approx(found[1], rel=1e-12)
+
+
+def test_what_a_solver_cannot_do_with_is_refused():
+    domain = SQUARE.mesh(0.5)
+    with Solver(waves(clock(domain)), domain, levels=2) as solver:
+        solution = solver.solve()
+        below = solve(waves(clock(domain)), domain)
+        with pytest.raises(InputError, match=r"before: a Function on another mesh"):
+            solver.solve(before=below)
+        with pytest.raises(InputError, match=r"source is <function .*; a dolfinx Function"):
+            solver.solve(source=lambda x: x[0])
+    with pytest.raises(InputError, match="the solver is closed"):
+        solver.solve(before=solution)
 
 
 def known(solution):

@@ -22,7 +22,7 @@ from ufl.algorithms.analysis import extract_constants
 
 from ..adaptive import solve_adaptive
 from ..arrays import FloatArray
-from ..data.admissible import check_data, check_operator
+from ..data.admissible import check_boundary, check_data, check_operator
 from ..data.consistency import doubts
 from ..diffusion import Diffusion
 from ..errors import InputError, naming, on_root
@@ -103,18 +103,31 @@ class Time:
     clock: Clock
 
     def check(self, forms: Forms, domain: Domain) -> None:
-        """Try out at all times what a_h is made of, where that depends on them; collective."""
+        """Try out at all times what depends on them of a_h, u_D and bounds; collective."""
         losses = [c.loss for c in forms.conditions if c.loss is not None]
-        if not any(map(extract_constants, (forms.kappa, forms.reaction, *losses))):
+        checks = [
+            check
+            for check, data in (
+                (check_operator, (forms.kappa, forms.reaction, *losses)),
+                (check_boundary, forms.holding),
+            )
+            if any(map(extract_constants, data))
+        ]
+        if not checks:
             return
         start = self.clock.value
         for step in range(1, self.steps + 1):
             self.clock.value = self.end * step / self.steps
             try:
-                check_operator(forms, domain)
+                for check in checks:
+                    check(forms, domain)
             except InputError as error:
-                raise InputError(f"{error}, at the time {self.clock.value:g}") from None
+                raise self.dated(error) from None
         self.clock.value = start
+
+    def dated(self, error: InputError) -> InputError:
+        """The same error, with the time."""
+        return InputError(f"{error}, at the time {self.clock.value:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,16 +194,26 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         weights = {f"quantities.{name}.weight": q.place for name, q in self.quantities.items()}
-        check_values(self.expressions, domain, weights)
+        if self.time is None:
+            check_values(self.expressions, domain, weights)
+        else:  # no step looks at what the data are at the time 0
+            self.time.clock.value = self.time.end / self.time.steps
+            try:
+                check_values(self.expressions, domain, weights)
+            except InputError as error:
+                guilty = self.expressions.get(str(error).partition(": ")[0])
+                if guilty is not None and guilty.depends_on_time:
+                    raise self.time.dated(error) from None
+                raise
         forms = Diffusion(self.problem, domain.mesh, "CR", domain.parts, domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
+        if self.time is not None:
+            self.time.check(forms, domain)
         check_data(forms, domain)
         if self.time is None:
             check_pieces(forms, domain)  # capacity would hold all
-        else:
-            self.time.check(forms, domain)
         return [*self._of_no_material(domain), *self._of_no_time(), *doubts(forms, domain)]
 
     def _of_no_time(self) -> list[str]:

@@ -103,6 +103,11 @@ def check_data(forms: Forms, domain: Domain) -> None:
             is above u_D where Γ0 meets Γ1. The message names the point and the values.
     """
     check_operator(forms, domain)
+    check_boundary(forms, domain)
+
+
+def check_boundary(forms: Forms, domain: Domain) -> None:
+    """Insist on u_D, α and β that some function has, as `check_data` does; collective."""
     comm = domain.mesh.comm
     fixed = [(_Values(c.fixed, domain), _Facets.of(domain, c.number)) for c in forms.fixed]
     for condition, (u_D, facets) in zip(forms.fixed, fixed, strict=True):

@@ -362,7 +362,8 @@ class Enclosure:
         size, steady = int(np.prod(function.ufl_shape)), V.ufl_element().embedded_superdegree == 0
         if box.cells is None or box.domain is None or not steady or V.dofmap.bs != size:
             raise Unknown(function.name)
-        dofs = box.domain.own(function).function_space.dofmap.list[box.cells, 0]
+        function = box.domain.own(function)
+        dofs = function.function_space.dofmap.list[box.cells, 0]
         values = function.x.array[
             size * dofs + int(np.ravel_multi_index(place, function.ufl_shape))
         ]

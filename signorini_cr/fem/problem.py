@@ -419,6 +419,21 @@ class Forms:
                 found |= dict.fromkeys([] if kernel is None else kernel.constants)
         return list(found)
 
+    @property
+    def holding(self) -> list[Expr]:
+        """u_D and the bounds of all parts."""
+        bounds = [bound for c in self.bounded for _, bound in c.bounds]
+        return [*(c.fixed for c in self.fixed), *bounds]
+
+    def moment_of_holding(self) -> Moment:
+        """Note what Constants and Functions in these are at present, on the coarsest mesh."""
+        constants: dict[fem.Constant, None] = {}
+        functions: dict[fem.Function, None] = {}
+        for each in self.holding:
+            constants |= dict.fromkeys(ufl.algorithms.analysis.extract_constants(each))
+            functions |= dict.fromkeys(ufl.algorithms.extract_coefficients(each))
+        return Moment(list(constants), functions)
+
     def moment(self, domains: Sequence[Domain]) -> Moment:
         """Note what the Constants and Functions are at present, on some meshes."""
         own = [domain.own(function) for function in self.functions for domain in domains]
@@ -524,7 +539,10 @@ class Forms:
         Raises:
             InputError: It is none that the element can do with.
         """
-        form = getattr(self.problem.form, name)(*arguments, *self._measures)
+        try:
+            form = getattr(self.problem.form, name)(*arguments, *self._measures)
+        except (TypeError, ValueError) as error:  # of UFL, or of what the function takes
+            raise InputError(f"form: {name} makes no form: {error}") from error
         if not isinstance(form, ufl.Form):
             raise InputError(f"form: {name} returns {form!r}; a UFL form is needed")
         for integral in form.integrals():

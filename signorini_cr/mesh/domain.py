@@ -167,16 +167,16 @@ class Domain:
         if V.mesh is self.mesh:
             return function
         above = [i for i, step in enumerate(self.descent) if step.mesh() is V.mesh]
-        if not above or not is_by_cells(function):
+        if not above or not _is_of_degree_0(function):
             raise InputError(
                 "data given as a dolfinx Function live on one mesh only, unless they are of degree"
                 " 0 on the coarsest; give a function of x to solve on a sequence of meshes"
             )
-        values = function.x.array[V.dofmap.list[:, 0]]
+        values = get_by_cells(function)
         for step in self.descent[above[0] :]:
             values = step.carry(values)
-        fine = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=function.name)
-        fine.x.array[fine.function_space.dofmap.list[: len(values), 0]] = values
+        fine = fem.Function(fem.functionspace(self.mesh, V.ufl_element()), name=function.name)
+        set_by_cells(fine, values)
         self._own[function] = fine
         return fine
 
@@ -352,10 +352,26 @@ def _insist_on(
 
 def is_by_cells(function: object) -> bool:
     """Tell whether it is a scalar function that is constant on each cell."""
-    if not isinstance(function, fem.Function) or function.ufl_shape:
-        return False
-    element = function.function_space.ufl_element()
-    return bool(element.embedded_superdegree == 0)
+    return (
+        isinstance(function, fem.Function) and not function.ufl_shape and _is_of_degree_0(function)
+    )
+
+
+def _is_of_degree_0(function: fem.Function) -> bool:
+    return bool(function.function_space.ufl_element().embedded_superdegree == 0)
+
+
+def get_by_cells(function: fem.Function) -> FloatArray:
+    """What a function of degree 0 is on this rank's cells, shape (cells, entries)."""
+    dofmap = function.function_space.dofmap
+    values: FloatArray = function.x.array.reshape(-1, dofmap.bs)[dofmap.list[:, 0]]
+    return values
+
+
+def set_by_cells(function: fem.Function, values: FloatArray) -> None:
+    """Set it on the first of these cells."""
+    dofmap = function.function_space.dofmap
+    function.x.array.reshape(-1, dofmap.bs)[dofmap.list[: len(values), 0]] = values
 
 
 def numbered(names: Iterable[str]) -> dict[str, int]:

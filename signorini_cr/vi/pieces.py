@@ -100,7 +100,10 @@ class Floating:
         adrift = pressed <= doubt
         adrift[0] = False
         complaint, bad = None, int(np.argmax(adrift))
-        wanted = " or ".join(["below 0"] * bool(below[bad]) + ["above 0"] * bool(above[bad]))
+        sign = "below" if below[bad] else "above"
+        wanted = f"only one {sign} 0, which presses it onto the obstacle, would hold it"
+        if below[bad] and above[bad]:
+            wanted = "obstacles on both sides may hold it, but it is solved with another one only"
         amount = f"of {net[bad]:g}"
         if 0.0 < abs(rules[-1][bad]) <= doubt[bad]:
             amount = "that can't be told from 0"
@@ -115,8 +118,7 @@ class Floating:
                 if alone
                 else f"the domain falls into pieces, and the one around ({around}) has {missing}"
             ) + (
-                f"a net force ∫f + ∫g {amount}: only one {wanted}, which presses it onto the "
-                "obstacle, would hold it"
+                f"a net force ∫f + ∫g {amount}: {wanted}"
                 if below[bad] or above[bad]
                 else "no contact facet: nothing holds it"
             )

@@ -206,7 +206,13 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
             '[data]\ncoefficient = "1 - t"',
             "is 0; it must be above 0 everywhere, at the time 1",
         ),
-        ("[data]", '[data]\nreaction = "x - t"', "it must not be below 0, at the time 0.25"),
+        ("[data]", '[data]\nreaction = "x - t"', "must be 0 or more everywhere, at the time 0.25"),
+        (
+            'dirichlet", "neumann"]\nsize = 0.4\n[define]\nwave = "sin(4*t)"\n[data]',
+            'dirichlet", "dirichlet"]\nsize = 0.4\n[define]\nwave = "sin(4*t)"\n[data]\n'
+            'dirichlet = "-0.2*t"',
+            "only -0.15; the obstacle must not be above it, at the time 0.75",
+        ),
         ("wave =", "t = 1\nwave =", "define.t: t is the time"),
         ("[time]", '[exact]\nu = "x"\n[time]', "exact.u: a problem in time has none"),
     ],

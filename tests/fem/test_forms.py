@@ -112,6 +112,32 @@ def test_functions_of_degree_0_go_along():
     assert ours.contact.force == pytest.approx(theirs.contact.force, rel=1e-7)
 
 
+def test_tensors_of_degree_0_go_along():
+    """Like the matrix of what their entries are, which are scalars; the error's bound, too."""
+    domain = SQUARE.mesh(0.25)
+    cells = {shape: fem.functionspace(domain.mesh, ("DG", 0, shape)) for shape in ((), (2, 2))}
+    whole = fem.Function(cells[2, 2])
+    whole.interpolate(lambda x: np.stack([2 + x[0], 0.2 * x[1], 0.2 * x[1], 1 + x[1] ** 2]))
+    rows = whole.x.array.reshape(-1, 4)
+    entries = [fem.Function(cells[()]) for _ in range(4)]
+    for i, entry in enumerate(entries):
+        entry.x.array[:] = rows[:, i]
+    k = ufl.as_matrix([entries[:2], entries[2:]])
+    walls = WALLS | {"floor": Contact(-0.02)}
+    data = {"f": -1.0, "conditions": walls}
+    form = Form(lambda u, v, dx, ds: ufl.inner(whole * ufl.grad(u), ufl.grad(v)) * dx)
+    ours, own, theirs = (
+        list(solve_levels(Problem(**data, **each), domain, 3))
+        for each in ({"coefficient": whole}, {"form": form}, {"coefficient": k})
+    )
+    for one, two, three in zip(ours, own, theirs, strict=True):
+        assert one.contact.force == pytest.approx(three.contact.force, rel=1e-7)
+        assert two.contact.force == pytest.approx(three.contact.force, rel=1e-7)
+        for name in ("bound_h1", "energy"):
+            bounds = (getattr(each.certificate, name) for each in (one, three))
+            assert next(bounds) == pytest.approx(next(bounds), rel=1e-6)
+
+
 def nowhere(u, v, dx, ds):
     x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(v))
     return ufl.ln(-1.0 - x[0] ** 2) * u * v * dx
@@ -125,6 +151,9 @@ def nowhere(u, v, dx, ds):
         (Form(nowhere), "not finite"),
         (Form(lambda u, v, dx, ds: u**2 * v * dx), "not linear"),
         (Form(lambda u, v, dx, ds: 3.0), "a UFL form is needed"),
+        (Form(lambda u, v: u * v), "a makes no form: .*2 positional arguments"),
+        (Form(lambda u, v, dx, ds: v * ufl.grad(u) * dx), "a makes no form: "),
+        (Form(lambda u, v, dx, ds: u * v * dx("rock")), "a makes no form: .*rock"),
         (Form(lambda u, v, dx, ds: ufl.avg(u) * ufl.avg(v) * ufl.dS), "interior_facet"),
         (Form(lambda u, v, dx, ds: u.dx(0).dx(0) * v.dx(1).dx(1) * dx), "second order"),
         (Form(lambda u, v, dx, ds: u * v * ds("roof")), "called 'roof'"),
