@@ -60,6 +60,7 @@ def check_values(
     expressions: Mapping[str, Expression],
     domain: Domain,
     weights: Weights = MappingProxyType({}),
+    time: float | None = None,
 ) -> None:
     """Insist on finite data, and on a positive coefficient; collective.
 
@@ -68,6 +69,7 @@ def check_values(
         domain: They are evaluated at vertices and midpoints of its cells or, where they belong to
             a part of the boundary, of that part's facets.
         weights: Where those that are weights are used.
+        time: What the time is now, if there is one.
 
     Raises:
         InputError: The message names the key and the first such point from the left.
@@ -95,11 +97,14 @@ def check_values(
     if len(bad) == 1:
         return
     key = list(expressions)[bad[0]]
+    when = ""
+    if time is not None and expressions[key].depends_on_time:
+        when = f", at the time {time:g}"
     message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
         what = "above 0" if is_kappa(key) else "0 or more"
         there = "there" if key.startswith("material.") else "everywhere"
-        raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} {there}")
+        raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} {there}{when}")
     part, named = (
         _used_on(key, domain, weights),
         {value: name for name, value in domain.parts.items()},
@@ -107,7 +112,7 @@ def check_values(
     where = "in the domain" if part is None else f"on the {named[part]} part"
     raise InputError(
         f"{message}; it must be finite everywhere {where}"
-        " (where(condition, a, b) can set a value apart)"
+        f" (where(condition, a, b) can set a value apart){when}"
     )
 
 

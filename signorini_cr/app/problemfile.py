@@ -122,12 +122,8 @@ class Time:
                 for check in checks:
                     check(forms, domain)
             except InputError as error:
-                raise self.dated(error) from None
+                raise InputError(f"{error}, at the time {self.clock.value:g}") from None
         self.clock.value = start
-
-    def dated(self, error: InputError) -> InputError:
-        """The same error, with the time."""
-        return InputError(f"{error}, at the time {self.clock.value:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,17 +190,10 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         weights = {f"quantities.{name}.weight": q.place for name, q in self.quantities.items()}
-        if self.time is None:
-            check_values(self.expressions, domain, weights)
-        else:  # no step looks at what the data are at the time 0
-            self.time.clock.value = self.time.end / self.time.steps
-            try:
-                check_values(self.expressions, domain, weights)
-            except InputError as error:
-                guilty = self.expressions.get(str(error).partition(": ")[0])
-                if guilty is not None and guilty.depends_on_time:
-                    raise self.time.dated(error) from None
-                raise
+        first = None
+        if self.time is not None:  # no step looks at what the data are at the time 0
+            first = self.time.clock.value = self.time.end / self.time.steps
+        check_values(self.expressions, domain, weights, first)
         forms = Diffusion(self.problem, domain.mesh, "CR", domain.parts, domain.materials)
         there = sum(len(domain.facets(condition.number)) for condition in forms.bounded)
         if not domain.mesh.comm.allreduce(there):

@@ -224,6 +224,16 @@ class Kernel:
         return Moment(self.constants, self.own)
 
 
+def _constants_in(data: Iterable[Expr]) -> dict[fem.Constant, None]:
+    """The Constants in expressions, each once."""
+    return {e: None for each in data for e in ufl.algorithms.analysis.extract_constants(each)}
+
+
+def _functions_in(data: Iterable[Expr]) -> dict[fem.Function, None]:
+    """The Functions in expressions, each once."""
+    return {e: None for each in data for e in ufl.algorithms.extract_coefficients(each)}
+
+
 class Forms:
     """The forms of the paper for one problem and element, compiled when first asked for.
 
@@ -400,9 +410,7 @@ class Forms:
     @cached_property
     def functions(self) -> list[fem.Function]:
         """The Functions that the data hold, each once."""
-        found: dict[fem.Function, None] = {}
-        for each in self._data.values():
-            found |= dict.fromkeys(ufl.algorithms.extract_coefficients(each))
+        found = _functions_in(self._data.values())
         if self.problem.form is not None:
             for kernel in (self.a, self.own_load):
                 found |= dict.fromkeys([] if kernel is None else kernel.own)
@@ -411,9 +419,7 @@ class Forms:
     @cached_property
     def constants(self) -> list[fem.Constant]:
         """The Constants that the data hold, each once."""
-        found: dict[fem.Constant, None] = {}
-        for each in self._data.values():
-            found |= dict.fromkeys(ufl.algorithms.analysis.extract_constants(each))
+        found = _constants_in(self._data.values())
         if self.problem.form is not None:
             for kernel in (self.a, self.own_load):
                 found |= dict.fromkeys([] if kernel is None else kernel.constants)
@@ -427,12 +433,7 @@ class Forms:
 
     def moment_of_holding(self) -> Moment:
         """Note what Constants and Functions in these are at present, on the coarsest mesh."""
-        constants: dict[fem.Constant, None] = {}
-        functions: dict[fem.Function, None] = {}
-        for each in self.holding:
-            constants |= dict.fromkeys(ufl.algorithms.analysis.extract_constants(each))
-            functions |= dict.fromkeys(ufl.algorithms.extract_coefficients(each))
-        return Moment(list(constants), functions)
+        return Moment(list(_constants_in(self.holding)), _functions_in(self.holding))
 
     def moment(self, domains: Sequence[Domain]) -> Moment:
         """Note what the Constants and Functions are at present, on some meshes."""
