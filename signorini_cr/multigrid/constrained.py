@@ -70,14 +70,18 @@ class ConstrainedMatrix:
         matrix: A, whole outside the blocks of `constrained`.
         dofs: Owned dofs that can be constrained, local numbers, ascending, shape (n,).
         diagonal: Their diagonal entries of A, shape (n,).
+        whole_diagonal: Those of all owned dofs, shape (owned dofs,).
     """
 
     def __init__(self, A: PETSc.Mat, dofs: Int32Array):
         """Note the rows and columns of all dofs that may ever be constrained; collective."""
         self.matrix, self.dofs = A, dofs
+        entries = A.getDiagonal()
+        self.whole_diagonal: FloatArray = entries.array_r.copy()
+        release(entries)
+        self.diagonal = self.whole_diagonal[dofs]
         numbers = numbers_of(A, dofs)
-        csr = start, column, value = rows_of(A, numbers)
-        self.diagonal: FloatArray = value[column == np.repeat(numbers, np.diff(start))]
+        csr = _, column, _ = rows_of(A, numbers)
         sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
         self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)
         self._product = self._rows.createVecLeft()

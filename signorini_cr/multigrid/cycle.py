@@ -140,8 +140,8 @@ class Grid:
             constrained: Owned dofs that are not free, beside those on Γ0, whose diagonal is 1
                 whatever the matrix's magnitude.
         """
-        terms = self.matrix.getDiagonal()
-        terms.pointwiseMult(terms, x)
+        terms = x.duplicate()
+        terms.array[:] = self.operator.whole_diagonal * x.array_r
         for dofs in (self.dirichlet, constrained):
             terms.array[dofs] = 0.0
         norm = terms.norm()
@@ -304,9 +304,8 @@ def is_galerkin_product(grid: Grid, finer: PETSc.Mat, transfer: Transfer) -> boo
     grid.matrix.mult(v, own)
     difference = np.abs(product.array_r - own.array_r)
     difference[grid.dirichlet] = 0.0
-    diagonal = grid.matrix.getDiagonal()
-    largest = float((difference / diagonal.array_r).max(initial=0.0))
-    release(v, product, own, u, image, diagonal)
+    largest = float((difference / grid.operator.whole_diagonal).max(initial=0.0))
+    release(v, product, own, u, image)
     return grid.matrix.getComm().tompi4py().allreduce(largest, op=MPI.MAX) <= NEARLY
 
 

@@ -250,9 +250,7 @@ class _AtDofs:
         vector = ghosted_vector(u.function_space, u.x.array)
         terms = system.operator.magnitude(vector) + np.abs(system.b[bounded])
         release(vector)
-        entries = system.A.getDiagonal()
-        diagonal = entries.array_r.copy()
-        release(entries)
+        diagonal = system.operator.whole_diagonal
         x, raw = u.x.array[bounded], residual.x.array[bounded]
         gap, side = system.bounds.gap(x), system.bounds.side(x)
         force = np.where(np.abs(raw) > rounding * terms, raw, 0.0)

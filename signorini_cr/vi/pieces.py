@@ -20,7 +20,6 @@ from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import raise_together
 from ..fem.space import shared_maximum
-from ..garbage import release
 from ..mesh.planar import pieces
 from ..multigrid.parents import Layout
 from .active import ActiveSet
@@ -142,9 +141,8 @@ class Floating:
         forces = bounds.side(at) * residual.x.array[bounded]
         pushed = ActiveSet.of(bounded, bounds.gap(at), forces)
         active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
-        entries = system.A.getDiagonal()
-        lift = np.abs(system.b[: entries.local_size]) / entries.array_r
-        release(entries)
+        diagonal = system.operator.whole_diagonal
+        lift = np.abs(system.b[: len(diagonal)]) / diagonal
         # upside down where the net force pulls
         side = np.where(self._net(system) <= 0.0, 1.0, -1.0)
         floor = np.where(side[self.piece] > 0.0, _floors(system, 1.0), _floors(system, -1.0))

@@ -119,8 +119,7 @@ class Stiffness:
             window: As `windows` has it; None for one that all are in.
         """
         self._grid, self.comm = grid, grid.matrix.getComm().tompi4py()
-        diagonal = grid.matrix.getDiagonal()
-        entries = diagonal.array
+        entries = grid.operator.whole_diagonal.copy()
         entries[grid.dirichlet] = np.inf
         low = self.comm.allreduce(float(entries.min(initial=np.inf)), op=MPI.MIN)
         entries[grid.dirichlet] = 0.0
@@ -139,9 +138,8 @@ class Stiffness:
         if row_sums is not None and self._kinds > 1:
             self._free, self._class = np.ones(len(entries), dtype=bool), self._classes(entries)
             self._free[grid.dirichlet] = False
-            self._diagonal = entries.copy()
+            self._diagonal = entries
             self._take_differences(row_sums)
-        release(diagonal)
 
     @property
     def varied(self) -> bool:

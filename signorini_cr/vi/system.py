@@ -139,6 +139,7 @@ class System:
         if like is None:
             self.A = _assembled(data.a, self._bc(self.u_D), layout)
             self.operator = ConstrainedMatrix(self.A, self.bounded)
+            _require_positive(comm, self.operator.whole_diagonal)
         else:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi())
@@ -465,16 +466,16 @@ def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
             else assemble_matrix(a, [bc])
         )
     A.assemble()
-    diagonal = A.getDiagonal()
-    positive = bool((diagonal.array_r > 0.0).all())
-    release(diagonal)
+    A.setOption(PETSc.Mat.Option.SPD, True)
+    return A
+
+
+def _require_positive(comm: MPI.Comm, diagonal: FloatArray) -> None:
     complaint = (
         "data: the coefficient must be finite and above 0 everywhere, reactions and coefficients of"
         " parts finite"
     )
-    raise_together(A.comm.tompi4py(), None if positive else complaint)
-    A.setOption(PETSc.Mat.Option.SPD, True)
-    return A
+    raise_together(comm, None if (diagonal > 0.0).all() else complaint)
 
 
 def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:

@@ -81,17 +81,18 @@ def test_a_bottom_follows_its_matrix():
     solver.free()
 
 
-def grid(dirichlet=(0, 19)):
+def grid(dirichlet=(0, 19), scale=1.0):
     """A space that stands alone."""
-    operator = ConstrainedMatrix(banded(20, -0.4), np.array([4, 8, 11], np.int32))
+    matrix = banded(20, -0.4)
+    matrix.scale(scale)
+    operator = ConstrainedMatrix(matrix, np.array([4, 8, 11], np.int32))
     dofs = SimpleNamespace(cells=np.zeros((0, 3), np.int32))
     return Grid(operator, dofs, np.array(dirichlet, np.int32))
 
 
 def test_rounding_of_a_grid():
     """‖diag(A) x‖ but for what is held."""
-    space = grid()
-    space.matrix.scale(3.0)
+    space = grid(scale=3.0)
     x = space.matrix.createVecRight()
     x.array[:] = np.random.default_rng(3).normal(size=x.local_size)
     constrained = np.array([4, 11], np.int32)
