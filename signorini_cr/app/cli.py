@@ -151,7 +151,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..memory import most_memory
     from ..output import report as output
     from ..output.files import check_writable
-    from .runs import solve_case, stopped, what_is_kept
+    from .run import stopped, what_is_kept
+    from .runs import solve_case
 
     folder = _folder(args)
     with naming("--out"):

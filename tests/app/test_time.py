@@ -18,7 +18,7 @@ from helpers import is_picture
 from mpi4py import MPI
 
 from signorini_cr import evolution, limits, memory
-from signorini_cr.app import cli, runs
+from signorini_cr.app import cli, timerun
 from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
@@ -277,7 +277,7 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
     if not draws:
         monkeypatch.setattr(plots, "can_draw", lambda comm: False)
     with monkeypatch.context() as patch:
-        original, begin = evolution.Solver.solve, runs._Steps._solve_on
+        original, begin = evolution.Solver.solve, timerun.Steps._solve_on
         left = [math.inf]  # until the mesh is found
 
         def solve(self, *arguments):
@@ -290,7 +290,7 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
             left[0] = after
             begin(self, meshes)
 
-        patch.setattr(runs._Steps, "_solve_on", solve_on)
+        patch.setattr(timerun.Steps, "_solve_on", solve_on)
         patch.setattr(evolution.Solver, "solve", solve)
         assert solved(path, out) == 3
     if COMM.rank == 0:
@@ -321,12 +321,12 @@ def test_on_another_number_of_ranks(first, then, scheme, case, whole, shared_tmp
     (shared_tmp_path / "run.py").write_text(
         "import sys\n"
         "from signorini_cr import evolution\n"
-        "from signorini_cr.app import cli, runs\n"
+        "from signorini_cr.app import cli, timerun\n"
         "from signorini_cr.errors import NotConverged\n"
         "from signorini_cr.output import plots\n"
         "plots.can_draw = lambda comm: False\n"
         "found = []\n"
-        "def solve_on(self, meshes, begin=runs._Steps._solve_on):\n"
+        "def solve_on(self, meshes, begin=timerun.Steps._solve_on):\n"
         "    found.append(0)\n"
         "    begin(self, meshes)\n"
         "def stop(self, *arguments, solve=evolution.Solver.solve):\n"
@@ -334,7 +334,7 @@ def test_on_another_number_of_ranks(first, then, scheme, case, whole, shared_tmp
         "    if max(found, default=0) > 3 and '--resume' not in sys.argv:\n"
         "        raise NotConverged('told')\n"
         "    return solve(self, *arguments)\n"
-        "runs._Steps._solve_on, evolution.Solver.solve = solve_on, stop\n"
+        "timerun.Steps._solve_on, evolution.Solver.solve = solve_on, stop\n"
         "sys.exit(cli.main())\n"
     )
     words = ["solve", case(text), "--out", out, "-q"]
@@ -378,7 +378,7 @@ def test_a_step_that_would_end_too_late_is_not_begun(
 
     monkeypatch.setattr(limits, "time", Clock)
     monkeypatch.setattr(limits.Limits, "admit_step", after)
-    monkeypatch.setattr(runs._Run, "time_left", property(lambda run: run.args.max_time))
+    monkeypatch.setattr(timerun.Run, "time_left", property(lambda run: run.args.max_time))
     out = shared_tmp_path / "out"
     assert solved(case(), out, "--max-time", 3.5) == 3
     if COMM.rank == 0:
