@@ -36,9 +36,10 @@ DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "
 def forces(solution: Solution) -> npt.NDArray[np.float64]:
     """Force less gap times the diagonal on the contact facets, in parts of the load."""
     system = solution.level.system
-    dofs, diagonal = system.bounded, system.A.getDiagonal().array_r
-    gap = solution.u.x.array[dofs] - system.lower[dofs]
-    return (solution.residual.x.array[dofs] - diagonal[dofs] * gap) / system.residual_scale
+    dofs, bounds = system.bounded, system.bounds
+    x = solution.u.x.array[dofs] - system.offset
+    pushes = bounds.side(x) * solution.residual.x.array[dofs]
+    return (pushes - system.operator.diagonal * bounds.gap(x)) / system.residual_scale
 
 
 def wrong(solution: Solution, exact: Solution) -> str:

@@ -95,7 +95,7 @@ class Solver:
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
         self.physics, self._domain = physics, domain
         physics.check(domain)
-        self._checked = physics.moment_of_holding()
+        self._checked = physics.snapshot_of_holding()
         self.refined = [*known, *_uniform(domain, more)]
         self._stack, self._solved, self._closed = ExitStack(), 0, False
         self._set_up()
@@ -114,7 +114,7 @@ class Solver:
         again = self._held and self._solved != 1
         lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, again)
         self._cycle = self._stack.enter_context(lent)
-        self._assembled, self._solved = self.physics.a.moment(), 0
+        self._assembled, self._solved = self.physics.a.snapshot(), 0
 
     def _carry_down(self) -> None:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
@@ -179,7 +179,7 @@ class Solver:
         operator, boundary = self._have_changed()
         if boundary:
             check_boundary(self.physics, self._domain)
-            self._checked = self.physics.moment_of_holding()
+            self._checked = self.physics.snapshot_of_holding()
         if operator:
             check_operator(self.physics, self._domain)
             self._stack.close()

@@ -23,9 +23,9 @@ from .multigrid.hierarchy import Hierarchy, NestedMesh
 from .restart import Restart
 from .solution import Solution
 from .vi.contact import contact_facts
+from .vi.floating import Floating
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
-from .vi.pieces import Floating
 from .vi.solver import Data, solve_vi
 from .vi.system import System
 

@@ -22,8 +22,8 @@ from scipy.sparse.linalg import spsolve
 
 from signorini_cr import InputError, Polygon, compat
 from signorini_cr.adaptive import adaptively
-from signorini_cr.fem.moment import Moment
 from signorini_cr.fem.physics import Imposed
+from signorini_cr.fem.snapshot import Snapshot
 from signorini_cr.fem.space import facet_corners, facet_entities, facet_measures, shared_sum
 from signorini_cr.levels import solve_physics
 from signorini_cr.limits import Limits
@@ -162,8 +162,8 @@ class Coupled:
     def on(self, domain):
         return self.kind(domain)
 
-    def moment(self, domains):
-        return Moment([], [])
+    def snapshot(self, domains):
+        return Snapshot([], [])
 
     def certify(self, solution):
         """How far u_h is from what averages at vertices make of it: no bound, but it marks."""

@@ -26,8 +26,8 @@ from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
-from ..fem.conditions import facets_of, is_by_cells, negative
-from ..fem.problem import Forms, number
+from ..fem.conditions import as_number, facets_of, is_by_cells, negative
+from ..fem.problem import Forms
 from ..fem.space import facet_entities, function_space, ghosted_vector
 from ..garbage import release
 from ..mesh.domain import Domain
@@ -251,7 +251,7 @@ class _Values:
     def __init__(self, expression: ufl.core.expr.Expr, domain: Domain):
         self.expression, self.mesh = expression, domain.mesh
         self.precision = Precision.of(domain.mesh)
-        self.constant = number(expression) is not None
+        self.constant = as_number(expression) is not None
         self.tied = bool(ufl.algorithms.extract_coefficients(expression))
 
     def at(

@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..compat import cell_nodes
-from ..fem.conditions import Condition
-from ..fem.problem import Forms, number
+from ..fem.conditions import Condition, as_number
+from ..fem.problem import Forms
 from ..fem.space import facet_entities, facet_measures
 from ..mesh.domain import Domain
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
@@ -46,7 +46,7 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
     found = []
     for condition in forms.conditions:
         main = condition.main
-        given = condition.source != "exact.u" and main is not None and number(main) != 0.0
+        given = condition.source != "exact.u" and main is not None and as_number(main) != 0.0
         if given and domain.mesh.comm.allreduce(len(domain.facets(condition.number))) == 0:
             found.append(f"{condition.source}: it acts nowhere, for {_nowhere(condition, forms)}")
     if forms.exact is not None:
@@ -71,7 +71,7 @@ def _nowhere(condition: Condition, forms: Forms) -> str:
 def _jumps(forms: Forms, domain: Domain) -> list[str]:
     """Say that κ jumps inside of cells; collective."""
     kappa: Any = forms.kappa
-    if number(kappa) is not None:
+    if as_number(kappa) is not None:
         return []
     mesh = domain.mesh
     owned = mesh.topology.index_map(mesh.topology.dim).size_local
@@ -118,7 +118,7 @@ class _Solution:
         self.forms, self.domain, self.mesh = forms, domain, domain.mesh
         self.precision = Precision.of(domain.mesh).vertices
         self.u: Any = forms.exact
-        flat = number(self.u) is not None
+        flat = as_number(self.u) is not None
         self.slope: Any = None if flat else forms.kappa * ufl.grad(self.u)
 
     def complaint(self) -> str | None:

@@ -17,7 +17,7 @@ from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import InputError
 from ..fem.cells import Cells, measures, vertex_rows
-from ..fem.conditions import Condition, is_by_cells, number
+from ..fem.conditions import Condition, as_number, is_by_cells
 from ..fem.physics import Imposed, OnMesh
 from ..fem.problem import Kernel
 from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
@@ -139,7 +139,7 @@ class Moments:
 
 def _by_cells(compiled: Compiled, domain: Domain, datum: Expr) -> FloatArray:
     """Values on owned cells of what is constant there, shape (cells,), or () for a number."""
-    known = number(datum)
+    known = as_number(datum)
     if known is not None:
         return np.array(known)
     expression, mesh = compiled.by_cells(datum), domain.mesh

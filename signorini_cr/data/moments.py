@@ -25,9 +25,9 @@ from ufl.core.expr import Expr
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import BoundaryFacets, Cells
-from ..fem.conditions import Condition, may_change
+from ..fem.conditions import Condition, as_number, may_change
 from ..fem.physics import Imposed
-from ..fem.problem import Forms, number
+from ..fem.problem import Forms
 from ..fem.simplified import simplified
 from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
@@ -77,7 +77,7 @@ class Volume:
 
     def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
         """Compile the expression, unless it is a number."""
-        self.number, self.rule = number(expression), rule
+        self.number, self.rule = as_number(expression), rule
         self.expression, self._mesh = expression, mesh
         self._values = None
         if self.number is None:
@@ -182,7 +182,7 @@ class Tensor:
 
 def _same(a: Expr, b: Expr) -> bool:
     """Tell whether two formulas are the same, as formulas or where they cancel."""
-    return bool(a == b) or number(simplified(a - b)) == 0.0
+    return bool(a == b) or as_number(simplified(a - b)) == 0.0
 
 
 class Coefficient:
@@ -447,7 +447,7 @@ class Trace:
         self.points, self.weights = facet_quadrature(mesh, degree)
         self.hats = np.column_stack([1.0 - self.points.sum(axis=1), self.points])
         self._corners = len(corners)
-        self.constant = number(expression)
+        self.constant = as_number(expression)
         if self.constant is None:
             middle = corners.mean(axis=0)
             near = [corners + part * (middle - corners) for part in BESIDE]

@@ -31,9 +31,9 @@ from .companion import Companion, Lifted, companion, on_facet
 from .cubic import cubed, with_cubics
 from .curl import improve, promising
 from .cusps import Cusps
+from .duality import Within, integrate, integrate_edge
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .functional import Functional, Masses
-from .gap import Within, integrate, integrate_edge
 from .lifting import below
 from .loss import Loss, half
 from .reaction import Reaction

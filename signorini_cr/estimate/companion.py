@@ -22,7 +22,7 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
 from ..data.moments import OnFacets, OnParts
 from ..fem.cells import THIN, BoundaryFacets, Cells, measures
-from ..fem.conditions import number
+from ..fem.conditions import as_number
 from .best import solved
 from .cusps import Cusps
 from .draft import Draft, Floors, kinked
@@ -404,7 +404,7 @@ def _lift(
     third = cells.ways_between(*side.ends) * (data.sign * thirds[side.dofs])
     companion = Cubic(v, data.sign * bumps[side.dofs], third)
     base, lossy = None, data.condition.loss
-    loss = 0.0 if lossy is None else number(lossy)
+    loss = 0.0 if lossy is None else as_number(lossy)
     if loss is None:
         assert boundary.masses is not None
         loss = boundary.masses.largest(cells, side)

@@ -18,9 +18,9 @@ from ..data.moments import Coefficient
 from ..fem.cells import THIN, Cells, blocks, measures, pick
 from .beyond import Beyond
 from .companion import Companion
+from .duality import taken_up
 from .flux import Flux, field_squares
 from .functional import Slopes
-from .gap import taken_up
 from .nearest import nearest
 from .shapes import quadrature
 from .sums import Sums

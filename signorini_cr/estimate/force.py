@@ -24,7 +24,7 @@ from ..options import ESTIMATE_PREFIX, LINEAR, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
 from .companion import bend_squares
-from .gap import apart
+from .duality import apart
 from .heights import distance
 from .weights import Beyond, Weight
 

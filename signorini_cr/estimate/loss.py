@@ -12,7 +12,7 @@ from ..arrays import FloatArray
 from ..data.diffusion import DiffusionOnMesh
 from ..data.loads import Known, Segments
 from ..data.moments import Coefficient
-from .gap import EPS
+from .duality import EPS
 
 UNKNOWN = "{}: its coefficient is not known to be bounded, and 0 or more, on each facet"
 

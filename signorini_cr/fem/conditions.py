@@ -25,7 +25,7 @@ Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
 
 
-def number(expression: Expr) -> float | None:
+def as_number(expression: Expr) -> float | None:
     """The number that an expression is, or None."""
     if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
         return float(expression)
@@ -49,7 +49,7 @@ def may_change(expression: Expr) -> bool:
 
 def negative(expression: Expr) -> Expr:
     """The same with the other sign; a number remains one."""
-    value = number(expression)
+    value = as_number(expression)
     return -expression if value is None else ufl.as_ufl(-value)
 
 
@@ -309,12 +309,12 @@ class Contact(Condition):
     def flux(self) -> Any:
         """What does not depend on u; None where there is neither that nor a b."""
         known = _known(self)
-        return known if self.loss is not None or number(known) != 0.0 else None
+        return known if self.loss is not None or as_number(known) != 0.0 else None
 
     @property
     def loss(self) -> Any:
         """All of b; None where it is 0."""
-        return None if number(self.coefficient) == 0.0 else self.coefficient
+        return None if as_number(self.coefficient) == 0.0 else self.coefficient
 
 
 def _in_python(label: str, part: str, name: str) -> str:
@@ -325,7 +325,7 @@ def _in_python(label: str, part: str, name: str) -> str:
 
 def _known(condition: Any) -> Any:
     """G + b u_ext."""
-    if number(condition.coefficient) == 0.0:
+    if as_number(condition.coefficient) == 0.0:
         return condition.g
     return condition.g + condition.coefficient * condition.external
 

@@ -20,7 +20,7 @@ from dolfinx import fem
 
 from ..arrays import FloatArray, Int32Array
 from ..mesh.domain import Domain
-from .moment import Moment
+from .snapshot import Snapshot
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ class Physics(Protocol):
     def on(self, domain: Domain) -> OnMesh:
         """Take it to a mesh."""
 
-    def moment(self, domains: Sequence[Domain]) -> Moment:
+    def snapshot(self, domains: Sequence[Domain]) -> Snapshot:
         """Note what data that may change are at present, on some meshes."""
 
     def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:

@@ -32,9 +32,9 @@ from ..errors import InputError, meant
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials
-from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, is_by_cells, number
-from .moment import Moment
+from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, as_number, is_by_cells
 from .simplified import simplified
+from .snapshot import Snapshot
 from .space import facet_entities, ufl_element
 
 
@@ -219,9 +219,9 @@ class Kernel:
         """The Constants in the form."""
         return list(self._constants)
 
-    def moment(self) -> Moment:
+    def snapshot(self) -> Snapshot:
         """Note what the Constants and Functions in the form are at present."""
-        return Moment(self.constants, self.own)
+        return Snapshot(self.constants, self.own)
 
 
 def _constants_in(data: Iterable[Expr]) -> dict[fem.Constant, None]:
@@ -282,14 +282,14 @@ class Forms:
             None if problem.exact is None else as_expression(problem.exact, self.x, "exact")
         )
         # UFL can't differentiate a number
-        level = self.exact is None or number(self.exact) is not None or problem.form is not None
+        level = self.exact is None or as_number(self.exact) is not None or problem.form is not None
         flux = None if level else self.kappa * ufl.grad(self.exact)
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
         self.asked = None if flux is None else simplified(-ufl.div(flux))
         self.reaction = self._by_material("reaction", problem.reaction, materials)
         derivable = self.exact is not None and problem.form is None
-        if derivable and number(self.reaction) != 0.0:
+        if derivable and as_number(self.reaction) != 0.0:
             gain = self.reaction * self.exact
             self.asked = gain if self.asked is None else simplified(self.asked + gain)
         derived = 0.0 if self.asked is None else self.asked
@@ -314,7 +314,7 @@ class Forms:
         if any(each.ufl_shape for each in (base, *own.values())):
             base, *others = map(self._as_tensor, (base, *own.values()))
             own = dict(zip(own, others, strict=True))
-        numbers = [number(each) for each in (base, *own.values())]
+        numbers = [as_number(each) for each in (base, *own.values())]
         if None not in numbers:
             if len(set(numbers)) == 1:
                 return base
@@ -431,19 +431,19 @@ class Forms:
         bounds = [bound for c in self.bounded for _, bound in c.bounds]
         return [*(c.fixed for c in self.fixed), *bounds]
 
-    def moment_of_holding(self) -> Moment:
+    def snapshot_of_holding(self) -> Snapshot:
         """Note what Constants and Functions in these are at present, on the coarsest mesh."""
-        return Moment(list(_constants_in(self.holding)), _functions_in(self.holding))
+        return Snapshot(list(_constants_in(self.holding)), _functions_in(self.holding))
 
-    def moment(self, domains: Sequence[Domain]) -> Moment:
+    def snapshot(self, domains: Sequence[Domain]) -> Snapshot:
         """Note what the Constants and Functions are at present, on some meshes."""
         own = [domain.own(function) for function in self.functions for domain in domains]
-        return Moment(self.constants, dict.fromkeys([*self.functions, *own]))
+        return Snapshot(self.constants, dict.fromkeys([*self.functions, *own]))
 
     @property
     def uniform(self) -> bool:
         """Whether κ is a number."""
-        return number(self.kappa) is not None
+        return as_number(self.kappa) is not None
 
     @property
     def steady(self) -> bool:
@@ -453,7 +453,7 @@ class Forms:
     @cached_property
     def loaded(self) -> bool:
         """Whether f or a flux is more than the number 0."""
-        return any(number(data) != 0.0 for data in (self.f, *(c.flux for c in self.natural)))
+        return any(as_number(data) != 0.0 for data in (self.f, *(c.flux for c in self.natural)))
 
     @cached_property
     def chi(self) -> Kernel | None:
@@ -462,7 +462,7 @@ class Forms:
         degree = {"quadrature_degree": self.problem.quadrature_degree}
         loads = [(self.f, self.dx), *((c.flux, self.ds(c.number)) for c in self.natural)]
         terms = [
-            data * v * measure(metadata=degree) for data, measure in loads if number(data) != 0.0
+            data * v * measure(metadata=degree) for data, measure in loads if as_number(data) != 0.0
         ]
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
@@ -518,7 +518,7 @@ class Forms:
         return [
             self._adjustable(b) * u * v * measure(metadata=degree)
             for b, measure in terms
-            if number(b) != 0.0
+            if as_number(b) != 0.0
         ]
 
     @property
@@ -578,7 +578,7 @@ class Forms:
 
     def _adjustable(self, data: Expr) -> Expr:
         """A Constant in the place of a number, or of a tensor of numbers: one form serves all."""
-        values = [number(data[index]) for index in np.ndindex(data.ufl_shape)]
+        values = [as_number(data[index]) for index in np.ndindex(data.ufl_shape)]
         if None in values:
             return data
         return fem.Constant(self.mesh, np.array(values, dtype=np.float64).reshape(data.ufl_shape))

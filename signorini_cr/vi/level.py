@@ -15,7 +15,7 @@ from ..fem.physics import OnMesh, Physics
 from ..mesh.domain import Domain
 from ..multigrid.hierarchy import NestedMesh
 from ..multigrid.parents import Parents
-from .pieces import Floating
+from .floating import Floating
 from .system import System
 
 
@@ -38,11 +38,11 @@ class Level:
         """Insist on a PETSc of real numbers in double precision."""
         if PETSc.ScalarType is not np.float64:
             raise InputError(f"PETSc's numbers are {PETSc.ScalarType.__name__}; float64 is needed")
-        self._moment = self.physics.moment([each.domain for each in self.meshes])
+        self._snapshot = self.physics.snapshot([each.domain for each in self.meshes])
 
     def as_made(self) -> AbstractContextManager[None]:
         """A block in which data that may change are what they were when this was made."""
-        return self._moment.again()
+        return self._snapshot.again()
 
     @property
     def number(self) -> int:

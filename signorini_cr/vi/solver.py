@@ -174,7 +174,7 @@ def solve_vi(
             extended = test.doubtful and reason > 0
             if extended:
                 test.settle(vectors, bounds)
-        if test.touching and not extended:
+        if test.forceless and not extended:
             vectors.residual.array[linear.active_now().dofs] = 0.0
         iterations = Iterations(
             snes.getIterationNumber(),
@@ -261,7 +261,7 @@ class NewtonTest:
     Attributes:
         force_error: What may be wrong with the contact forces, in parts of their sum.
         imbalance: Largest residual of a class of stiffness in parts of its flows.
-        touching: Whether all forces are rounding, and there are none.
+        forceless: Whether all forces are rounding, and there are none.
         doubtful: Whether SNES has come as far as it can in double precision, which is not enough.
         failure: Why it can't be done, if it can't.
     """
@@ -282,7 +282,7 @@ class NewtonTest:
         self._for_the_set = self._passes = self._swaps = 0
         self._forces = linear.forces()
         self.force_error = self.imbalance = np.inf
-        self.doubtful = self.touching = False
+        self.doubtful = self.forceless = False
         self.failure = ""
 
     def __call__(self, snes: PETSc.SNES, step: int, norm: float) -> int:
@@ -326,7 +326,7 @@ class NewtonTest:
     def _forget(self) -> None:
         """What was measured in another set says nothing."""
         self.force_error = self.imbalance = np.inf
-        self.touching = False
+        self.forceless = False
 
     def _is_large(self, snes: PETSc.SNES, step: int, norm: float, small: float) -> bool:
         """Whether the residual is too large, and no rounding; collective."""
@@ -437,9 +437,9 @@ class NewtonTest:
             relative = np.where(beside <= slack * FORCES, beside, relative)
             if sure and not stiffness.varied and lost.all():
                 made_of = np.maximum(stiffness.made_of, 1e-300)
-                touching = noise / made_of
-                if (touching <= slack * TOUCHING).all():
-                    relative, self.touching = touching, True
+                lost_part = noise / made_of
+                if (lost_part <= slack * TOUCHING).all():
+                    relative, self.forceless = lost_part, True
         return relative, noise
 
     def _close(self, x: PETSc.Vec, active: ActiveSet, moving: bool) -> FloatArray:

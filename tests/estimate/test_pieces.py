@@ -16,7 +16,16 @@ from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
 from signorini_cr.data.moments import OnParts
 from signorini_cr.data.triangles import Triangles
-from signorini_cr.estimate import certificate, companion, cubic, draft, flux, gap, lifting, shapes
+from signorini_cr.estimate import (
+    certificate,
+    companion,
+    cubic,
+    draft,
+    duality,
+    flux,
+    lifting,
+    shapes,
+)
 from signorini_cr.estimate.best import Promise, solved
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.cusps import Cusps
@@ -937,7 +946,7 @@ def test_twist():
     field = np.sqrt(field_squares(cells, P, everywhere))
     slope = np.sqrt((w * cells.apply(w, everywhere)).sum(axis=0))
     spread = np.maximum(1 / kappa.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.high)
-    found = gap._twist(cells, kappa, everywhere, P, w)
+    found = duality._twist(cells, kappa, everywhere, P, w)
     assert np.allclose(found, spread * (field + kappa.mean * slope))
 
 
@@ -952,7 +961,7 @@ def test_slack_of_quadrature(few):
     errors[4:6] *= 1e-4 if few else 1.0  # there are few strips, too
     by_norm = 0
     R, t, W, inverse_W, strip_low, strip_high, _ = errors
-    found = gap._with_slack(np.stack([pp, bb, pb, vv, yy, *at_z]), errors, 2, 9)
+    found = duality._with_slack(np.stack([pp, bb, pb, vv, yy, *at_z]), errors, 2, 9)
     assert np.array_equal(found[:4], (pp, bb, pb, vv))
     for row, sign, zz, steep in ((4, -2, *at_z[:2]), (5, 2, *at_z[2:])):
         for i in range(5):
@@ -997,7 +1006,7 @@ def test_what_the_gap_is_made_of_at_points(more):
     k = rng.uniform(1, 2, size=(4, cells.number))
     hats, weights = rng.dirichlet(np.ones(3), 4), rng.dirichlet(np.ones(4))
     points = zip(k, weights, hats, strict=True)
-    found = gap._at_points(cells, kappa.mean, slice(0, cells.number), y, v, w, points)
+    found = duality._at_points(cells, kappa.mean, slice(0, cells.number), y, v, w, points)
     mesh = cells.domain.mesh
     x = mesh.geometry.x[mesh.geometry.dofmap[: cells.number], :2]
     for cell in range(cells.number):
@@ -1289,10 +1298,10 @@ def test_what_oscillates_on_thin_cells():
         mean=rng.normal(size=number), hats=hats - hats.mean(axis=0), bumps=0 * hats,
         variance=rng.uniform(2, 3, number), rest=rng.uniform(1, 2, number),
     )  # fmt: skip
-    sums = gap.integrate(cells, kappa, w, load, fluxes, v)
+    sums = duality.integrate(cells, kappa, w, load, fluxes, v)
     weights, points = quadrature()[1], quadrature()[0]
     at = ((kappa.mean, weight, hat) for hat, weight in zip(points, weights, strict=True))
-    pp, bb, pb, *_ = gap._at_points(cells, kappa.mean, slice(0, number), fluxes, v, w, at)
+    pp, bb, pb, *_ = duality._at_points(cells, kappa.mean, slice(0, number), fluxes, v, w, at)
     norm = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702
     norm = norm * np.sqrt(cells.volume * load.rest / kappa.low)
     near, far = (np.sqrt(pp + bb + 2 * sign * pb) for sign in (1, -1))
@@ -1323,7 +1332,7 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     edge = Segments.of(data.edges[0], data.cells, kappa.low, 1.0)
     before = {name: getattr(sums, name).copy() for name in ("indicators", "middle", "across")}
     fluxes = SimpleNamespace(beyond=Beyond(np.zeros(len(cells.exterior)), None))
-    found = gap.integrate_edge(data.cells, kappa, None, None, edge, fluxes, None, sums)
+    found = duality.integrate_edge(data.cells, kappa, None, None, edge, fluxes, None, sums)
     at, sizes = edge.oscillation(True)
     assert found == 0.0 and len(at) == 4 and sizes.min() > 1e-3
     norms = np.zeros(cells.number)

@@ -17,7 +17,7 @@ from signorini_cr.data.loads import Certain, Known, Segments, VolumeMoments
 from signorini_cr.data.moments import OnParts
 from signorini_cr.data.pieces import Pieces
 from signorini_cr.diffusion import Diffusion
-from signorini_cr.estimate import certificate, cusps, flux, force, gap, pairing, weights
+from signorini_cr.estimate import certificate, cusps, duality, flux, force, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
 from signorini_cr.estimate.companion import Companion, _at_vertices
 from signorini_cr.estimate.curl import _pull
@@ -364,7 +364,7 @@ def vary(made, cells, phi, work, rng):
         at.affine(made.vertices[cells.vertices] - made.w), at.of_facets(made.bumps)
     )
     pull, (unsure, mean) = rng.normal(size=(3, number)), rng.uniform(1, 2, (2, number))
-    made.within = gap.Within(pull, unsure, mean)
+    made.within = duality.Within(pull, unsure, mean)
     kappa = np.broadcast_to(made.kappa, number)[:, None]
     own = bend + at.affine(made.w)[1]  # ∇v
     work += (pull * phi).sum() - at.integral(kappa * (own * slopes).sum(axis=2)).sum()
@@ -620,7 +620,7 @@ def test_the_gap_with_a_reaction(bent):
     steepness = at.integral((at.affine(w)[1] ** 2).sum(axis=2))
     y = SimpleNamespace(excess=P, beyond=None, taken_up=taken_up, left=left, steepness=steepness)
     f = psi(at.x) * rng.uniform(1, 2, number)[:, None]
-    sums = gap.integrate(cells, kappa, w, moments(at, f), y, v, c)
+    sums = duality.integrate(cells, kappa, w, moments(at, f), y, v, c)
     jump, off = sums_of(at.affine(excess), at.of_facets(bumps))
     u, du = at.affine(w)
     k, field = kappa.mean[:, None, None], at.field(P)
@@ -687,7 +687,7 @@ def test_the_gap_where_a_tensor_varies(more):
     y = SimpleNamespace(excess=P, beyond=beyond, steepness=steepness)
     v = Companion(None, bumps, excess, None, None, None, None, None, thirds if more else None)
     before = rng.uniform(size=(2, number))
-    vv, far, near, energy = gap._of_tensor(
+    vv, far, near, energy = duality._of_tensor(
         cells, kappa, slice(0, number), y, v, w, (before[0], before[1])
     )
     _, du = at.affine(w)
@@ -704,7 +704,7 @@ def test_the_gap_where_a_tensor_varies(more):
     kappa.values = kappa.cut = None
     kappa.tensor = True
     load = VolumeMoments(rng.normal(size=number), None, None)
-    sums = gap.integrate(cells, kappa, w, load, y, v)
+    sums = duality.integrate(cells, kappa, w, load, y, v)
     grown = []
     for gained, old, row, dz in (
         (far, before[0], sums.across, du + change),
@@ -758,7 +758,7 @@ def test_quadrature_on_pieces(more):
         kappa.cut = SimpleNamespace(errors=errors, pieces=pieces, errors_inside=inside)
         kappa.inside = np.tile(k[pieces.parent], (len(at.weights), 1))
         part = slice(1, number)
-        found.append(np.array(gap._by_quadrature(cells, kappa, part, y, v, w)))
+        found.append(np.array(duality._by_quadrature(cells, kappa, part, y, v, w)))
         assert np.allclose(found[-1], found[0])
     u = at.affine(w)[1]
     off, field = sums_of(at.affine(excess), at.of_facets(bumps))[1], at.field(P)
@@ -775,7 +775,7 @@ def test_quadrature_on_pieces(more):
     errors[1], errors[2:4] = np.inf, rng.uniform(size=(2, number))
     kappa.cut = SimpleNamespace(errors=errors, pieces=whole[:0], errors_inside=errors[:, :0])
     kappa.inside = np.empty((len(at.weights), 0))
-    rows = gap._by_quadrature(cells, kappa, part, y, v, w)
+    rows = duality._by_quadrature(cells, kappa, part, y, v, w)
     for row, dz in ((4, u + off), (5, u - off)):
         of_z = at.integral((dz**2).sum(axis=2))
         missed = (2 * errors[3] + largest * errors[4]) * of_y + (
@@ -991,7 +991,7 @@ def test_the_gap_on_sides(reacts):
     y = SimpleNamespace(excess=excess, beyond=None, shed=shed)
     load = SimpleNamespace(variance=variance)
     reaction = np.where(np.arange(number) % 2, 1e3, 0.1) if reacts else np.array(0.0)
-    assert gap.integrate_edge(cells, kappa, w, load, edge, y, v, sums, reaction) == 0.0
+    assert duality.integrate_edge(cells, kappa, w, load, edge, y, v, sums, reaction) == 0.0
     jump = on.affine(made.vertices[cells.vertices] - w) + on.bump(made.bumps)
     rest = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]
     rest -= (rest @ on.weights)[:, None]

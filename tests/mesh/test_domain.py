@@ -553,7 +553,7 @@ def test_pieces_that_nothing_holds(shared_tmp_path: Path):
 
 
 def test_pieces_of_a_mesh_whose_curves_have_names_of_their_own(shared_tmp_path: Path):
-    """What holds them, the conditions say; `vi.pieces` asks these."""
+    """What holds them, the conditions say; `vi.floating` asks these."""
     path = shared_tmp_path / "own.msh"
     nodes = ["1 0 0 0", "2 1 0 0", "3 0 1 0", "4 2 0 0", "5 3 0 0", "6 2 1 0"]
     elements = ["1 2 1 1 1 2", "1 2 2 2 4 5", "2 2 3 3 1 2 3", "2 2 3 3 4 5 6"]

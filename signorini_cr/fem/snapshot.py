@@ -11,7 +11,7 @@ from dolfinx import fem
 from ..arrays import FloatArray
 
 
-class Moment:
+class Snapshot:
     """The values of Constants and Functions, as they are when it is made.
 
     Args:
