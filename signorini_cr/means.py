@@ -25,6 +25,7 @@ from .mesh.domain import Domain, named
 
 DOMAIN = "domain"
 """The place that all of Ω is, unless u has a mean on something else that is called so."""
+BOTH = "is a part and a material: one of them needs another name"
 NO_MEAN = "u has no bounds there"
 NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral with u has bounds"
 AFLOAT = (
@@ -123,7 +124,7 @@ def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
     materials = list(domain.materials.numbers)
     own = [c.part for c in forms.conditions if c.fixed is None] + materials
     if place in domain.parts and place in materials:
-        raise InputError(f"{where!r} is a part and a material: one of them needs another name")
+        raise InputError(f"{where!r} {BOTH}")
     if place is None or place in own:
         return place
     if place == DOMAIN:

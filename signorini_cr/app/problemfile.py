@@ -10,7 +10,7 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from ..errors import InputError, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
 from ..levels import check_pieces, solve_levels
-from ..means import DOMAIN
+from ..means import BOTH, DOMAIN
 from ..mesh.balance import Refined
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
@@ -355,7 +355,7 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _quantities(
-    table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], materials: Iterable[str]
+    table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], materials: Collection[str]
 ) -> dict[str, Quantity]:
     """[quantities]: each a kind and a place of a type that goes with it; yet without weights."""
     types = {name: name for name in PARTS} | {name: part["type"] for name, part in parts.items()}
@@ -376,6 +376,8 @@ def _quantities(
         if of_u:
             own += [*materials, DOMAIN]
         place = one_of(own)(f"{key}.{kind}", value[kind])
+        if of_u and place in types and place in materials:
+            raise InputError(f"{key}.{kind}: {place} {BOTH}")
         # own ends with all of the domain, unless something else is called so
         found[name] = Quantity(kind, None if of_u and own.index(place) == len(own) - 1 else place)
     return found

@@ -243,6 +243,11 @@ BAD: dict[str, tuple[str, list[str]]] = {
         CASE + '[quantities]\nedge = { mean = "dirichlet" }\n',
         ["quantities.edge.mean", "allowed are contact, neumann, domain"],
     ),
+    "mean over a part and a material of one name": (
+        part_case("soil").replace('"deck"', '"soil"')
+        + f'[material.soil]\n{SOIL}\n[quantities]\nwet = {{ mean = "soil" }}\n',
+        ["quantities.wet.mean: soil is a part and a material: one of them needs another name"],
+    ),
     "title a number": (with_('"S1"', "1"), ["title: a string is needed, found 1"]),
     "title with an escape": (
         with_('"S1"', '"a\\u001b[31mred"'),
