@@ -183,12 +183,14 @@ class ProblemFile:
         Raises:
             InputError: An expression is not finite where it is needed, the coefficient is not
                 positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, nothing holds a
-                piece of the domain, or the last mesh of the sequence would be absurdly large.
+                piece of the domain, a quantity's part has no facet, or the last mesh of the
+                sequence would be absurdly large.
         """
         topology = domain.mesh.topology
         cells = topology.index_map(topology.dim).size_global
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
+        self._insist_on_places(domain)
         weights = {f"quantities.{name}.weight": q.place for name, q in self.quantities.items()}
         first = None
         if self.time is not None:  # no step looks at what the data are at the time 0
@@ -204,6 +206,20 @@ class ProblemFile:
         if self.time is None:
             check_pieces(forms, domain)  # capacity would hold all
         return [*self._of_no_material(domain), *self._of_no_time(), *doubts(forms, domain)]
+
+    def _insist_on_places(self, domain: Domain) -> None:
+        """Refuse quantities of parts that no facet is in; collective."""
+        there = [
+            name
+            for name, part in domain.parts.items()
+            if domain.mesh.comm.allreduce(len(domain.facets(part)))
+        ]
+        for name, what in self.quantities.items():
+            if what.place in domain.parts and what.place not in there:
+                raise InputError(
+                    f"quantities.{name}.{what.kind}: no facet is {what.place}; the boundary has"
+                    f" {', '.join(there)}"
+                )
 
     def _of_no_time(self) -> list[str]:
         """Say which capacities do nothing, for nothing changes in time."""

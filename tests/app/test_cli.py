@@ -248,6 +248,15 @@ BAD: dict[str, tuple[str, list[str]]] = {
         + f'[material.soil]\n{SOIL}\n[quantities]\nwet = {{ mean = "soil" }}\n',
         ["quantities.wet.mean: soil is a part and a material: one of them needs another name"],
     ),
+    "flux through a part that no facet is in": (
+        part_case("deck").replace("dirichlet", "sides")
+        + '[boundary.sides]\ntype = "dirichlet"\n[quantities]\nheat = { flux = "dirichlet" }\n',
+        ["quantities.heat.flux: no facet is dirichlet; the boundary has deck, sides"],
+    ),
+    "mean over a part that no facet is in": (
+        CASE + '[quantities]\nair = { mean = "neumann" }\n',
+        ["quantities.air.mean: no facet is neumann; the boundary has contact, dirichlet"],
+    ),
     "title a number": (with_('"S1"', "1"), ["title: a string is needed, found 1"]),
     "title with an escape": (
         with_('"S1"', '"a\\u001b[31mred"'),
