@@ -381,7 +381,11 @@ def _quantities(
         kinds = [kind for kind in QUANTITIES if isinstance(value, dict) and kind in value]
         if isinstance(value, dict):
             insist_known(value, key, allowed(QUANTITY))
-        if len(kinds) != 1:
+        if len(kinds) > 1:
+            raise InputError(
+                f"{key}: one of {', '.join(QUANTITIES)} is to be given, found {' and '.join(kinds)}"
+            )
+        if not kinds:
             raise InputError(
                 f'{key}: {{ force = "PART" }}, {{ flux = "PART" }}, {{ mean = "PLACE" }} or'
                 f' {{ integral = "PLACE" }}, perhaps with a weight, is needed, found {shown(value)}'

@@ -418,7 +418,13 @@ all = { integral = "domain", weight = "x - y" }
         ('"x - y"', '"x < y"', "quantities.all.weight: a number is needed"),
         ('"x - y"', '"x - z"', "quantities.all.weight:"),
         ('weight = "2"', 'weigth = "2"', "quantities.tilt.weigth: there is no such key"),
-        ('mean = "low", ', 'mean = "low", flux = "contact", ', "quantities.tilt: { force"),
+        ('mean = "low", ', "", "quantities.tilt: { force"),
+        (
+            'mean = "low", ',
+            'mean = "low", flux = "contact", ',
+            "quantities.tilt: one of force, flux, mean, integral is to be given, found flux and"
+            " mean",
+        ),
     ]:
         with pytest.raises(InputError, match=re.escape(said)):
             other = read(text.replace(old, new))
