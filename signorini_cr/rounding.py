@@ -57,6 +57,11 @@ def told(value: float) -> str:
     return _told(_exact(value)) if math.isfinite(value) else str(value)
 
 
+def counted(number: int, thing: str) -> str:
+    """A number of things, which are called by the word for one of them and an s."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
 def _exact(value: float) -> Decimal:
     return Decimal(repr(float(value)))
 

@@ -19,7 +19,7 @@ from .fem import fields
 from .fem.conditions import Data
 from .fem.problem import Problem
 from .mesh.domain import Domain
-from .rounding import at_most
+from .rounding import at_most, counted
 from .shown import HTML
 from .vi.contact import Contact
 from .vi.level import Level
@@ -54,7 +54,7 @@ class Solution:
         contact, known = self.contact, self.__dict__.get("certificate")
         line = (
             f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
-            f"{contact.number} facets in contact, force {contact.force:.6g}"
+            f"{counted(contact.number, 'facet')} in contact, force {contact.force:.6g}"
         )
         bound = known and known.bound_h1
         return line + (">" if bound is None else f", error at most {at_most(bound)}>")

@@ -35,6 +35,7 @@ from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
 from ..quantities import Quantity
+from ..rounding import counted
 from ..solution import Solution
 from .datacheck import bare, check_values, is_kappa
 from .expressions import Expression, check_name, parse
@@ -518,7 +519,7 @@ def _polygon(
     if len(boundary) != len(vertices):
         raise InputError(
             f"{section}.boundary: one label for each edge is needed: {len(vertices)} edges,"
-            f" found {len(boundary)} labels"
+            f" found {counted(len(boundary), 'label')}"
         )
     arcs = _arcs(f"{section}.arcs", array(f"{section}.arcs", table.get("arcs", [])))
     with naming(key):

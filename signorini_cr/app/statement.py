@@ -11,6 +11,7 @@ import numpy as np
 from ..fem.conditions import Condition, as_factor
 from ..fem.space import facet_measures
 from ..mesh.domain import Domain
+from ..rounding import counted
 from .problemfile import ProblemFile
 from .reference import EXPRESSIONS, KINDS
 from .screen import WIDTH
@@ -43,14 +44,14 @@ def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
     for name, material in materials.items():
         data = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
         number = _cells(domain, name)
-        rows[name] = f"{', '.join(data) or 'no data of its own'}; {number} cells"
+        rows[name] = f"{', '.join(data) or 'no data of its own'}; {counted(number, 'cell')}"
     for name, (kind, given) in _conditions(said).items():
         condition = kind.in_words({key: _short(v) for key, v in given.items()}, exact, kappa)
         if there := _facets(domain, name):
             rows[name] = f"{condition}; {there}{unit}"
     if case.time is not None:
-        words = f"t from 0 to {case.time.end:g}{case.units.after('time')} in {case.time.steps}"
-        words += f" steps of {case.time.scheme}"
+        words = f"t from 0 to {case.time.end:g}{case.units.after('time')} in"
+        words += f" {counted(case.time.steps, 'step')} of {case.time.scheme}"
         rate = as_factor(f"{case.time.capacity:g}", "∂u/∂t")
         start = f"u = {_short(said.get('time.initial', 0))} at t = 0"
         rows["time"] = f"{words}; {rate} on the left; {start}"
@@ -85,7 +86,8 @@ def _extent(domain: Domain) -> str:
     low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
     high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
     extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
-    return f"{mesh.topology.index_map(mesh.topology.dim).size_global} cells in {extent}"
+    number = mesh.topology.index_map(mesh.topology.dim).size_global
+    return f"{counted(number, 'cell')} in {extent}"
 
 
 def _equation(
@@ -141,7 +143,8 @@ def _facets(domain: Domain, part: str) -> str:
     if not number:
         return ""
     total = mesh.comm.allreduce(float(measures.sum()))
-    return f"{number} facets, {'length' if mesh.geometry.dim == 2 else 'area'} {total:.6g}"
+    size = "length" if mesh.geometry.dim == 2 else "area"
+    return f"{counted(number, 'facet')}, {size} {total:.6g}"
 
 
 def _conditions(said: Mapping[str, Any]) -> dict[str, tuple[type[Condition], dict[str, Any]]]:

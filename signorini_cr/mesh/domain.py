@@ -36,6 +36,7 @@ from mpi4py import MPI
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
 from ..errors import InputError, insist_on_kind, naming, on_root, raise_together
+from ..rounding import counted
 from . import gmshmesh
 from .exchange import Exchange
 from .materials import Materials
@@ -310,8 +311,8 @@ def _values(
         values[chosen] = parts[name]
         if np.any(inside[chosen]):
             complaint = (
-                f"{np.count_nonzero(inside[chosen])} facets tagged {name} lie "
-                "inside the domain: only exterior facets can be tagged"
+                f"{counted(np.count_nonzero(inside[chosen]), 'facet')} tagged {name} inside the"
+                " domain: only exterior facets can be tagged"
             )
     raise_together(mesh.comm, complaint)
     return values

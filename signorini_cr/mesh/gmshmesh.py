@@ -17,6 +17,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..errors import InputError, naming
+from ..rounding import counted
 from . import mshfile
 from .lines import arranged, sorted_out
 from .mshfile import KINDS, MshFile
@@ -361,8 +362,8 @@ def _of_materials(
         here = [name for name in materials if called[name] & block.groups]
         if len(here) > 1 and len(block.nodes):
             raise InputError(
-                f"{len(block.nodes)} triangles lie in the physical surfaces {here[0]!r} and"
-                f" {here[1]!r}: a cell consists of one material"
+                f"the physical surfaces {here[0]!r} and {here[1]!r} share"
+                f" {counted(len(block.nodes), 'triangle')}: a cell consists of one material"
             )
         found.append(np.full(len(block.nodes), materials[here[0]] if here else 0, np.int32))
     numbers: Int32Array = np.concatenate(found)
@@ -416,7 +417,7 @@ def _check_names(
             )
             hint = f"did you mean {near[0]}? Allowed there" if near else "allowed there"
             raise InputError(
-                f"{what} has {number} facets on the boundary; {hint} are"
+                f"{what} has {counted(number, 'facet')} on the boundary; {hint} are"
                 f" {', '.join(allowed)}, or a name with a condition of its own, in a problem file"
                 f" a section [boundary.{name.strip()}]; a curve without a physical group is neumann"
             )

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from ..arrays import FloatArray, Int64Array
 from ..errors import InputError
 from ..reading import read_regular
+from ..rounding import counted
 from .polygon import FARTHEST
 
 Array = npt.NDArray[Any]
@@ -154,7 +155,7 @@ class _Text:
     def end_row(self) -> None:
         """As in `_Source`."""
         if self.words:
-            self.fail(f"there are {len(self.words)} numbers too many")
+            self.fail(f"{counted(len(self.words), 'number')} too many")
 
     def table(self, rows: int, columns: int, kind: str) -> Array:
         """As in `_Source`."""

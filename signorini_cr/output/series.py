@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from ..errors import on_root
-from ..rounding import at_most, interval, known
+from ..rounding import at_most, counted, interval, known
 from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
@@ -150,7 +150,9 @@ def certified(records: Sequence[Mapping[str, Any]]) -> str:
     """What is certain about the steps."""
     bounds = [record["bound_h1"] for record in records if record["bound_h1"] is not None]
     if len(bounds) < len(records):
-        return f"{len(records) - len(bounds)} of {len(records)} steps have no bound of the error"
+        missing = len(records) - len(bounds)
+        have = "has" if missing == 1 else "have"
+        return f"{missing} of {counted(len(records), 'step')} {have} no bound of the error"
     return (
         "certified: in no step is ‖∇_h(u − u_h)‖ of its own problem, in which the steps before"
         f" are data, above {at_most(max(bounds))}"
@@ -164,7 +166,7 @@ def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
         found = [record["quantities"][name] for record in records]
         reasons = [each["reason"] for each in found if each["reason"] is not None]
         if reasons:
-            said.append(f"{name} has no bounds in {len(reasons)} steps: {reasons[0]}")
+            said.append(f"{name} has no bounds in {counted(len(reasons), 'step')}: {reasons[0]}")
             continue
         lower, upper = min(each["lower"] for each in found), max(each["upper"] for each in found)
         ends = interval(lower, upper).replace(" ", GLUE)
@@ -179,7 +181,7 @@ def times(records: Sequence[Mapping[str, Any]]) -> str:
     """How long the steps have taken."""
     total = sum(record["seconds"] for record in records)
     whole, each = (known(seconds, None, 2) for seconds in (total, total / len(records)))
-    return f"{whole}{GLUE}s for all {len(records)} steps, {each}{GLUE}s a step"
+    return f"{whole}{GLUE}s for {counted(len(records), 'step')}, {each}{GLUE}s a step"
 
 
 def is_kept(step: int) -> bool:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ..rounding import at_most, interval, known, rounded_up
+from ..rounding import at_most, counted, interval, known, rounded_up
 from .meanings import PRINTED
 from .units import GLUE, PLAIN, Units
 
@@ -62,7 +62,7 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     facet = contact["length"] / contact["active"] if contact["active"] else None
     wide = None if force["reason"] is not None else force["upper"] - force["lower"]
     line = (
-        f"contact on {contact['active']} of {contact['facets']} facets, length"
+        f"contact on {contact['active']} of {counted(contact['facets'], 'facet')}, length"
         f" {known(contact['length'], facet)}{units.after('x')}, force"
         f" {known(contact['force'], wide, 4 if wide is None else 6)}{units.after('force')}"
     )

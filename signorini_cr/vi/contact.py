@@ -20,6 +20,7 @@ from ..fem.physics import OnMesh
 from ..fem.space import ghosted_vector
 from ..garbage import release
 from ..multigrid.parents import Layout
+from ..rounding import counted
 from .active import ActiveSet
 from .solver import Iterations
 from .stopping import NOISE
@@ -102,8 +103,8 @@ class Contact:
     def __repr__(self) -> str:
         """A line."""
         return (
-            f"<Contact: {self.number_active} of {self.number} facets, length {self.length:.6g}, "
-            f"force {self.force:.6g}>"
+            f"<Contact: {self.number_active} of {counted(self.number, 'facet')}, "
+            f"length {self.length:.6g}, force {self.force:.6g}>"
         )
 
     @property

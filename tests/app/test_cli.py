@@ -771,6 +771,16 @@ reaction = 5
         assert f"equation   −∇·(κ∇u) + c u = {last}\n" in text
 
 
+def test_one_facet_is_one(write) -> None:
+    text = with_(LINE, LINE.replace("dirichlet", "neumann", 1)).replace("size = 0.5", "size = 1")
+    text += "[time]\nend = 1\nsteps = 1\n"
+    status, text, _ = run("check", write(text), "--out", "out")
+    assert status == 0
+    if COMM.rank == 0:
+        flat = " ".join(text.split())
+        assert "∂ₙu = 0; 1 facet, length 1" in flat and "in 1 step of euler" in flat
+
+
 def test_what_is_certain_stands_line_by_line(write) -> None:
     """What goes on does so further in; the force is told once and kept under both names."""
     wall = '"neumann", "dirichlet", "neumann"'

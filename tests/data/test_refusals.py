@@ -383,11 +383,11 @@ PARTS = [(1, 1, 2), (2, 3, 4)]
     [
         (
             "dirichlet_left",
-            "curve 'dirichlet_left' has 1 facets on the boundary; did you mean diri",
+            "curve 'dirichlet_left' has 1 facet on the boundary; did you mean diri",
         ),
-        ("neuman", "curve 'neuman' has 1 facets on the boundary; did you mean neumann?"),
+        ("neuman", "curve 'neuman' has 1 facet on the boundary; did you mean neumann?"),
         ("wall", "allowed there are contact, dirichlet, neumann"),
-        ("", "curve with the number 3 and no name has 1 facets on the boundary"),
+        ("", "curve with the number 3 and no name has 1 facet on the boundary"),
     ],
 )
 def test_curves_of_other_names_on_the_boundary(shared_tmp_path: Path, name: str, words: str):

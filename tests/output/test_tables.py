@@ -84,6 +84,21 @@ def test_what_is_certain_is_a_line_each():
     ]
 
 
+def test_one_step_is_one():
+    """And a verb goes with how many there are."""
+    none = {"bound_h1": None, "quantities": {"m": {"reason": "they touch"}}, "seconds": 2.0}
+    some = {"bound_h1": 1.0, "quantities": {"m": {"reason": None}}, "seconds": 2.0}
+    for records, bound, means, time in (
+        ([none], "1 of 1 step has", "1 step", "2 s for 1 step, 2 s a step"),
+        ([some, none], "1 of 2 steps has", "1 step", "4 s for 2 steps, 2 s a step"),
+        ([none, none], "2 of 2 steps have", "2 steps", "4 s for 2 steps, 2 s a step"),
+    ):
+        assert series.certified(records) == f"{bound} no bound of the error"
+        (said,) = series.over_time(records, Units())
+        assert said == f"m has no bounds in {means}: they touch"
+        assert plain(series.times(records)) == time
+
+
 @pytest.mark.parametrize(
     ("change", "once"),
     [({}, True), ({"weighted": True}, False), ({"kind": "flux"}, False), ({"upper": 1.2}, False)],
@@ -179,4 +194,4 @@ def test_times_add_up():
         "solver 1, certificate 0"
     )
     steps = [{"seconds": 80.0}, {"seconds": 70.0}]
-    assert plain(series.times(steps)) == "150 s for all 2 steps, 75 s a step"
+    assert plain(series.times(steps)) == "150 s for 2 steps, 75 s a step"
