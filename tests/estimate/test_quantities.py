@@ -220,3 +220,17 @@ def test_a_part_and_a_material_of_the_same_name_are_not_told_apart():
     solution = solve(problem, polygon.mesh(0.5))
     with pytest.raises(InputError, match="'right' is a part and a material"):
         solution.mean("right")
+
+
+def test_where_contact_alone_holds_u_a_mean_is_refused_and_a_force_is_not():
+    """A weak loss of heat, which says how high u is, is enough for both."""
+    for loss, held in ((0.0, False), (0.5, True)):
+        solution = list(strip([Contact(coefficient=loss), *[Neumann()] * 3], f=-1.0))[-1]
+        _, low, high = solution.flux("floor")
+        assert low <= 2.0 <= high
+        for ask in (solution.mean, solution.integral):
+            if held:
+                assert ask().lower <= 0.0
+                continue
+            with pytest.raises(InputError, match="nothing but contact is known to hold"):
+                ask()
