@@ -60,10 +60,10 @@ class Form:
     """A symmetric, coercive a(u, v) of one's own in the place of ∫ κ∇u·∇v, and a load beside f.
 
     Both are functions that return UFL forms, so that they serve on all meshes and in all spaces.
-    They get ``dx`` and ``ds``: ``ds("floor")`` is the measure of the boundary part of that name.
-    Beside the arguments they may hold expressions in ``ufl.SpatialCoordinate(mesh)``, Constants,
-    and Functions of degree 0 on the coarsest mesh. Where conditions speak of κ∂ₙu, a's conormal
-    derivative is meant.
+    They get ``dx`` and ``ds``: ``ds("floor")`` is the measure of the boundary part of that name,
+    and ``dx("steel")`` that of the material. Beside the arguments they may hold expressions in
+    ``ufl.SpatialCoordinate(mesh)``, Constants, and Functions of degree 0 on the coarsest mesh.
+    Where conditions speak of κ∂ₙu, a's conormal derivative is meant.
 
     There is no certificate, as the flux that goes with a is not known.
 
@@ -183,13 +183,7 @@ class Kernel:
             if not any(w is s for s in self._stand_ins)
         ]
         self._constants = {c: c for c in ufl.algorithms.analysis.extract_constants(form)}
-        self._sides = sorted(
-            {
-                i.subdomain_id()[0] if isinstance(i.subdomain_id(), tuple) else i.subdomain_id()
-                for i in form.integrals()
-                if i.integral_type() == "exterior_facet"
-            }
-        )
+        self._sides, self._regions = (_over(form, kind) for kind in ("exterior_facet", "cell"))
 
     def on(
         self,
@@ -203,6 +197,13 @@ class Kernel:
             subdomains[fem.IntegralType.exterior_facet] = [
                 (part, facet_entities(domain.mesh, domain.facets(part)).ravel())
                 for part in self._sides
+            ]
+        if self._regions:
+            topology = domain.mesh.topology
+            of_cells = domain.materials.of_cells[: topology.index_map(topology.dim).size_local]
+            subdomains[fem.IntegralType.cell] = [
+                (number, np.flatnonzero(of_cells == number).astype(np.int32))
+                for number in self._regions
             ]
         return fem.create_form(
             self._compiled,
@@ -222,6 +223,31 @@ class Kernel:
     def snapshot(self) -> Snapshot:
         """Note what the Constants and Functions in the form are at present."""
         return Snapshot(self.constants, self.own)
+
+
+def _over(form: ufl.Form, kind: str) -> list[int]:
+    """The numbers of what a form's integrals of a type are over, each once."""
+    given = [i.subdomain_id() for i in form.integrals() if i.integral_type() == kind]
+    found = {each for ids in given for each in (ids if isinstance(ids, tuple) else (ids,))}
+    return sorted(found - {"everywhere"})
+
+
+class _Cells(ufl.Measure):
+    """dx, which over a material is dx(name)."""
+
+    def __init__(self, numbers: Mapping[str, int], mesh: ufl.Mesh, **more: Any):
+        super().__init__("dx", mesh, **more)
+        self._numbers = numbers
+
+    def __call__(self, name: str | None = None, *more: Any, **named: Any) -> ufl.Measure:
+        """As for any measure; `name` is that of a material."""
+        if name is None:
+            made = super().__call__(None, *more, **named)
+            return _Cells(self._numbers, made.ufl_domain(), metadata=made.metadata())
+        if name not in self._numbers:
+            there = meant(name, self._numbers or ["none"])
+            raise InputError(f"no material is called {name!r}; {there}")
+        return super().__call__(self._numbers[name], *more, **named)
 
 
 def _constants_in(data: Iterable[Expr]) -> dict[fem.Constant, None]:
@@ -261,13 +287,14 @@ class Forms:
         parts: Mapping[str, int] = PARTS,
         materials: Materials | None = None,
     ):
+        materials = materials or Materials()
         self.problem, self.mesh, self.element, self._parts = problem, mesh, element, parts
+        self._numbers = materials.numbers
         cell = mesh.ufl_domain()
         self.space = ufl.FunctionSpace(cell, ufl_element(mesh, element))
         self.w = ufl.Coefficient(self.space)
         self.dx, self.ds = ufl.Measure("dx", cell), ufl.Measure("ds", cell)
         self.x = ufl.SpatialCoordinate(cell)
-        materials = materials or Materials()
         _check_materials(problem, materials)
         own = [each.coefficient for each in problem.materials.values()]
         if problem.form is not None and (
@@ -523,16 +550,16 @@ class Forms:
 
     @property
     def _measures(self) -> tuple[ufl.Measure, Callable[[str], ufl.Measure]]:
-        """What the user's own forms are written with: dx, and ds by the names of parts."""
+        """What own forms are written with: dx, of materials too, and ds by the names of parts."""
 
         def ds(name: str) -> ufl.Measure:
             if name not in self._parts:
                 raise InputError(
-                    f"form: no part of the boundary is called {name!r}; {meant(name, self._parts)}"
+                    f"no part of the boundary is called {name!r}; {meant(name, self._parts)}"
                 )
             return self.ds(self._parts[name])
 
-        return self.dx, ds
+        return _Cells(self._numbers, self.mesh.ufl_domain()), ds
 
     def _own(self, name: str, arity: int, *arguments: Expr) -> ufl.Form:
         """A form of the user's own, of some arguments.
@@ -554,13 +581,15 @@ class Forms:
                 )
             over, inside = integral.subdomain_id(), integral.integral_type() == "cell"
             given = over if isinstance(over, tuple) else (over,)
-            known = ("everywhere",) if inside else tuple(self._parts.values())
-            if not all(each in known for each in given):
+            known = ("everywhere", *self._numbers.values()) if inside else self._parts.values()
+            # numbers in tags of the user's own are others
+            tagged = over != "everywhere" and integral.subdomain_data() is not None
+            if tagged or not all(each in known for each in given):
                 kind = "dx" if inside else "ds"
                 raise InputError(
-                    f"form: {name} has {kind} over the subdomain {over}; the dx and the ds(name)"
-                    " that it is given are what there is, the name that of a boundary part; where"
-                    " cells differ, Functions of degree 0 say so"
+                    f"form: {name} has {kind} over the subdomain {over}; the dx, dx(name) and"
+                    " ds(name) that it is given are what there is, the names those of materials"
+                    " and of boundary parts"
                 )
             if _order(integral.integrand()) > 1:
                 raise InputError(

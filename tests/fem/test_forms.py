@@ -138,6 +138,53 @@ def test_tensors_of_degree_0_go_along():
             assert next(bounds) == pytest.approx(next(bounds), rel=1e-6)
 
 
+HALVES = {"left": [[-1, 0], [0, 0], [0, 1], [-1, 1]], "right": [[0, 0], [1, 0], [1, 1], [0, 1]]}
+
+
+@pytest.mark.parametrize("named", [("left", "right"), ("right",)])
+def test_dx_of_a_material(named):
+    """κ and f of two materials, or of one and the rest, on meshes that are refined."""
+    kappa, load = {"left": 3.0, "right": 0.25}, {"left": -1.0, "right": 2.0}
+    polygons = {name: HALVES[name] for name in named}
+    domain = Polygon(SQUARE.vertices, EDGES, names=EDGES, materials=polygons).mesh(0.3)
+    rest = {} if len(named) == 2 else {"coefficient": kappa["left"], "f": load["left"]}
+    materials = {name: Material(coefficient=kappa[name], f=load[name]) for name in named}
+    conditions = WALLS | {"floor": Contact(-0.02)}
+
+    def total(datum, density, dx):
+        """One for each material; or for all of the domain, and what a material has more."""
+        if len(named) == 2:
+            return sum(datum[name] * density * dx(name, degree=2) for name in named)
+        more = (datum["right"] - datum["left"]) * density
+        return datum["left"] * density * dx + more * dx(degree=2)("right")
+
+    own = Form(
+        lambda u, v, dx, ds: total(kappa, laplace_density(u, v), dx),
+        lambda v, dx, ds: total(load, v, dx),
+    )
+    given = Problem(**rest, materials=materials, conditions=conditions)
+    with_form = Problem(form=own, conditions=conditions)
+    for element in ("CR", "P1"):
+        both = (solve_levels(p, domain, 3, element) for p in (given, with_form))
+        for theirs, ours in zip(*both, strict=True):
+            A, B = theirs.level.system.A, ours.level.system.A
+            b, c = theirs.level.system.b, ours.level.system.b
+            assert (A - B).norm() <= 1e-13 * A.norm()
+            assert c == pytest.approx(b, rel=1e-12, abs=1e-13)
+            assert ours.u.x.array == pytest.approx(theirs.u.x.array, abs=1e-9)
+            assert ours.contact.force == pytest.approx(theirs.contact.force, rel=1e-7)
+
+
+def test_tags_of_ones_own_are_not_taken_for_the_numbers_of_names():
+    """In either, 1 is the number of something."""
+    halves = Polygon(SQUARE.vertices, EDGES, names=EDGES, materials=HALVES).mesh(0.5)
+    for kind in ("dx", "ds"):
+        own = ufl.Measure(kind, halves.mesh, subdomain_data=halves.tags)
+        form = Form(lambda u, v, dx, ds, own=own: laplace(u, v, dx, ds) + u * v * own(1))
+        with pytest.raises(InputError, match=f"a has {kind} over the subdomain 1"):
+            solve(Problem(form=form, conditions=WALLS | {"floor": Contact(0.0)}), halves)
+
+
 def nowhere(u, v, dx, ds):
     x = ufl.SpatialCoordinate(ufl.domain.extract_unique_domain(v))
     return ufl.ln(-1.0 - x[0] ** 2) * u * v * dx
@@ -153,12 +200,13 @@ def nowhere(u, v, dx, ds):
         (Form(lambda u, v, dx, ds: 3.0), "a UFL form is needed"),
         (Form(lambda u, v: u * v), "a makes no form: .*2 positional arguments"),
         (Form(lambda u, v, dx, ds: v * ufl.grad(u) * dx), "a makes no form: "),
-        (Form(lambda u, v, dx, ds: u * v * dx("rock")), "a makes no form: .*rock"),
+        (Form(lambda u, v, dx, ds: u * v * dx("rock")), "called 'rock'; there are none"),
         (Form(lambda u, v, dx, ds: ufl.avg(u) * ufl.avg(v) * ufl.dS), "interior_facet"),
         (Form(lambda u, v, dx, ds: u.dx(0).dx(0) * v.dx(1).dx(1) * dx), "second order"),
         (Form(lambda u, v, dx, ds: u * v * ds("roof")), "called 'roof'"),
         (Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) + u * v * ufl.ds), "a has ds over the"),
-        (Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) + u * v * dx(3)), "a has dx over the"),
+        (Form(lambda u, v, dx, ds: laplace(u, v, dx, ds) + u * v * dx(3)), "called 3"),
+        (Form(lambda u, v, dx, ds: u * v * ufl.dx(3)), "a has dx over the"),
         (Form(lambda u, v, dx, ds: u.dx(0) * v.dx(0) * dx), "not above 0"),
         (Form(laplace, lambda v, dx, ds: v * v * dx), "linear"),
         (Form(laplace, lambda v, dx, ds: 2.0), "load returns 2.0"),
