@@ -99,29 +99,26 @@ class Floating:
         adrift = pressed <= doubt
         adrift[0] = False
         complaint, bad = None, int(np.argmax(adrift))
-        sign = "below" if below[bad] else "above"
-        wanted = f"only one {sign} 0, which presses it onto the obstacle, would hold it"
-        if below[bad] and above[bad]:
-            wanted = "obstacles on both sides may hold it, but it is solved with another one only"
-        amount = f"of {net[bad]:g}"
-        if 0.0 < abs(rules[-1][bad]) <= doubt[bad]:
-            amount = "that can't be told from 0"
-        if adrift.any() and len(dofs := np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == bad)):
-            nodes = compat.cell_nodes(V.mesh)[dofs[0] // V.dofmap.index_map_bs]
-            middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
-            around = ", ".join(f"{x:g}" for x in middle)
-            missing = "no Dirichlet facet, no loss of heat, no reaction, and "
+        if adrift.any() and (where := self._where(V, bad)) is not None:
+            amount = f"of {net[bad]:g}"
+            if 0.0 < abs(rules[-1][bad]) <= doubt[bad]:
+                amount = "that can't be told from 0"
             alone = number[bad] == V.dofmap.index_map.size_global * V.dofmap.index_map_bs
             complaint = (
-                f"there is {missing}"
-                if alone
-                else f"the domain falls into pieces, and the one around ({around}) has {missing}"
-            ) + (
-                f"a net force ∫f + ∫g {amount}: {wanted}"
-                if below[bad] or above[bad]
-                else "no contact facet: nothing holds it"
+                ("there is " if alone else f"the domain falls into pieces, and {where} has ")
+                + "no Dirichlet facet, no loss of heat, no reaction, and "
+                + _of_contact(below[bad] > 0.0, above[bad] > 0.0, amount)
             )
         raise_together(comm, complaint)
+
+    def _where(self, V: fem.FunctionSpace, piece: int) -> str | None:
+        """Name a piece by a point in it; None on ranks that have no cell of it."""
+        dofs = np.flatnonzero(self.piece[_cell_dofs(V)[:, 0]] == piece)
+        if not len(dofs):
+            return None
+        nodes = compat.cell_nodes(V.mesh)[dofs[0] // V.dofmap.index_map_bs]
+        middle = V.mesh.geometry.x[nodes].mean(axis=0)[: V.mesh.geometry.dim]
+        return f"the one around ({', '.join(f'{x:g}' for x in middle)})"
 
     def hold(self, system: System, start: fem.Function) -> None:
         """Put pieces of which no dof is active onto the obstacle they are pressed to; collective.
@@ -168,6 +165,23 @@ class Floating:
         chi = np.bincount(self.piece[:owned], system.chi[:owned], self.count + 1)
         net: FloatArray = system.u_D.function_space.mesh.comm.allreduce(chi)
         return net
+
+
+def _of_contact(below: bool, above: bool, amount: str) -> str:
+    """Say why contact does not hold a piece.
+
+    Args:
+        below: Whether it has an obstacle below.
+        above: Whether it has one above.
+        amount: Of the net force on it, in words.
+    """
+    if not below and not above:
+        return "no contact facet: nothing holds it"
+    side = "below" if below else "above"
+    wanted = f"only one {side} 0, which presses it onto the obstacle, would hold it"
+    if below and above:
+        wanted = "any constant that fits between the obstacles may be added to a solution"
+    return f"a net force ∫f + ∫g {amount}: {wanted}"
 
 
 def _floors(system: System, side: float) -> FloatArray:

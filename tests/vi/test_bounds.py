@@ -263,7 +263,7 @@ def test_pieces_that_an_upper_bound_holds():
     for sign in (1, -1):
         solution = solve(Problem(f=sign * 3.0, conditions=both), domain())
         assert solution.contact.force == pytest.approx(-sign * 6.0, rel=1e-7)
-    with pytest.raises(InputError, match="obstacles on both sides may hold it"):
+    with pytest.raises(InputError, match="any constant that fits between the obstacles"):
         solve(Problem(f=0.0, conditions=both), domain())
 
 
