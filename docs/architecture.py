@@ -4,14 +4,12 @@
 
 All of it is read from the sources: a sub-package is a street, the modules beside them are the
 drivers, if they import from a street, and the ground floor if they do not; a street stands above
-all that it imports from. An arrow's number is that of the modules imported, by each file
-that does.
+all that it imports from.
 """
 
 from __future__ import annotations
 
 import ast
-from collections import Counter
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -22,8 +20,8 @@ PICTURE = HERE / "architecture.svg"
 GROUND, DRIVERS = "ground floor", "drivers"
 COLOURS = ("#004488", "#BB5566", "#997700", "#117733", "#882255", "#555555")
 
-Arrows = Counter[tuple[str, str]]
-
+Arrows = set[tuple[str, str]]
+"""Who imports, and from whom."""
 
 Module = tuple[str, ...]
 """A module's name below the package, part by part; () for the package itself."""
@@ -66,24 +64,22 @@ def imports(path: Path, package: Path = PACKAGE) -> list[Module]:
 
 
 def read(package: Path = PACKAGE) -> Arrows:
-    """Count the imports from street to street; those within one are left out."""
-    found: dict[str, list[str]] = {}
+    """List who imports from whom; what streets import from themselves is left out."""
+    found: dict[str, set[str]] = {}
     for path in sorted(package.rglob("*.py")):
         if path.parent == package and path.stem.startswith("__"):
             continue  # the public names, loaded when they are first used
-        names = found.setdefault(path.relative_to(package).parts[0].removesuffix(".py"), [])
+        names = found.setdefault(path.relative_to(package).parts[0].removesuffix(".py"), set())
         # what is left is the front door's own, as the version
-        names += [module[0] for module in dict.fromkeys(imports(path, package)) if module]
+        names |= {module[0] for module in imports(path, package) if module}
     streets = {name for name in found if (package / name).is_dir()}
-    beside = {
-        name: DRIVERS if streets & set(found[name]) else GROUND for name in set(found) - streets
+    beside = {name: DRIVERS if streets & found[name] else GROUND for name in set(found) - streets}
+    ends = {
+        (beside.get(here, here), beside.get(there, there))
+        for here, others in found.items()
+        for there in others
     }
-    arrows: Arrows = Counter()
-    for here, others in found.items():
-        for there in others:
-            ends = beside.get(here, here), beside.get(there, there)
-            arrows[ends] += ends[0] != ends[1]
-    return +arrows
+    return {(here, there) for here, there in ends if here != there}
 
 
 def floors(arrows: Arrows) -> list[str]:
@@ -134,16 +130,15 @@ def draw(arrows: Arrows, path: Path = PICTURE) -> None:
         axes.text(0.1, y, name, weight="bold", size=11, va="center")
         axes.text(2.15, y, charter(name), size=8, va="center")
     for x, here, there, colour in lanes:
-        top, bottom, number = row[here], row[there], arrows[here, there]
+        top, bottom = row[here], row[there]
         axes.plot(x, top, "o", color=colour, markersize=3.5)
         arrow = axes.annotate(
             "",
-            xy=(x, bottom + 0.12),
+            xy=(x, bottom),
             xytext=(x, top),
-            arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 0.7 + 0.08 * number},
+            arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.6},
         )
         arrow.arrow_patch.set_gid(f"{here} > {there}")
-        axes.text(x, bottom - 0.08, f"{number}", size=7.5, color=colour, ha="center", va="center")
     axes.set(xlim=(-0.1, width + 0.1), ylim=(0.6 - len(order), 0.4))
     axes.axis("off")
     figure.savefig(path, metadata={"Date": None})
