@@ -32,17 +32,17 @@ BESSEL = 3.8317059702
 
 
 def blocks(cells: int) -> Iterator[slice]:
-    """Consecutive ranges of cells."""
+    """Cut the cells into consecutive ranges."""
     return (slice(a, min(a + BLOCK, cells)) for a in range(0, cells, BLOCK))
 
 
 def pick(values: FloatArray, where: slice | IndexArray) -> FloatArray:
-    """Values on some cells of an array over all of them, or the one value that holds on all."""
+    """Take the values on some cells of an array over all, or the one value that holds on all."""
     return values if values.ndim == 0 else values[where]
 
 
 def sum_rows(a: FloatArray) -> FloatArray:
-    """Σ_i a_i, shape (n,); for few long rows much faster than ``a.sum(axis=0)``."""
+    """Sum rows: Σ_i a_i, shape (n,); for few long rows much faster than ``a.sum(axis=0)``."""
     out = a[0] + a[1]
     for row in a[2:]:
         out += row
@@ -50,7 +50,7 @@ def sum_rows(a: FloatArray) -> FloatArray:
 
 
 def dot_rows(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Σ_i a_i b_i, shape (n,)."""
+    """Compute Σ_i a_i b_i, shape (n,)."""
     out = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         out += x * y
@@ -58,7 +58,7 @@ def dot_rows(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def poincare(tdim: int) -> float:
-    """C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
+    """Return C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
 
     1/π for any convex cell (Payne and Weinberger); 1/j₁₁ for triangles (Laugesen and Siudeja).
     """
@@ -83,7 +83,7 @@ class BoundaryFacets:
 
     @classmethod
     def joined(cls, sides: Sequence[BoundaryFacets], d: int) -> BoundaryFacets:
-        """Those of several parts, one after the other, for cells of dimension d."""
+        """Put those of several parts one after the other, for cells of dimension d."""
         none = np.empty(0, dtype=np.intp)
         sides = [cls(none, none, none, none.reshape(d, 0)), *sides]
         return cls(
@@ -94,7 +94,7 @@ class BoundaryFacets:
         )
 
     def picked(self, where: BoolArray) -> BoundaryFacets:
-        """Some of the facets."""
+        """Take some of the facets."""
         ends = self.ends[:, where]
         return BoundaryFacets(self.cells[where], self.local[where], self.dofs[where], ends)
 
@@ -172,11 +172,11 @@ class Cells:
         self.fixed, self.sinks = (*self.fixed, *sinks), sinks
 
     def unstretched(self) -> Cells:
-        """The same with lengths as they are."""
+        """Return the same cells with lengths as they are."""
         return self if self.stretch is None else Cells(self.domain, self.V, self.fixed, self.sinks)
 
     def corners(self, part: slice) -> tuple[FloatArray, FloatArray]:
-        """Vertices, stretched, and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""
+        """Find stretched vertices and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""
         mesh = self.domain.mesh
         nodes = compat.cell_nodes(mesh)[: self.number][part]
         x = mesh.geometry.x[nodes.T, : mesh.geometry.dim]
@@ -188,7 +188,7 @@ class Cells:
     def coefficient(
         self, kappa: FloatArray, mesh: Mesh | None = None, where: slice | IndexArray = slice(None)
     ) -> fem.Function:
-        """κ to write in forms: by cells, and with a stretch κ stretch⁻², a tensor; collective.
+        """Make κ for forms: by cells, and with a stretch κ stretch⁻², a tensor; collective.
 
         Args:
             kappa: Shape (cells,) or ().
@@ -224,7 +224,7 @@ class Cells:
         return np.stack([self.ways_between(*self.vertices[pair]) for pair in self.others])
 
     def ways_between(self, first: IndexArray, second: IndexArray) -> FloatArray:
-        """1 where the first of two vertices comes before the second on all ranks, else −1."""
+        """Return 1 where the first of two vertices precedes the second on all ranks, else −1."""
         name = self.domain.mesh.topology.index_map(0).local_to_global
         names = (name(ends.astype(np.int32)) for ends in (first, second))
         return np.where(np.less(*names), 1.0, -1.0)
@@ -247,7 +247,7 @@ class Cells:
 
     @cached_property
     def exterior(self) -> BoolArray:
-        """Which facet dofs lie on the boundary, ghosts included."""
+        """Whether each facet dof lies on the boundary, ghosts included."""
         mark = la.vector(self.V.dofmap.index_map, dtype=np.float64)
         for side in self.sides.values():
             mark.array[side.dofs] = 1.0
@@ -303,7 +303,7 @@ class Cells:
         return layers
 
     def around(self, chosen: BoolArray, layers: int) -> BoolArray:
-        """Which vertices so many layers of cells around some have; collective.
+        """Tell which vertices so many layers of cells around some have; collective.
 
         Args:
             chosen: These, ghosts included.
@@ -339,7 +339,7 @@ class Cells:
         return self.share(total) if shared else total
 
     def masses(self, rate: FloatArray) -> FloatArray:
-        """∫ rate ψ² for each facet dof's function ψ, this rank's cells' share; for triangles.
+        """Compute ∫ rate ψ² for each facet dof's function ψ, this rank's share; for triangles.
 
         There the functions of Crouzeix-Raviart are orthogonal, and these all products there are.
 
@@ -368,7 +368,7 @@ class Cells:
         return shared_sum(self.comm, index_map, values)
 
     def largest_at_vertices(self, ends: IndexArray, values: FloatArray) -> FloatArray:
-        """The largest value that facets of any rank give each vertex, ghosts included; collective.
+        """Find the largest value that any rank's facets give each vertex, with ghosts; collective.
 
         Args:
             ends: The facets' vertices, shape (d, n).
@@ -395,7 +395,7 @@ class Cells:
         return la.vector(self.V.dofmap.index_map, dtype=np.float64)
 
     def from_others(self, where: IndexArray, values: FloatArray) -> FloatArray:
-        """Sums of what the other ranks have, in the order of ``between``; collective.
+        """Sum what the other ranks have, in the order of ``between``; collective.
 
         Args:
             where: Dofs that this rank has something for, each once.
@@ -412,11 +412,11 @@ class Cells:
         return theirs
 
     def owned_facets(self) -> int:
-        """Number of facet dofs this rank owns."""
+        """Return the number of facet dofs this rank owns."""
         return self.V.dofmap.index_map.size_local
 
     def owned_vertices(self) -> int:
-        """Number of vertices this rank owns."""
+        """Return the number of vertices this rank owns."""
         return self.domain.mesh.topology.index_map(0).size_local
 
     def total(self, *values: float | np.floating | FloatArray) -> FloatArray:
@@ -424,7 +424,7 @@ class Cells:
         return self.comm.allreduce(np.array(values, dtype=np.float64))
 
     def apply(self, c: FloatArray, part: slice | IndexArray) -> FloatArray:
-        """|T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
+        """Compute |T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
         out = np.empty_like(c)
         if self.tdim == 2:
             # what flows to each vertex from the next one, all the way round
@@ -445,21 +445,21 @@ class Cells:
         return out
 
     def slopes(self, c: FloatArray) -> FloatArray:
-        """|T| |∇w|² for w = Σ c_i λ_i, c of shape (d + 1, cells), shape (cells,)."""
+        """Compute |T| |∇w|² for w = Σ c_i λ_i, c of shape (d + 1, cells), shape (cells,)."""
         out = np.empty(self.number)
         for part in blocks(self.number):
             out[part] = dot_rows(c[:, part], self.apply(c[:, part], part))
         return out
 
     def opposite(self, side: BoundaryFacets) -> FloatArray:
-        """|T| |∇λ_i|² for the vertices opposite boundary facets, shape (n,)."""
+        """Compute |T| |∇λ_i|² for the vertices opposite boundary facets, shape (n,)."""
         out = np.zeros(len(side.cells))
         for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
             out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
         return out
 
     def squares(self, part: slice | IndexArray) -> FloatArray:
-        """|T| |∇λ_i|², shape (d + 1, cells in the part)."""
+        """Compute |T| |∇λ_i|², shape (d + 1, cells in the part)."""
         out = np.zeros((self.tdim + 1, len(self.volume[part])))
         for (i, j), s in zip(self.pairs, self.stiffness[:, part], strict=True):
             out[i] -= s
@@ -467,7 +467,7 @@ class Cells:
         return out
 
     def trace(self, part: slice | IndexArray) -> FloatArray:
-        """|T| Σ |∇λ_i|²."""
+        """Compute |T| Σ |∇λ_i|²."""
         return -2.0 * sum_rows(self.stiffness[:, part])
 
 
@@ -487,7 +487,7 @@ def on_cells(mesh: Mesh, values: FloatArray) -> fem.Function:
 def corner_points(
     cells: Cells, side: BoundaryFacets, stretched: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Coordinates of the opposite vertex, shape (n, gdim), and of the ends, shape (d, n, gdim).
+    """Find the opposite vertex, shape (n, gdim), and the ends, shape (d, n, gdim).
 
     They are the stretched ones where that is asked for and the cells have a stretch.
     """
@@ -503,18 +503,18 @@ def corner_points(
 
 
 def measures(cells: Cells, side: BoundaryFacets) -> FloatArray:
-    """|F|, shape (n,)."""
+    """Compute |F|, shape (n,)."""
     _, ends = corner_points(cells, side)
     return simplex_measures(ends.transpose(1, 0, 2))
 
 
 def _rows(table: Int32Array) -> IndexArray:
-    """The transpose of a table of indices, row by row in memory."""
+    """Transpose a table of indices, row by row in memory."""
     return np.ascontiguousarray(table.T, dtype=np.intp)
 
 
 def _column(table: IndexArray, index_map: Any) -> csc_array:
-    """A column with an entry, not set, for each place of a table of rows; rows come repeatedly.
+    """Make a column with an entry, not set, for each place of a table of rows, which may repeat.
 
     Its product with 1 adds up what each row has, in the order of the table: as `np.bincount`, but
     that looks through the table first, which takes as long again.
@@ -534,7 +534,7 @@ def _sums(column: csc_array, values: FloatArray) -> FloatArray:
 
 
 def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Volumes and |T| ∇λ_i·∇λ_j of cells given by the edges from their first vertex."""
+    """Compute volumes and |T| ∇λ_i·∇λ_j of cells from the edges at their first vertex."""
     if len(edges) == 2:
         (a, b), (c, d) = edges
         volume = 0.5 * np.abs(a * d - b * c)
@@ -554,7 +554,7 @@ def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArr
 
 
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
-    """u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
+    """Compute u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
     out = np.empty(cells.facets.shape)
     for part in blocks(cells.number):
         values = u[cells.facets[:, part]]

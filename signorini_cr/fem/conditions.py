@@ -26,7 +26,7 @@ Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 
 
 def as_number(expression: Expr) -> float | None:
-    """The number that an expression is, or None."""
+    """Return the number that an expression is, or None."""
     if isinstance(expression, ufl.constantvalue.ScalarValue | ufl.constantvalue.Zero):
         return float(expression)
     return None
@@ -48,7 +48,7 @@ def may_change(expression: Expr) -> bool:
 
 
 def negative(expression: Expr) -> Expr:
-    """The same with the other sign; a number remains one."""
+    """Return the same with the other sign; a number remains one."""
     value = as_number(expression)
     return -expression if value is None else ufl.as_ufl(-value)
 
@@ -113,7 +113,7 @@ class Condition:
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """The names of its data, the main one first."""
+        """Return the names of its data, the main one first."""
         common = {each.name for each in fields(Condition)}
         return tuple(each.name for each in fields(cls) if each.name not in common)
 
@@ -156,17 +156,17 @@ class Condition:
 
     @property
     def fixed(self) -> Any:
-        """What u is set to."""
+        """The value that u is set to."""
         return None
 
     @property
     def bounds(self) -> tuple[tuple[int, Any], ...]:
-        """What bounds u: s u must not be below a, for each pair (s, a), where s is 1 or −1."""
+        """The bounds of u: s u must not be below a, for each pair (s, a), where s is 1 or −1."""
         return ()
 
     @property
     def flux(self) -> Any:
-        """What is known of κ∂ₙu + b u: χ(v) gains its integral times v."""
+        """The known part of κ∂ₙu + b u: χ(v) gains its integral times v."""
         return None
 
     @property
@@ -250,7 +250,7 @@ class Robin(Condition):
 
     @property
     def flux(self) -> Any:
-        """What does not depend on u."""
+        """The part of the flux that does not depend on u."""
         return _known(self)
 
     @property
@@ -307,7 +307,7 @@ class Contact(Condition):
 
     @property
     def flux(self) -> Any:
-        """What does not depend on u; None where there is neither that nor a b."""
+        """The part of the flux free of u; None where there is neither that nor a b."""
         known = _known(self)
         return known if self.loss is not None or as_number(known) != 0.0 else None
 
@@ -324,7 +324,7 @@ def _in_python(label: str, part: str, name: str) -> str:
 
 
 def _known(condition: Any) -> Any:
-    """G + b u_ext."""
+    """Return g + b u_ext."""
     if as_number(condition.coefficient) == 0.0:
         return condition.g
     return condition.g + condition.coefficient * condition.external
@@ -370,6 +370,6 @@ def _difference(left: str, right: str) -> str:
 
 
 def facets_of(where: Domain, conditions: Sequence[Condition]) -> Int32Array:
-    """Local indices of the owned facets under some conditions, ascending, shape (n,)."""
+    """Find the owned facets under some conditions: local indices, ascending, shape (n,)."""
     facets = [where.facets(condition.number) for condition in conditions]
     return np.sort(np.concatenate([np.empty(0, dtype=np.int32), *facets]))

@@ -19,7 +19,7 @@ from .space import vertex_values
 
 
 def discontinuous(u: fem.Function, name: str = "u") -> fem.Function:
-    """A CR or P1 function as a discontinuous P1 function, to which it is equal; collective.
+    """Turn a CR or P1 function into the discontinuous P1 function that equals it; collective.
 
     Args:
         u: The function, ghosts up to date.
@@ -32,7 +32,7 @@ def discontinuous(u: fem.Function, name: str = "u") -> fem.Function:
 
 
 def on_cells(mesh: Mesh, values: FloatArray, name: str) -> fem.Function:
-    """A function that is constant on each cell; collective.
+    """Make a function that is constant on each cell; collective.
 
     Args:
         mesh: The mesh.
@@ -48,7 +48,7 @@ def on_cells(mesh: Mesh, values: FloatArray, name: str) -> fem.Function:
 def on_facets(
     mesh: Mesh, facets: Int32Array, values: Mapping[str, npt.NDArray]
 ) -> dict[str, fem.Function]:
-    """Functions that are constant on each facet, on one mesh of these facets; collective.
+    """Make functions that are constant on each facet, on one mesh of these facets; collective.
 
     Args:
         mesh: The mesh that the facets are of.

@@ -61,17 +61,17 @@ class OnMesh(Protocol):
 
     @property
     def fixed(self) -> tuple[Imposed, ...]:
-        """What is set on Γ0: all unknowns of a facet."""
+        """The values set on Γ0: of all unknowns of a facet."""
 
     @property
     def bounds(self) -> tuple[Imposed, ...]:
         """Bounds on Γ1: of one unknown a facet."""
 
     def chi(self) -> FloatArray:
-        """χ by unknown, this rank's cells' share, ghosts included."""
+        """Compute χ by unknown, this rank's cells' share, ghosts included."""
 
     def of_constants(self) -> FloatArray | None:
-        """a_h(1, ·) by unknown, this rank's cells' share; None where it vanishes."""
+        """Compute a_h(1, ·) by unknown, this rank's cells' share; None where it vanishes."""
 
     def inflow(self) -> FloatArray | None:
         """Compute ∫ f + ∫ g over each owned cell by two rules, much finer than that of `chi`.
@@ -92,10 +92,10 @@ class OnMesh(Protocol):
         """
 
     def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
-        """Values of what is bounded at the vertices of contact facets, shape (n, d)."""
+        """Find the values of what is bounded at the vertices of contact facets, shape (n, d)."""
 
     def squared_energy_norm(self, u: fem.Function) -> float:
-        """a_h(u, u), this rank's cells' share."""
+        """Compute a_h(u, u), this rank's cells' share."""
 
     def tidy(self) -> None:
         """Make room: drop what is large and needed until a solution is certified."""
@@ -120,7 +120,7 @@ class Physics(Protocol):
 
     @property
     def not_definite(self) -> str | None:
-        """What to say where a_h is found not to be positive definite; None if it is sure to be."""
+        """The message where a_h is not found to be positive definite; None if it is sure to be."""
 
     def check(self, domain: Domain) -> None:
         """Refuse data for which there is no solution; collective."""
@@ -132,7 +132,7 @@ class Physics(Protocol):
         """Note what data that may change are at present, on some meshes."""
 
     def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:
-        """‖u − w‖_h and ‖u − w‖ in L2, where u is known; collective."""
+        """Compute ‖u − w‖_h and ‖u − w‖ in L2, where u is known; collective."""
 
     def certify(self, solution: Any) -> Any:
         """Bound the error of a solution, or say why that can't be done; collective.

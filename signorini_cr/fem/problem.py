@@ -226,7 +226,7 @@ class Kernel:
 
 
 def _over(form: ufl.Form, kind: str) -> list[int]:
-    """The numbers of what a form's integrals of a type are over, each once."""
+    """List the numbers of what a form's integrals of a type are over, each once."""
     given = [i.subdomain_id() for i in form.integrals() if i.integral_type() == kind]
     found = {each for ids in given for each in (ids if isinstance(ids, tuple) else (ids,))}
     return sorted(found - {"everywhere"})
@@ -240,7 +240,7 @@ class _Cells(ufl.Measure):
         self._numbers = numbers
 
     def __call__(self, name: str | None = None, *more: Any, **named: Any) -> ufl.Measure:
-        """As for any measure; `name` is that of a material."""
+        """Integrate over the material of that name, or go on as any measure does."""
         if name is None:
             made = super().__call__(None, *more, **named)
             return _Cells(self._numbers, made.ufl_domain(), metadata=made.metadata())
@@ -251,12 +251,12 @@ class _Cells(ufl.Measure):
 
 
 def _constants_in(data: Iterable[Expr]) -> dict[fem.Constant, None]:
-    """The Constants in expressions, each once."""
+    """Collect the Constants in expressions, each once."""
     return {e: None for each in data for e in ufl.algorithms.analysis.extract_constants(each)}
 
 
 def _functions_in(data: Iterable[Expr]) -> dict[fem.Function, None]:
-    """The Functions in expressions, each once."""
+    """Collect the Functions in expressions, each once."""
     return {e: None for each in data for e in ufl.algorithms.extract_coefficients(each)}
 
 
@@ -331,7 +331,7 @@ class Forms:
                 raise InputError(f"data: {key} is given on another mesh than the one to solve on")
 
     def _by_material(self, name: str, usual: Data, materials: Materials) -> Expr:
-        """A datum that materials may have of their own, and elsewhere is the usual one."""
+        """Make a datum that materials may have of their own, and elsewhere is the usual one."""
         base = as_expression(usual, self.x, name)
         own = {
             material: as_expression(datum, self.x, f"materials[{material!r}].{name}")
@@ -358,7 +358,7 @@ class Forms:
         return found
 
     def _as_tensor(self, datum: Expr) -> Expr:
-        """A scalar as the tensor that does the same."""
+        """Turn a scalar into the tensor that does the same."""
         return datum if datum.ufl_shape else datum * ufl.Identity(self.mesh.geometry.dim)
 
     def _on_cells(
@@ -368,7 +368,7 @@ class Forms:
         materials: Materials,
         own: Iterable[str],
     ) -> fem.Function:
-        """A number for cells without material of its own, and one for each that has."""
+        """Set a number on cells without material of its own, and one for each that has."""
         function = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name=name)
         dofs = function.function_space.dofmap.list[:, 0]
         function.x.array[dofs] = numbers[0]
@@ -379,7 +379,7 @@ class Forms:
 
     @property
     def _data(self) -> dict[str, Expr]:
-        """What the user has given, or what was derived from it, by the names of `Problem`."""
+        """The data that the user has given, or that were derived, by the names of `Problem`."""
         data = {
             "coefficient": self.kappa,
             "f": self.f,
@@ -409,7 +409,7 @@ class Forms:
 
     @property
     def uncertified(self) -> str | None:
-        """Why there is no certificate, if the form or some condition has none."""
+        """The reason why there is no certificate, if the form or some condition has none."""
         if self.problem.form is not None:
             return "the form is the user's own: the flux that goes with it is not known"
         for condition in self.conditions:
@@ -528,7 +528,7 @@ class Forms:
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
-        """κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
+        """Integrate κ by the rule of the loads; UFL's own guess is one point for a κ that jumps."""
         if self.problem.form is not None:
             arity = sum(isinstance(each, ufl.Argument) for each in (u, v))
             return sum(self._without_gradients(u, v), self._own("a", arity, u, v))
@@ -550,7 +550,7 @@ class Forms:
 
     @property
     def _measures(self) -> tuple[ufl.Measure, Callable[[str], ufl.Measure]]:
-        """What own forms are written with: dx, of materials too, and ds by the names of parts."""
+        """The measures that forms of one's own have: dx, of materials too, and ds by parts' names."""
 
         def ds(name: str) -> ufl.Measure:
             if name not in self._parts:
@@ -562,7 +562,7 @@ class Forms:
         return _Cells(self._numbers, self.mesh.ufl_domain()), ds
 
     def _own(self, name: str, arity: int, *arguments: Expr) -> ufl.Form:
-        """A form of the user's own, of some arguments.
+        """Make a form of the user's own, of some arguments.
 
         Raises:
             InputError: It is none that the element can do with.
@@ -606,7 +606,7 @@ class Forms:
         return form
 
     def _adjustable(self, data: Expr) -> Expr:
-        """A Constant in the place of a number, or of a tensor of numbers: one form serves all."""
+        """Put a Constant in the place of a number or a tensor of numbers: one form serves all."""
         values = [as_number(data[index]) for index in np.ndindex(data.ufl_shape)]
         if None in values:
             return data
@@ -630,7 +630,7 @@ class Forms:
         return basix.ufl.element("DG", self.mesh.basix_cell(), 0, shape=(2,))
 
     def errors(self, domain: Domain, w: fem.Function) -> tuple[float, float]:
-        """‖u − w‖_h in the broken norm (1.6) and ‖u − w‖ in L2; collective.
+        """Compute ‖u − w‖_h in the broken norm (1.6) and ‖u − w‖ in L2; collective.
 
         One form has both, as the exact solution and its gradient take most of the time and have
         much in common.
@@ -651,7 +651,7 @@ def _order(expression: Expr) -> int:
 
 
 def _chosen(condition: Expr, first: Expr, second: Expr) -> Expr:
-    """The first where a condition holds, else the second, entry by entry."""
+    """Choose the first where a condition holds, else the second, entry by entry."""
     if not first.ufl_shape:
         return ufl.conditional(condition, first, second)
     rows, columns = map(range, first.ufl_shape)

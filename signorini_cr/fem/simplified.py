@@ -61,7 +61,7 @@ def simplified(expression: Any) -> Any:
 
 
 def _origin(expression: Any) -> dict[Any, Fraction]:
-    """The number that each coordinate is compared with most often, for those that are with one."""
+    """Find the number that each coordinate is most often compared with, if with any."""
     found: dict[Any, Counter[float]] = {}
     for e in unique_pre_traversal(expression):
         if isinstance(e, classes.Sum):
@@ -83,7 +83,7 @@ def _size(expression: Any) -> int:
 
 
 def _fraction(value: float) -> Fraction:
-    """The number, or the simple fraction of which it is the rounded value."""
+    """Return the number, or the simple fraction of which it is the rounded value."""
     exact = Fraction(value)
     simple = exact.limit_denominator(SIMPLE)
     return simple if abs(simple - exact) <= 3e-16 * max(1.0, abs(value)) else exact
@@ -109,7 +109,7 @@ class _Reader:
         self._coordinates: set[int] = set()
 
     def read(self, e: Any) -> Polynomial:
-        """The normal form."""
+        """Return the normal form."""
         if e not in self.known:
             self.known[e] = self._read(e)
             if len(self.known[e]) > MOST:
@@ -137,7 +137,7 @@ class _Reader:
         return self._atom(self._key(e, operands), e)
 
     def _coordinate(self, e: Any) -> Polynomial:
-        """The distance from the origin, and where that is."""
+        """Write it as the distance from the origin, and where that is."""
         at = self._origin.get(e, Fraction(0))
         found = self._atom(e, e - float(at) if at else e)
         self._coordinates.add(self._places[e])
@@ -212,7 +212,7 @@ class _Reader:
         return self._reduced({m: c for m, c in found.items() if c})
 
     def _reduced(self, terms: Polynomial) -> Polynomial:
-        """Without the squares that a sum replaces."""
+        """Take out the squares that a sum replaces."""
         for monomial in terms:
             for i, k in monomial:
                 if i in self._squares and k >= 2 and k.denominator == 1:
@@ -225,7 +225,7 @@ class _Reader:
         return terms
 
     def formula(self, terms: Polynomial) -> Any:
-        """The expression of a normal form."""
+        """Write a normal form as an expression."""
         total = ufl.as_ufl(0.0)
         for monomial in sorted(terms):
             term = ufl.as_ufl(float(terms[monomial]))

@@ -24,7 +24,7 @@ ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
 
 
 def ufl_element(mesh: Mesh, element: str) -> Any:
-    """The Basix element called ``element`` ("CR" or "P1") on the mesh's cell.
+    """Make the Basix element called ``element`` ("CR" or "P1") on the mesh's cell.
 
     Raises:
         InputError: There is no element of that name.
@@ -35,12 +35,12 @@ def ufl_element(mesh: Mesh, element: str) -> Any:
 
 
 def function_space(mesh: Mesh, element: str = "CR") -> fem.FunctionSpace:
-    """V_h on a mesh; boundary values are not built in."""
+    """Make V_h on a mesh; boundary values are not built in."""
     return fem.functionspace(mesh, ufl_element(mesh, element))
 
 
 def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
-    """The cell and the local facet index of boundary facets.
+    """Find the cell and the local facet index of boundary facets.
 
     Args:
         mesh: The mesh.
@@ -61,12 +61,12 @@ def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
 
 
 def facet_corners(mesh: Mesh) -> IndexArray:
-    """The vertices of a cell's facets by local number, shape (d + 1, d)."""
+    """List the vertices of a cell's facets by local number, shape (d + 1, d)."""
     return np.array(basix.topology(mesh.basix_cell())[-2])
 
 
 def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
-    """The dofs that fix a function on boundary facets.
+    """Find the dofs that fix a function on boundary facets.
 
     One per facet, its midpoint's, for CR; the d of its vertices for P1, in the order in which
     `moments.Trace` gives values at vertices.
@@ -84,7 +84,7 @@ def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
 
 
 def unknowns(V: fem.FunctionSpace, facets: Int32Array, components: Int32Array) -> Int32Array:
-    """Numbers of some unknowns that fix a function on boundary facets.
+    """Find the numbers of some unknowns that fix a function on boundary facets.
 
     Args:
         V: CR or P1, with a block of unknowns at each node.
@@ -98,7 +98,7 @@ def unknowns(V: fem.FunctionSpace, facets: Int32Array, components: Int32Array) -
 
 
 def facet_to_dof(V: fem.FunctionSpace) -> Int32Array:
-    """The CR dof of every facet, shape (facets,), ghosts included."""
+    """Find the CR dof of every facet, shape (facets,), ghosts included."""
     tdim = V.mesh.topology.dim
     c2f = V.mesh.topology.connectivity(tdim, tdim - 1)
     facets = V.mesh.topology.index_map(tdim - 1)
@@ -108,7 +108,7 @@ def facet_to_dof(V: fem.FunctionSpace) -> Int32Array:
 
 
 def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArray]:
-    """Vertex coordinates and measures (lengths, for d = 2) of exterior facets.
+    """Find vertex coordinates and measures (lengths, for d = 2) of exterior facets.
 
     Returns:
         Coordinates of shape (n, d, 3), vertices in the order of the cell's closure, and measures
@@ -121,14 +121,14 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
 
 
 def measures(x: FloatArray) -> FloatArray:
-    """Measures of simplices with vertices x, shape (n, vertices, gdim)."""
+    """Compute the measures of simplices with vertices x, shape (n, vertices, gdim)."""
     edges = x[:, 1:] - x[:, :1]
     gram = np.einsum("nid,njd->nij", edges, edges)
     return np.sqrt(np.linalg.det(gram)) / np.prod(np.arange(1, x.shape[1]))
 
 
 def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> FloatArray:
-    """Values at the vertices of each cell, where a CR function is discontinuous.
+    """Evaluate at the vertices of each cell, where a CR function is discontinuous.
 
     With c_i the value on the facet opposite vertex i, vertex i has Σ_j c_j − d c_i.
 
@@ -156,7 +156,7 @@ def vertex_values(u: fem.Function, cells: Int32Array | slice = slice(None)) -> F
 def ghosted(
     comm: MPI.Comm, index_map: Any, array: FloatArray | None = None, block: int = 1
 ) -> PETSc.Vec:
-    """A PETSc vector with room for ghosts.
+    """Make a PETSc vector with room for ghosts.
 
     On one process it is a plain one, which takes a third of the time to make.
 
@@ -177,7 +177,7 @@ def ghosted(
 
 
 def ghosted_vector(V: fem.FunctionSpace, array: FloatArray) -> PETSc.Vec:
-    """A PETSc vector with room for the ghosts of V, on an array (no copy)."""
+    """Make a PETSc vector with room for the ghosts of V, on an array (no copy)."""
     return ghosted(V.mesh.comm, V.dofmap.index_map, array, V.dofmap.index_map_bs)
 
 
@@ -199,7 +199,7 @@ def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray, block: int = 1
 
 
 def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Points on the reference facet, shape (q, d − 1), and weights that add up to 1."""
+    """Return points on the reference facet, shape (q, d − 1), and weights that add up to 1."""
     facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
     points, weights = basix.make_quadrature(facet, degree)
     return points, weights / weights.sum()

@@ -87,7 +87,7 @@ class Walk:
 
 
 def _gathered(comm: MPI.Comm, columns: dict[str, npt.NDArray]) -> dict[str, npt.NDArray]:
-    """The columns of all ranks on rank 0, one below the other; none on other ranks; collective."""
+    """Gather all ranks' columns on rank 0, one below the other; none elsewhere; collective."""
     if comm.size == 1:
         return columns
     gathered = comm.gather(columns, root=0)
@@ -105,7 +105,7 @@ def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDAr
 
 
 def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.NDArray]:
-    """The columns of the table that depend on the solution or its bounds."""
+    """Pick the columns of the table that depend on the solution or its bounds."""
     names = ["obstacle", "upper"] if np.isfinite(rows["upper"]).any() else ["obstacle"]
     bounds = {name: np.where(np.isfinite(rows[name]), rows[name], np.nan) for name in names}
     given = bounds | {name: rows[name] for name in ("u", "pressure", "active")}
@@ -162,7 +162,7 @@ class _Way:
 
 
 def _predecessors(ends: FloatArray) -> Int64Array:
-    """For each facet the one that ends where it begins, itself where there is none."""
+    """Find for each facet the one that ends where it begins, itself where there is none."""
     own = np.arange(len(ends))
     _, vertex = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
     tail, head = vertex.reshape(-1, 2).T
@@ -183,7 +183,7 @@ def _cut(before: Int64Array, rank: Int64Array) -> Int64Array:
 def _way_from_first(
     before: Int64Array, length: FloatArray
 ) -> tuple[Int64Array, Int64Array, FloatArray]:
-    """The first facet of each one's curve, steps from there, and the distance of the midpoints."""
+    """Find the first facet of each one's curve, steps from there, and the midpoints' distances."""
     is_first = before == np.arange(len(before))
     distance = np.where(is_first, 0.0, 0.5 * (length + length[before]))
     steps, jump = (~is_first).astype(np.int64), before
