@@ -186,7 +186,7 @@ class Promise:
     def of_values(
         self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
-        """What each value promises, ghosts included; collective.
+        """Compute what each value promises, ghosts included; collective.
 
         Args:
             slopes: Those of v.
@@ -207,7 +207,7 @@ class Promise:
         return promises
 
     def total(self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray) -> float:
-        """What all of them promise; collective."""
+        """Sum what all of them promise; collective."""
         vertices, facets = self.of_values(slopes, free_vertices, free_facets)
         own = (
             vertices[: self.cells.owned_vertices()].sum()

@@ -28,7 +28,7 @@ class Beyond:
     rise: FloatArray | None
 
     def through(self, cells: Cells, where: slice | IndexArray, hat: FloatArray) -> FloatArray:
-        """The numbers Q_i = 2|T| (curl ω + τ)·∇λ_i at a point of each cell, shape (3, n).
+        """Compute Q_i = 2|T| (curl ω + τ)·∇λ_i at a point of each cell, shape (3, n).
 
         Args:
             cells: The mesh.
@@ -46,11 +46,11 @@ class Beyond:
         return out
 
     def largest(self, cells: Cells) -> FloatArray:
-        """The largest |height| on each cell, shape (cells,)."""
+        """Find the largest |height| on each cell, shape (cells,)."""
         return np.asarray(np.abs(self.heights[cells.facets]).max(axis=0))
 
     def field(self, cells: Cells) -> ufl.core.expr.Expr:
-        """The curl of the bumps and τ = ⅓ (Σ ℓ_i λ_i X_i − ℓ x) as an expression; collective."""
+        """Write the curl of the bumps and τ = ⅓ (Σ ℓ_i λ_i X_i − ℓ x) in UFL; collective."""
         mesh = cells.domain.mesh
         omega = fem.Function(fem.functionspace(mesh, ("Lagrange", 2)))
         dofs = omega.function_space.dofmap.list[: cells.number]
@@ -73,5 +73,5 @@ class Beyond:
 
 
 def turn(gamma: FloatArray) -> FloatArray:
-    """2|T| curl φ·∇λ_i for ∇φ = Σ γ_k ∇λ_k if the vertices turn left."""
+    """Compute 2|T| curl φ·∇λ_i for ∇φ = Σ γ_k ∇λ_k if the vertices turn left."""
     return np.stack([gamma[1] - gamma[2], gamma[2] - gamma[0], gamma[0] - gamma[1]])

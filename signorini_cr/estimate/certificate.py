@@ -78,7 +78,7 @@ class Certificate:
     _made: Made | None = None
 
     def __repr__(self) -> str:
-        """A line."""
+        """Write bound and energy on a line, or why there are none."""
         if self.bound_h1 is None or self.energy is None:
             return f"<Certificate: no bound, {self.reason}>"
         bound, energy = at_most(self.bound_h1), interval(*self.energy)
@@ -219,11 +219,11 @@ class Made:
     above: float
 
     def cells(self) -> Cells:
-        """The mesh's geometry."""
+        """Return the mesh's geometry."""
         return Cells(self.level.domain, self.level.V, stretch=self.stretch)
 
     def through(self, cells: Cells) -> FloatArray:
-        """Fluxes of y out of the cells, shape (d + 1, cells)."""
+        """Compute the fluxes of y out of the cells, shape (d + 1, cells)."""
         own = cells.apply(self.w, slice(0, cells.number))
         return self.excess - cells.tdim * self.kappa * own
 
@@ -626,17 +626,17 @@ class _Ball:
 
     @property
     def bound(self) -> float:
-        """How far its points are from κ∇u_h, at most."""
+        """The largest distance of its points from κ∇u_h, at most."""
         return self.near / 2 + self.radius
 
     @property
     def of_companion(self) -> float:
-        """How far its points are from κ∇v, at most."""
+        """The largest distance of its points from κ∇v, at most."""
         return float((self.far + np.sqrt(self.far**2 + 4 * self.contact)) / 2)
 
 
 def _bracket(total: Totals, ball: _Ball, hidden: float, rounding: float) -> tuple[float, float]:
-    """Two numbers with J(u) between them: J(v) is above it, by the gap at most.
+    """Find two numbers with J(u) between them: J(v) is above it, by the gap at most.
 
     Args:
         total: The integrals over all ranks' cells.
@@ -800,7 +800,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
 
 
 def _misses(cells: Cells, certain: Certain, segments: Segments) -> bool:
-    """Whether quadrature may have missed anything of f and g; collective."""
+    """Tell whether quadrature may have missed anything of f and g; collective."""
     return any(cells.total(certain.missed is not None, bool(segments.missed.any())))
 
 

@@ -83,7 +83,7 @@ class Companion:
     bubbles: FloatArray | None = None
 
     def slopes(self, cells: Cells, where: slice | IndexArray) -> Callable[[FloatArray], FloatArray]:
-        """∇(v − u_h) without cusps, as γ_i with ∇(v − u_h) = Σ γ_i ∇λ_i, as a function.
+        """Return a function for ∇(v − u_h) without cusps: γ_i with ∇(v − u_h) = Σ γ_i ∇λ_i.
 
         Args:
             cells: The mesh.
@@ -274,7 +274,7 @@ class Boundary:
 def _at_vertices(
     functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, touching: bool
 ) -> tuple[FloatArray, BoolArray]:
-    """Means of u_h's values at the vertices, weighted by what it costs to leave them; α, β, u_D.
+    """Average u_h at vertices, weighted by what it costs to leave its values; or take α, β, u_D.
 
     Returns:
         They, and on which facets of Γ1 they are α or β at both ends, and the bump should be theirs.
@@ -324,7 +324,7 @@ def _at_vertices(
 
 
 def _moving(functional: Functional, floors: Floors) -> FloatArray | None:
-    """About (d + 1) times what moving v by Δ costs, over Δ², by vertex; or None for nothing.
+    """Estimate (d + 1) times what moving v by Δ costs, over Δ², by vertex; or None for nothing.
 
     On thin cells and next to kinks of α; elsewhere what u_h has at the vertices of facets in
     contact is near α.
@@ -342,7 +342,7 @@ def _moving(functional: Functional, floors: Floors) -> FloatArray | None:
 
 
 def bend_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
-    """What ‖∇φ‖²_T of φ = Σ height_i b_i is more than that of its mean; d = 2, shape (n,).
+    """Compute what ‖∇φ‖²_T of φ = Σ height_i b_i has beyond that of its mean; d = 2, shape (n,).
 
     The mean of ∇b_i is −4/3 ∇λ_i.
     """
@@ -366,7 +366,7 @@ def on_facet(
     bumps: FloatArray,
     thirds: FloatArray | None = None,
 ) -> FloatArray:
-    """Values of v at points of facets, shape (q, n).
+    """Evaluate v at points of facets, shape (q, n).
 
     Args:
         cells: The mesh.

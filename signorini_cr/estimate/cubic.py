@@ -58,7 +58,7 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
 def with_cubics(
     cells: Cells, v: fem.Function, thirds: FloatArray, bubbles: FloatArray
 ) -> fem.Function:
-    """A function of degree 2 plus cubic functions with some heights; collective."""
+    """Make a function of degree 2 plus cubic functions with some heights; collective."""
     mesh = cells.domain.mesh
     pieces = fem.Function(fem.functionspace(mesh, ("DG", 3)))
     pieces.interpolate(v)
@@ -78,7 +78,7 @@ def with_cubics(
 
 
 def _of_data(data: OnFacets) -> FloatArray:
-    """Heights of c_F in the data, as seen from the facets' cells, shape (n,)."""
+    """Find the heights of c_F in the data, as seen from the facets' cells, shape (n,)."""
     trace = data.trace
     first, second = trace.hats.T
     cubic = first * second * (first - second)

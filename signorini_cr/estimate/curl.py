@@ -104,7 +104,7 @@ def improve(
 
 
 def _pull(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> FloatArray:
-    """−∫ κ⁻¹ (y − κ∇(u_h + v)/2)·curl b_i on each cell, shape (3, cells).
+    """Compute −∫ κ⁻¹ (y − κ∇(u_h + v)/2)·curl b_i on each cell, shape (3, cells).
 
     With V = Σ Q_i X_i/(2|T|), Σ Q_i = 0, and a, b the vertices before and after k,
     V·curl λ_k = ((Q_a − Q_b) |X_a − X_b|² + Q_k (|X_b − X_k|² − |X_a − X_k|²)) / (8|T|²) if the

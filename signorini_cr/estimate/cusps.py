@@ -132,7 +132,7 @@ class Cusps:
         return np.einsum("q,qn,qin->in", self.weights, self.value, self.hats)
 
     def fitted(self, cells: Cells, excess: FloatArray, bumps: FloatArray) -> Cusps:
-        """The same with the heights for which ∇(v + ψ) is nearest to ∇u_h, v given; collective.
+        """Fit the heights so that ∇(v + ψ) is nearest to ∇u_h, v given; collective.
 
         Args:
             cells: The mesh.
@@ -171,7 +171,7 @@ class Cusps:
         return replace(self, heights=best)
 
     def before(self, cells: Cells, excess: FloatArray, bumps: FloatArray) -> FloatArray:
-        """∇(v − u_h) without ψ, as coefficients of ∇λ_i at the points, shape (q, d + 1, n)."""
+        """Compute ∇(v − u_h) without ψ, as γ_i by ∇λ_i, at the points, shape (q, d + 1, n)."""
         height = bumps[cells.facets[:, self.at]]
         out = np.repeat(excess[None, :, self.at], len(self.weights), axis=0)
         for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
@@ -184,7 +184,7 @@ class Cusps:
         return self._products(cells, 2.0 * self.before(cells, excess, bumps) + self.slope)
 
     def pulls(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
-        """∫_T κ∇ψ·∇λ_i, and ∫_T κ∇ψ·∇b_i for the bumps, shapes (d + 1, n)."""
+        """Compute ∫_T κ∇ψ·∇λ_i, and ∫_T κ∇ψ·∇b_i for the bumps, shapes (d + 1, n)."""
         flow = self._flow(cells, self.slope)
         of_bumps = np.stack(
             [
@@ -272,7 +272,7 @@ class Cusps:
             sums.totals.load_companion += float(rest @ self.means)
 
     def _flow(self, cells: Cells, slope: FloatArray) -> FloatArray:
-        """κ |T| ∇λ_i·Σ_j γ_j ∇λ_j, shape (q, d + 1, n)."""
+        """Compute κ |T| ∇λ_i·Σ_j γ_j ∇λ_j, shape (q, d + 1, n)."""
         flow = np.zeros_like(slope)
         for (i, j), s in zip(cells.pairs, cells.stiffness[:, self.at], strict=True):
             part = (slope[:, j] - slope[:, i]) * (self.kappa * s)
@@ -281,12 +281,12 @@ class Cusps:
         return flow
 
     def _products(self, cells: Cells, slope: FloatArray) -> FloatArray:
-        """∫_T κ∇ψ·Σ_i γ_i ∇λ_i, shape (n,)."""
+        """Compute ∫_T κ∇ψ·Σ_i γ_i ∇λ_i, shape (n,)."""
         return np.einsum("q,qin,qin->n", self.weights, slope, self._flow(cells, self.slope))
 
 
 def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """1 − λ at the apex, the place along the opposite side, and the weights, shapes (q,)."""
+    """Return 1 − λ at the apex, the place along the opposite side, and weights, shapes (q,)."""
     (tau, across), (place, beside) = _gauss(9), _gauss(3)
     t = tau**4
     weights = np.outer(8.0 * t * tau**3 * across, beside).ravel().astype(np.float64)
@@ -294,7 +294,7 @@ def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
-    """Points and weights on (0, 1)."""
+    """Return points and weights on (0, 1)."""
     points, weights = np.polynomial.legendre.leggauss(n)
     return 0.5 * (points + 1.0), np.asarray(0.5 * weights, dtype=np.float64)
 

@@ -81,7 +81,7 @@ class Floors:
         return cls(side, signs, ends, bounds.middle, tuple(limits), n, bent, at_middle)
 
     def heights(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The least and the largest heights of bumps that they allow for, by facet dof.
+        """Return the least and the largest heights of bumps that they allow for, by facet dof.
 
         Args:
             v: v at the vertices, within the bounds.
@@ -100,7 +100,7 @@ class Floors:
 
 
 def _lowest(v: FloatArray, obstacle: FloatArray, middle: FloatArray) -> FloatArray:
-    """Least heights of the bumps with which v stays above the quadratic through α's three values.
+    """Find the bumps' least heights for v to stay above the quadratic through α's three values.
 
     Args:
         v: At the facets' ends, not below α, shape (2, n).

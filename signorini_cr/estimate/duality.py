@@ -156,7 +156,7 @@ class _Gap:
         totals.energy_slack += float(np.sum(found.energy))
 
     def _moment(self, part: slice, height: FloatArray | None) -> FloatArray | None:
-        """Means of (f − f_T)(v − u_h), shape (n,); None where f is constant on each cell."""
+        """Compute means of (f − f_T)(v − u_h), shape (n,); None for f constant on each cell."""
         if self.load.hats is None or self.load.bumps is None:
             return None
         moment = dot_rows(self.load.hats[:, part], self.v.excess[:, part])
@@ -210,7 +210,7 @@ class _Gap:
     def _against(
         self, part: slice, pp: FloatArray, square: FloatArray, weighted: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """∫_T κ^{-1/2}σ·p, and how far that may be from the truth, shapes (n,).
+        """Compute ∫_T κ^{-1/2}σ·p, and bound how far that is off, shapes (n,).
 
         Args:
             part: Which cells.
@@ -455,7 +455,7 @@ def _add_edge_products(
 
 
 def _edge_potential(cells: Cells, kappa: Coefficient, edge: Segments, flux: Flux) -> FloatArray:
-    """φ with ∇φ = κ_T⁻¹ y − ∇u_h, as in `_against_potential`, at the points, shape (q, n)."""
+    """Find φ with ∇φ = κ_T⁻¹ y − ∇u_h, as in `_against_potential`, at points, shape (q, n)."""
     side, d = edge.side, cells.tdim
     P = flux.excess[:, side.cells]
     s, row = sum_rows(P), np.arange(len(side.cells))
@@ -528,7 +528,7 @@ def _twist(
     P: FloatArray,
     W: FloatArray,
 ) -> FloatArray:
-    """max_T |κ⁻¹ − κ_T⁻¹| ‖y‖_T, or somewhat more.
+    """Bound max_T |κ⁻¹ − κ_T⁻¹| ‖y‖_T.
 
     Args:
         cells: The mesh.
@@ -552,7 +552,7 @@ def _exact(
     w: FloatArray,
     height: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """∫_T of |p|², |b|², p·b and κ|∇v|² for κ constant on T, shapes (cells in the part,).
+    """Integrate |p|², |b|², p·b and κ|∇v|² over T for constant κ, shapes (cells in the part,).
 
     Args:
         cells: The mesh.
@@ -715,7 +715,7 @@ Row = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _within(cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray) -> Row:
-    """By quadrature on cells, or on their pieces, and by what that may miss."""
+    """Integrate by quadrature on cells, or on their pieces, and bound what that misses."""
     weights = kappa.rule.weights
 
     def integrals(
@@ -739,7 +739,7 @@ def _within(cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: Floa
 def _tensor_within(
     cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray
 ) -> Row:
-    """The same of a tensor, which is within ϱ κ_T of what the rule is exact for."""
+    """Integrate the same of a tensor, which is within ϱ κ_T of what the rule is exact for."""
     k, volume, slopes = pick(kappa.mean, part), cells.volume[part], v.slopes(cells, part)
     _, gradients = cells.corners(part)
     total, steep = np.zeros((len(volume), cells.tdim)), np.zeros_like(volume)
@@ -758,7 +758,7 @@ def _tensor_within(
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:
-    """The first four rows, and what quadrature may miss; see `Coefficient.enclose` for the errors.
+    """Take the first four rows, and what quadrature may miss; for errors see `Coefficient.enclose`.
 
     With z = v or 2u_h − v it is the smaller of two bounds of what it misses of ∫ κ⁻¹|y − κ∇z|²:
     that of its three products, and what follows from ‖κ^{-1/2}(y − κ∇z)‖ ≤ N(y − κ∇z) + 2R N(∇z),
@@ -788,7 +788,7 @@ def _at_points(
     w: FloatArray,
     points: Iterable[tuple[FloatArray, float, FloatArray]],
 ) -> FloatArray:
-    """Means over points of |T| times what the gap is made of.
+    """Average over points |T| times what the gap is made of.
 
     It is |p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and κ⁻¹|∇z|² for z = v and z = 2u_h − v.
 
@@ -845,7 +845,7 @@ def _against_potential(
     bumps: FloatArray,
     part: slice,
 ) -> FloatArray:
-    """∫_T (f − f_T) φ for the φ with ∇φ = y − κ_T∇u_h and d = 2, shape (cells in the part,).
+    """Compute ∫_T (f − f_T) φ, ∇φ = y − κ_T∇u_h, for d = 2, shape (cells in the part,).
 
     2d |T| φ = Σ P_i |x − X_i|² up to a constant, and for x = Σ λ_i X_i with L_ij = |X_i − X_j|²
     |x − X_i|² = Σ_j λ_j L_ij − Σ_{j<k} λ_j λ_k L_jk.

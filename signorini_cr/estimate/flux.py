@@ -67,7 +67,7 @@ class Flux:
 
     @property
     def unbalanced(self) -> FloatArray:
-        """What is left and not taken up, shape (cells,)."""
+        """∫_T (f + div y) where it is not taken up, shape (cells,)."""
         return self.left if self.taken_up is None else np.where(self.taken_up, 0.0, self.left)
 
 
@@ -209,7 +209,7 @@ def _relaxed(
     on_contact: BoundaryFacets,
     pushing: BoolArray,
 ) -> tuple[_Relaxed, BoolArray]:
-    """What is to become small, and which facets' fluxes may change, by facet dof; collective.
+    """Set up what is to become small, and which fluxes may change, by facet dof; collective.
 
     Args:
         cells: The mesh.
@@ -281,7 +281,7 @@ class _Relaxed:
         )
 
     def least(self, flux: Flux, free: BoolArray) -> FloatArray:
-        """How fluxes out of the cells are to change, shape (3, cells); collective.
+        """Find how fluxes out of the cells are to change, shape (3, cells); collective.
 
         Args:
             flux: y.
@@ -301,7 +301,7 @@ class _Relaxed:
         return self.sign * change[self.cells.facets]
 
     def slopes(self, excess: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
-        """½ ∂ by the flux through each cell's facets, shape (3, cells).
+        """Compute ½ ∂ by the flux through each cell's facets, shape (3, cells).
 
         Args:
             excess: Fluxes of y − κ∇u_h out of the cells, shape (3, cells).
@@ -313,7 +313,7 @@ class _Relaxed:
         return self.sign * local
 
     def diagonal(self) -> FloatArray:
-        """½ ∂² by each flux, by facet dof; collective."""
+        """Compute ½ ∂² by each flux, by facet dof; collective."""
         units = np.eye(3)[:, :, None] * np.ones(self.cells.number)
         local = np.stack([field_squares(self.cells, unit) for unit in units]) / self.kappa
         local += self.of_cells
@@ -322,12 +322,12 @@ class _Relaxed:
 
 
 def _inverse(masses: FloatArray) -> FloatArray:
-    """1 over what is positive, 0 for the rest."""
+    """Compute 1 over what is positive, 0 for the rest."""
     return np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0.0)
 
 
 def _field_slopes(cells: Cells, fluxes: FloatArray) -> FloatArray:
-    """½ ∂`field_squares` by each flux, shape (d + 1, cells)."""
+    """Compute ½ ∂`field_squares` by each flux, shape (d + 1, cells)."""
     d, s = cells.tdim, sum_rows(fluxes)
     a, q = fluxes - s / (d + 1), np.zeros_like(fluxes)
     for (i, j), length in zip(cells.pairs, cells.lengths, strict=True):
@@ -424,7 +424,7 @@ WORTH = 1e-3
 def _carry(
     cells: Cells, left: FloatArray, layers: Layers | None = None, takers: int = 0
 ) -> tuple[FloatArray, bool]:
-    """Fluxes of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
+    """Find the fluxes of a Raviart-Thomas field q with ∫_T div q = −left_T; collective.
 
     q·n vanishes on the boundary but Γ0. Cell after cell, the farthest from Γ0 first, sends what it
     holds through the facets by which a walk from Γ0 first came to it, the same through each: so q
@@ -463,7 +463,7 @@ def _carry(
 def _carried(
     cells: Cells, left: FloatArray, kappa_min: FloatArray, size: float, reaction: FloatArray
 ) -> float:
-    """‖κ^{-1/2} q‖ of a field q in the Raviart-Thomas space with ∫_T div q = −left_T; collective.
+    """Compute ‖κ^{-1/2} q‖ of a Raviart-Thomas field q with ∫_T div q = −left_T; collective.
 
     Where q leaves through facets with a b, that takes up ‖b^{-1/2} q·n‖ there. Where a walk's q is
     not small against `size`, one that is nearly the smallest takes its place. Where cells have no
@@ -565,7 +565,7 @@ def carried_to_contact(
 
 
 def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
-    """Fluxes of nearly the smallest q with nearly ∫_T div q = −left_T; collective.
+    """Find the fluxes of nearly the smallest q with nearly ∫_T div q = −left_T; collective.
 
     They are those of `equilibrate` for the load left_T/|T|, a b and no contact. A few steps of
     conjugate gradients are enough where there are few cells, and of use on any mesh.
@@ -607,7 +607,7 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
 def field_squares(
     cells: Cells, fluxes: FloatArray, part: slice | IndexArray | None = None
 ) -> FloatArray:
-    """‖p‖²_T of the field with the given fluxes out of the cell, shape (cells in the part,).
+    """Compute ‖p‖²_T of the field with these fluxes out of the cell, shape (cells in the part,).
 
     p = (s (x − x_T) − Σ a_i X_i) / (d |T|) with s the sum of the fluxes and a_i = flux_i − s/(d+1).
     """

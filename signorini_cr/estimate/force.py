@@ -42,7 +42,7 @@ class Certified(Solved, Protocol):
 
     @property
     def certificate(self) -> Certificate:
-        """What is certain about the error."""
+        """The certificate of its error."""
 
 
 class Interval(NamedTuple):
@@ -138,7 +138,7 @@ def unsure(
 
 
 def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, float, FloatArray]:
-    """(A v − p', Aφ), this rank's share, p' = p + A u_h, for d = 2.
+    """Compute (A v − p', Aφ), this rank's share, p' = p + A u_h, for d = 2.
 
     Args:
         made: v, p and u_h.
@@ -199,7 +199,7 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, float, Flo
 
 
 def square(made: Made, cells: Cells, at: FloatArray) -> float:
-    """‖Aφ‖², or a bound of it, this rank's share, from φ at the cells' vertices."""
+    """Compute ‖Aφ‖², or a bound of it, this rank's share, from φ at the cells' vertices."""
     total, edge = sum_rows(at), made.segments
     slopes = cells.apply(at, slice(0, cells.number))
     kappa = made.kappa if made.within is None else made.within.mean
@@ -242,7 +242,7 @@ def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
 
 
 def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Function:
-    """A P1 function, 1 on some parts, 0 on the rest of Γ0 and Γ1, with nearly the least ‖Aφ‖."""
+    """Make a P1 function, 1 on some parts, 0 on the rest of Γ0 and Γ1, with nearly least ‖Aφ‖."""
     domain = solution.domain
     mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
     data = diffusion(solution.level.data)
@@ -271,7 +271,7 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
 
 
 def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Function:
-    """A P1 function φ with given values at some dofs and nearly the least ‖Aφ‖; collective.
+    """Extend values given at some dofs to a P1 function φ with nearly the least ‖Aφ‖; collective.
 
     Args:
         values: A P1 function.

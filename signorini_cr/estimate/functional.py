@@ -54,7 +54,7 @@ class Masses:
     def fall(
         self, cells: Cells, excess: FloatArray, height: FloatArray, part: slice | IndexArray
     ) -> tuple[FloatArray, FloatArray]:
-        """How fast c‖v − u_h‖² falls, as `Slopes`, from both on these cells, shapes (3, n)."""
+        """Compute how fast c‖v − u_h‖² falls, as `Slopes`, from both on cells, shapes (3, n)."""
         mass, whole, humps = self.on_cells(cells, part), sum_rows(excess), sum_rows(height)
         at_vertices = (whole + excess) / 12.0 + (2.0 * humps - height) / 15.0
         at_facets = (2.0 * whole - excess) / 15.0 + 4.0 / 45.0 * (humps + height)
@@ -63,7 +63,7 @@ class Masses:
     def fall_on_facets(
         self, cells: Cells, excess: FloatArray, bumps: FloatArray, which: slice | IndexArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How fast b‖v − t/b‖² falls, by v's ends and the height, and what it is.
+        """Compute how fast b‖v − t/b‖² falls, by v's ends and the height, and what it is.
 
         Args:
             cells: The mesh.

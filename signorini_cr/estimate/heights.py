@@ -140,7 +140,7 @@ class _OfHeights:
         return out
 
     def diagonal(self) -> FloatArray:
-        """The diagonal by facet dof; collective."""
+        """Compute the diagonal by facet dof; collective."""
         cells = self.functional.cells
         local = np.tile(self.own, (3, 1))
         if self._reacts:
@@ -201,7 +201,7 @@ def promise_of_vertices(
 
 
 def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
-    """Means of (v − u_h)² over simplices of one, two or three dimensions, shape (n,).
+    """Compute means of (v − u_h)² over simplices of one, two or three dimensions, shape (n,).
 
     Args:
         c: v − u_h at the vertices, shape (k, n).

@@ -59,19 +59,19 @@ class Cubic:
     third: FloatArray
 
     def at(self, which: IndexArray, s: FloatArray) -> FloatArray:
-        """Values at s on some facets."""
+        """Evaluate at s on some facets."""
         a, b = self.ends[:, which]
         bend = 4.0 * self.height[which] + (1.0 - 2.0 * s) * self.third[which]
         return a + s * (b - a) + s * (1.0 - s) * bend
 
     def slope(self, which: IndexArray, s: FloatArray) -> FloatArray:
-        """Derivative in s."""
+        """Compute the derivative in s."""
         a, b = self.ends[:, which]
         bend = 4.0 * (1.0 - 2.0 * s) * self.height[which]
         return b - a + bend + (1.0 - 6.0 * s * (1.0 - s)) * self.third[which]
 
     def bend(self, which: IndexArray, s: FloatArray) -> FloatArray:
-        """Half the second derivative in s."""
+        """Compute half the second derivative in s."""
         return (6.0 * s - 3.0) * self.third[which] - 4.0 * self.height[which]
 
 
@@ -363,7 +363,7 @@ def _bounds(
     scale: float,
     signed: bool = False,
 ) -> FloatArray:
-    """Bounds of |δ|, |δ'| and of the data's mean from below, on pieces of facets, shape (3, n).
+    """Bound |δ|, |δ'|, and the data's mean from below, on pieces of facets, shape (3, n).
 
     Taylor's formula about the middle m for δ', with what the orders 1, 2 and 3 say; whichever is
     the best. With `signed` the first is an upper bound of δ itself.
@@ -411,7 +411,7 @@ def _bounds(
 
 
 def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
-    """The value and the coefficients up to the third order in one variable."""
+    """Return the value and the coefficients up to the third order in one variable."""
     mid, rad = jet.rest.on((1, 2, 3))
     pairs = [middle(jet.low, jet.high), *zip(mid, rad, strict=True)]
     return [(np.broadcast_to(a, n), np.broadcast_to(b, n)) for a, b in pairs]

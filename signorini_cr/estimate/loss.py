@@ -72,7 +72,7 @@ class Loss:
 
 
 def half(squares: Sequence[Segments]) -> tuple[float, float]:
-    """½∫ b u_h² by what `Loss.certain` gives, and how far that may be off; this rank's share."""
+    """Compute ½∫ b u_h² by what `Loss.certain` gives, and bound the error; this rank's share."""
     value, off = 0.0, 0.0
     for each in squares:
         value += 0.5 * float(np.sum(each.through))

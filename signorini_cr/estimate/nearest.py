@@ -41,7 +41,7 @@ def nearest(
     free_facets: BoolArray,
     masses: Masses | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """The way from v to the function of degree 2 that is nearest to u_h; collective.
+    """Find the way from v to the function of degree 2 that is nearest to u_h; collective.
 
     Args:
         cells: The mesh, d = 2.

@@ -99,7 +99,7 @@ def left_by(dual: Made, made: Made) -> float:
 
 
 def in_p1(dual: Certificate, cells: Cells, bent: bool = False) -> Made | None:
-    """What a dual's certificate is made of, if v is in P1 and y·n a number a facet; collective.
+    """Return what a dual's certificate is made of, if v is in P1, y·n a number a facet; collective.
 
     Args:
         dual: The certificate.

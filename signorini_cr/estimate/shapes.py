@@ -16,7 +16,7 @@ SHARE = 1e-20
 
 
 def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
-    """Numbers γ_k with ∇ Σ height_i b_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    """Compute γ_k with ∇ Σ height_i b_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
     gamma = np.zeros_like(height)
     for (i, j), m in ((pair, 3 - sum(pair)) for pair in cells.pairs):
         gamma[i] += 4.0 * hat[m] * height[j]
@@ -25,7 +25,7 @@ def bump_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray
 
 
 def third_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArray:
-    """Numbers γ_k with ∇ Σ height_i c_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    """Compute γ_k with ∇ Σ height_i c_i = Σ γ_k ∇λ_k at a point, shape (3, n)."""
     gamma = np.zeros_like(height)
     for i, (j, k) in enumerate(cells.others):
         both = 2.0 * hat[j] * hat[k]
@@ -35,23 +35,23 @@ def third_slopes(cells: Cells, height: FloatArray, hat: FloatArray) -> FloatArra
 
 
 def bubble_slopes(hat: FloatArray) -> FloatArray:
-    """Numbers γ_k with ∇ λ_1 λ_2 λ_3 = Σ γ_k ∇λ_k at a point, shape (3, n)."""
+    """Compute γ_k with ∇ λ_1 λ_2 λ_3 = Σ γ_k ∇λ_k at a point, shape (3, n)."""
     return np.stack([hat[1] * hat[2], hat[2] * hat[0], hat[0] * hat[1]])
 
 
 def local_thirds(cells: Cells, thirds: FloatArray, where: slice | IndexArray) -> FloatArray:
-    """Heights of the c_i of each cell from those of the facets, shape (3, n)."""
+    """Take the heights of the c_i of each cell from those of the facets, shape (3, n)."""
     return np.asarray(cells.ways[:, where] * thirds[cells.facets[:, where]])
 
 
 def quadrature() -> tuple[FloatArray, FloatArray]:
-    """Points and weights of a rule that is exact for |y|², shapes (q, 3) and (q,)."""
+    """Return points and weights of a rule that is exact for |y|², shapes (q, 3) and (q,)."""
     points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
     return np.column_stack([1.0 - points.sum(axis=1), points]), weights / weights.sum()
 
 
 def best_heights(cells: Cells, matrix: FloatArray, pull: FloatArray, free: BoolArray) -> FloatArray:
-    """Heights that minimise a quadratic functional, by conjugate gradients; collective.
+    """Find heights that minimise a quadratic functional, by conjugate gradients; collective.
 
     Args:
         cells: The mesh.

@@ -57,7 +57,7 @@ class Totals:
     steepness: float = 0.0
 
     def over_ranks(self, cells: Cells) -> Totals:
-        """The same of all ranks' cells; collective."""
+        """Add up the same over all ranks' cells; collective."""
         return Totals(*(float(value) for value in cells.total(*astuple(self))))
 
 

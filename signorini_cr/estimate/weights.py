@@ -168,7 +168,7 @@ class Weight:
 
 
 def scalar(weight: Data, forms: Forms) -> ufl.core.expr.Expr:
-    """A weight as an expression in the coordinates of the mesh that the forms were written for.
+    """Write a weight as an expression in the coordinates of the mesh that the forms are on.
 
     Raises:
         InputError: It is no scalar, or on another mesh.
@@ -182,7 +182,7 @@ def scalar(weight: Data, forms: Forms) -> ufl.core.expr.Expr:
 
 
 def pressed(made: Made, cells: Cells, side: BoundaryFacets) -> FloatArray:
-    """∫_F (y·n + t − g̃) on facets of Γ0 and Γ1, but for what is in σ, shape (n,)."""
+    """Compute ∫_F (y·n + t − g̃) on facets of Γ0 and Γ1, but for what is in σ, shape (n,)."""
     known, edge = np.zeros(len(cells.exterior)), made.segments
     known[edge.facets.dofs] = edge.through
     if made.shed is not None:
