@@ -151,7 +151,7 @@ def check_operator(forms: Forms, domain: Domain) -> None:
 
 
 def _middles(domain: Domain) -> tuple[FloatArray, Int32Array]:
-    """The middles of this rank's cells, and the cells."""
+    """Find the middles of this rank's cells, and the cells."""
     tdim = domain.mesh.topology.dim
     cells = np.arange(domain.mesh.topology.index_map(tdim).size_local, dtype=np.int32)
     return compute_midpoints(domain.mesh, tdim, cells), cells
@@ -257,7 +257,7 @@ class _Values:
     def at(
         self, points: FloatArray, cells: Int32Array, error: float
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Values and tolerances for their rounding, shapes of the points but for the last axis."""
+        """Evaluate, with tolerances for rounding, shapes of the points but for the last axis."""
         shape = points.shape[:-1]
         cells = np.broadcast_to(cells.reshape(cells.shape + (1,) * (len(shape) - 1)), shape)
         found = evaluate(self.expression, points.reshape(-1, 3), error, cells.ravel())
@@ -435,7 +435,7 @@ def _sampled(u_D: _Values, fixed: _Facets, pieces: int) -> _Intervals | None:
 
 
 def _halves(triples: FloatArray, cuts: FloatArray) -> FloatArray:
-    """Both parts of every interval, the first ones first, shape (3, 2 intervals)."""
+    """Cut every interval in two, the first parts first, shape (3, 2 intervals)."""
     (a, m, b), (p, q) = triples, cuts
     return np.hstack([np.stack([a, p, m]), np.stack([m, q, b])])
 
@@ -463,7 +463,7 @@ def _pole_message(key: str, mesh: Mesh, x: FloatArray) -> Complaint:
 def _between(
     given: Sequence[tuple[_Values, _Facets]], scale: float | None, key: str
 ) -> list[Complaint]:
-    """Vertices at which facets give u_D different values; collective.
+    """Find vertices at which facets give u_D different values; collective.
 
     On one part only Functions can: what else depends on x alone.
 
@@ -652,7 +652,7 @@ def check_symmetry(kappa: Tensor, domain: Domain) -> None:
 
 
 def _rows(tensor: FloatArray) -> str:
-    """A tensor in a message."""
+    """Write a tensor for a message."""
     return "[" + ", ".join("[" + ", ".join(f"{v:.10g}" for v in row) + "]" for row in tensor) + "]"
 
 
@@ -690,7 +690,7 @@ def _bad_form(forms: Forms, domain: Domain) -> str | None:
 
 
 def _definite(ranks: Sequence[tuple[IndexArray, IndexArray, FloatArray, Int64Array]]) -> bool:
-    """Whether a symmetric matrix is definite but for constants, which obstacles may hold.
+    """Tell whether a symmetric matrix is definite but for constants, which obstacles may hold.
 
     By Sylvester's law of inertia there are as many eigenvalues below 0 as pivots.
 
@@ -722,18 +722,18 @@ def _definite(ranks: Sequence[tuple[IndexArray, IndexArray, FloatArray, Int64Arr
 
 
 def place(x: FloatArray, mesh: Mesh) -> tuple[float, ...]:
-    """A point for a message, without the digits that rounding has made."""
+    """Round a point for a message: leave out the digits that rounding has made."""
     digits = 11 - math.ceil(math.log10(np.abs(mesh.geometry.x).max()))
     return tuple(float(value) + 0.0 for value in np.round(x[: mesh.geometry.dim], digits))
 
 
 def shown(x: Sequence[float]) -> str:
-    """A point in a message."""
+    """Write a point for a message."""
     return "(" + ", ".join(f"{value:.10g}" for value in x) + ")"
 
 
 def first(comm: MPI.Comm, found: list[Complaint]) -> str | None:
-    """The complaint about the first point from the left, on all ranks; collective."""
+    """Find the complaint about the first point from the left, on all ranks; collective."""
     every = [each for each in comm.allgather(min(found, default=None)) if each is not None]
     return min(every)[1] if every else None
 

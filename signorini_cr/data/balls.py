@@ -27,7 +27,7 @@ LOOSE = 4e-15
 
 @cache
 def indices(variables: int, order: int = ORDER) -> tuple[tuple[int, ...], ...]:
-    """The multi-indices of Taylor coefficients, by order, the value's first."""
+    """List the multi-indices of Taylor coefficients, by order, the value's first."""
     found = [k for k in product(range(order + 1), repeat=variables) if sum(k) <= order]
     return tuple(sorted(found, key=lambda k: (sum(k), [-i for i in k])))
 
@@ -47,7 +47,7 @@ class Balls:
     rad: FloatArray
 
     def on(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
-        """Middles and radii of these coefficients and of others, which are 0."""
+        """Return middles and radii of these coefficients and of others, which are 0."""
         if rows == self.rows:
             return self.mid, self.rad
         mid, rad = np.zeros((2, len(rows), self.mid.shape[1]))
@@ -56,11 +56,11 @@ class Balls:
         return mid, rad
 
     def __neg__(self) -> Balls:
-        """The negative polynomials."""
+        """Negate the polynomials."""
         return Balls(self.rows, -self.mid, self.rad)
 
     def __add__(self, other: Balls) -> Balls:
-        """Sums."""
+        """Add polynomials."""
         if not self.rows or not other.rows:
             return self if self.rows else other
         rows = union(self.rows, other.rows)
@@ -69,7 +69,7 @@ class Balls:
         return Balls(rows, mid, (of_a + of_b + EPS * np.abs(mid)) * (1 + 1e-15))
 
     def scaled(self, factor: float) -> Balls:
-        """Products with a number."""
+        """Multiply by a number."""
         mid = factor * self.mid
         return Balls(self.rows, mid, (abs(factor) * self.rad + EPS * np.abs(mid)) * (1 + 1e-15))
 
@@ -95,7 +95,7 @@ class Factor:
 
     @classmethod
     def of(cls, low: FloatArray, high: FloatArray, others: Balls) -> Factor:
-        """A value between some bounds, shape (n,) or (), and coefficients of higher order."""
+        """Take a value between some bounds, shape (n,) or (), and coefficients of higher order."""
         mid = 0.5 * low + 0.5 * high
         shape = np.broadcast_shapes(mid.shape, others.mid.shape[1:])
         planes = np.empty((3, 1 + len(others.rows), *shape))
@@ -116,7 +116,7 @@ class Factor:
         return Factor(self.rows[1:], self.planes[:, 1:], self.bounded)
 
     def times(self, other: Factor, variables: int, order: int) -> Balls:
-        """The coefficients of a product from the first order on, up to some order.
+        """Compute the coefficients of a product from the first order on, up to some order.
 
         With A = |a| + r a product's radius is A B − |a b|, and both of these are added up. 0 times
         what has no bound is 0.
@@ -142,7 +142,7 @@ class Factor:
 def _terms(
     variables: int, order: int, left: Rows, right: Rows
 ) -> tuple[tuple[tuple[slice, ...], ...], Rows]:
-    """The products in the coefficients of a product, from the first order on.
+    """List the products in the coefficients of a product, from the first order on.
 
     Returns:
         Triples of slices of rows: two to multiply, one of which at least is a single row, and those
@@ -172,11 +172,11 @@ def _terms(
 
 @cache
 def union(a: Rows, b: Rows) -> Rows:
-    """Rows of either."""
+    """Join the rows of both."""
     return tuple(sorted({*a, *b}))
 
 
 def middle(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A range as middle and radius."""
+    """Write a range as middle and radius."""
     mid = 0.5 * low + 0.5 * high
     return mid, np.maximum(high - mid, mid - low) * (1 + 1e-15)

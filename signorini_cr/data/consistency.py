@@ -122,7 +122,7 @@ class _Solution:
         self.slope: Any = None if flat else forms.kappa * ufl.grad(self.u)
 
     def complaint(self) -> str | None:
-        """The first condition that u violates: on Γ1, in Ω, on other parts; collective."""
+        """Find the first condition that u violates: on Γ1, in Ω, on other parts; collective."""
         said = None
         for contact in self.forms.bounded:
             for sign, bound in contact.bounds:
@@ -181,7 +181,7 @@ class _Solution:
         return self._first(wrong, x, words, given, wanted)
 
     def _facets(self, part: int) -> tuple[FloatArray, Int32Array, FloatArray]:
-        """Midpoints of facets, their cells and outward normals."""
+        """Find midpoints of facets, their cells and outward normals."""
         entities = facet_entities(self.mesh, self.domain.facets(part))
         corners, _ = facet_measures(self.mesh, self.domain.facets(part))
         middle, cells = corners.mean(axis=1), entities[:, 0]
@@ -193,7 +193,7 @@ class _Solution:
         return middle, cells, normal / np.linalg.norm(normal, axis=1)[:, None]
 
     def _values(self, e: Any, x: FloatArray, cells: Int32Array) -> Found:
-        """An expression at points; what can't be told is nan."""
+        """Evaluate an expression at points; what can't be told is nan."""
         found = evaluate(e, x, self.precision, cells)
         if found is None:
             shape = (len(x), *e.ufl_shape)
@@ -201,7 +201,7 @@ class _Solution:
         return found[0], SAFETY * found[1]
 
     def _flux(self, where: Condition, x: FloatArray, cells: Int32Array, n: FloatArray) -> Found:
-        """κ∂ₙu + b u."""
+        """Evaluate κ∂ₙu + b u."""
         if self.slope is None:
             found = np.zeros(len(x)), np.zeros(len(x))
         else:
@@ -213,7 +213,7 @@ class _Solution:
         return _difference(found, self._values(-where.loss * self.u, x, cells))
 
     def _size(self, *found: Found) -> float:
-        """The largest value on any rank."""
+        """Find the largest value on any rank."""
         values = np.concatenate([np.abs(each[0]) for each in found])
         largest = float(values[np.isfinite(values)].max(initial=0.0))
         return float(self.mesh.comm.allreduce(largest, op=MPI.MAX))

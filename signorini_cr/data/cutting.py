@@ -231,7 +231,7 @@ class _Wanted:
     levels: Levels | None
 
     def shares(self, pieces: Pieces, inside: FloatArray) -> FloatArray:
-        """Weighted errors of pieces, shape (n,)."""
+        """Compute weighted errors of pieces, shape (n,)."""
         return pieces.part * _shares(self.weights[:, pieces.parent], inside)
 
 
@@ -258,13 +258,13 @@ class _Front:
         return cls(pieces, inside, wanted.shares(pieces, inside), ways)
 
     def __getitem__(self, which: BoolArray) -> _Front:
-        """Some of them."""
+        """Take some of them."""
         return _Front(
             self.pieces[which], self.inside[:, which], self.share[which], self.ways[which]
         )
 
     def __add__(self, other: _Front) -> _Front:
-        """These and others."""
+        """Join these and others."""
         return _Front(
             self.pieces + other.pieces,
             np.hstack([self.inside, other.inside]),
@@ -336,7 +336,7 @@ def _directed(front: _Front, wanted: _Wanted) -> _Front:
 
 
 def _tried(front: _Front, wanted: _Wanted, levels: Levels) -> IndexArray:
-    """The way to cut that leaves a jump in few pieces, by trying them all; else quarters; local.
+    """Find the way to cut that leaves a jump in few pieces, by trying all; else quarters; local.
 
     Errors fall faster than the number of pieces grows where what is left, in parts of what there
     was, times the number of pieces that have it is below 1: about that is what quarters do.
@@ -359,7 +359,7 @@ def _shares(weights: FloatArray, errors: FloatArray) -> FloatArray:
 
 
 def _worst(share: FloatArray, threshold: float, room: int, comm: MPI.Comm) -> BoolArray:
-    """Those above a threshold, which is raised until there is room for them; collective."""
+    """Choose those above a threshold, which is raised until there is room for them; collective."""
     top = comm.allreduce(float(share.max(initial=0.0, where=np.isfinite(share))), op=MPI.MAX)
     least = threshold
 
@@ -375,7 +375,7 @@ def _worst(share: FloatArray, threshold: float, room: int, comm: MPI.Comm) -> Bo
 
 
 def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
-    """A threshold below which shares add up to no more than some number; collective."""
+    """Find a threshold below which shares add up to no more than some number; collective."""
     if comm.allreduce(float(share.sum())) <= enough:
         return enough
     # It is the largest of these powers of two, times the share that all cells might have
@@ -389,7 +389,7 @@ def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
 
 
 def _extents(cells: Cells) -> Range:
-    """Least and largest coordinates in each cell, shapes (gdim, cells)."""
+    """Find the least and largest coordinates in each cell, shapes (gdim, cells)."""
     mesh = cells.domain.mesh
     nodes = cell_nodes(mesh)[: cells.number]
     low, high = np.empty((2, mesh.geometry.dim, cells.number))
@@ -406,7 +406,7 @@ def _extents(cells: Cells) -> Range:
 
 
 def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, FloatArray, IndexArray]:
-    """Boxes on grids that depend on nothing but the cells' own extents.
+    """Make boxes on grids that depend on nothing but the cells' own extents.
 
     Returns:
         The boxes, upper bounds of half the extents of their cells, and each cell's box.

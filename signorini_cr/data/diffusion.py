@@ -91,7 +91,7 @@ class Moments:
         return (np.full(n, -np.inf), np.full(n, np.inf)) if found is None else found
 
     def with_source(self, load: VolumeMoments) -> VolumeMoments:
-        """Moments of f, as given, and what it has beside."""
+        """Return moments of f, as given, and what it has beside."""
         if self.source is None:
             return load
         return load.less(-self.rate, vertex_rows(self.source, self.cells))
@@ -112,7 +112,7 @@ class Moments:
         )
 
     def _sinks(self, cells: Cells) -> dict[int, FloatArray]:
-        """The parts whose b is above 0, and a lower bound on their facets; collective."""
+        """Find the parts whose b is above 0, and a lower bound on their facets; collective."""
         conditions = self.compiled.forms.conditions
         found = {c.number: self._loss(c, cells)[0] for c in conditions if c.loss is not None}
         return {
@@ -122,9 +122,9 @@ class Moments:
         }
 
     def _loss(self, condition: Condition, cells: Cells) -> tuple[FloatArray, FloatArray]:
-        """Bounds of b on facets of owned cells, in the order of `Cells.sides`, shape (n,) or ().
+        """Bound b on facets of owned cells, in the order of `Cells.sides`, shape (n,) or ().
 
-        They are one object where b is constant on each facet, and infinite where nothing is known.
+        Both are one object where b is constant on each facet, and infinite where nothing is known.
         """
         datum = ufl.as_ufl(condition.loss or 0.0)
         if not is_by_cells(datum):
@@ -138,7 +138,7 @@ class Moments:
 
 
 def _by_cells(compiled: Compiled, domain: Domain, datum: Expr) -> FloatArray:
-    """Values on owned cells of what is constant there, shape (cells,), or () for a number."""
+    """Evaluate what is constant on owned cells, shape (cells,), or () for a number."""
     known = as_number(datum)
     if known is not None:
         return np.array(known)
@@ -269,13 +269,13 @@ class DiffusionOnMesh:
 
     @cached_property
     def u_D(self) -> tuple[OnFacets, ...]:
-        """What u is set to on Γ0, one for each condition."""
+        """The values of u on Γ0, one for each condition."""
         data = [(condition, 1, condition.fixed) for condition in self.forms.fixed]
         return self._sampled(data, lambda earlier: earlier.u_D)
 
     @cached_property
     def alpha(self) -> tuple[OnFacets, ...]:
-        """What s u must not be below on Γ1, one for each condition's each bound."""
+        """The bounds that s u must not be below on Γ1, one for each condition's each bound."""
         data = [(each, sign, datum) for each in self.forms.bounded for sign, datum in each.bounds]
         return self._sampled(data, lambda earlier: earlier.alpha)
 
@@ -317,7 +317,7 @@ class DiffusionOnMesh:
         return tuple(on_facets.imposed for on_facets in self.alpha)
 
     def chi(self) -> FloatArray:
-        """χ (1.10) by dof, this rank's cells' share."""
+        """Compute χ (1.10) by dof, this rank's cells' share."""
         moments = self.moments
         if self.forms.element == "CR" and (self.forms.loaded or moments.source is not None):
             found = chi(self.of_f, self.edges, self.cells)
@@ -330,7 +330,7 @@ class DiffusionOnMesh:
         return found
 
     def inflow(self) -> FloatArray | None:
-        """∫ f + ∫ g over each owned cell by two fine rules; None where more is part of the load."""
+        """Compute ∫ f + ∫ g over each owned cell by two fine rules; None if the load has more."""
         if self.forms.own_load is not None or self.moments.source is not None:
             return None
         cells = self.cells
@@ -346,7 +346,7 @@ class DiffusionOnMesh:
         return found
 
     def of_constants(self) -> FloatArray | None:
-        """a_h(1, ·) by dof, this rank's cells' share; None where it vanishes."""
+        """Compute a_h(1, ·) by dof, this rank's cells' share; None where it vanishes."""
         return None if self.forms.of_one is None else self._assembled(self.forms.of_one)
 
     def conforming(self, cells: Int32Array, index_map: Any) -> tuple[fem.Form, float]:
@@ -364,7 +364,7 @@ class DiffusionOnMesh:
         return forms.a_p1.on(self.domain, [W, W]), 1.0
 
     def at_vertices(self, u: fem.Function, facets: Int32Array) -> FloatArray:
-        """u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
+        """Evaluate u_h at the vertices of boundary facets, seen from their cells, shape (n, d)."""
         if self._earlier is not None:
             return self._earlier.at_vertices(u, facets)
         if self._ends is None or self._ends[0] is not facets:
@@ -374,7 +374,7 @@ class DiffusionOnMesh:
         return np.take_along_axis(vertex_values(u, cells), corners, axis=1)
 
     def squared_energy_norm(self, u: fem.Function) -> float:
-        """a_h(u, u), this rank's cells' share."""
+        """Compute a_h(u, u), this rank's cells' share."""
         if self._earlier is None:
             form = self.forms.a_of_w.on(self.domain, (), [u])
         else:

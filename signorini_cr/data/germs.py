@@ -138,7 +138,7 @@ class _Germs:
         return Germ(Fraction(float(self.point[i])), 1.0, *self.directions[:, i])
 
     def _with(self, g: Germ, power: float) -> Range:
-        """I for a smaller exponent: ρ^a I lies in ρ^b [0, ϱ^{a−b}] I."""
+        """Enclose I for a smaller exponent: ρ^a I lies in ρ^b [0, ϱ^{a−b}] I."""
         if g.power == power:
             return g.low, g.high
         if g.power == np.inf:
@@ -147,7 +147,7 @@ class _Germs:
         return out((np.minimum(g.low * scale, 0.0), np.maximum(g.high * scale, 0.0)))
 
     def _folded(self, g: Germ, power: float) -> Range:
-        """The same with the constant in I, for an exponent that is not above 0."""
+        """Enclose the same with the constant in I, for an exponent that is not above 0."""
         low, high = self._with(g, power)
         c = float(g.constant)
         if c:
@@ -159,7 +159,7 @@ class _Germs:
         return low, high
 
     def plain(self, g: Germ) -> Range:
-        """The range over all ρ."""
+        """Enclose the range over all ρ."""
         if g.power < 0:
             raise Unknown("what has no bound")
         return self._folded(g, 0.0)
@@ -223,7 +223,7 @@ class _Germs:
         return Germ(Fraction(0), 0.0, np.where(full, -4.0, low), np.where(full, 4.0, high))
 
     def _sign(self, a: Germ, b: Germ) -> Range:
-        """A range with the signs of a − b."""
+        """Find a range with the signs of a − b."""
         g = self._sum(a, self._product(self._number(-1.0), b))
         if g.power == np.inf:
             return np.full((1, 1), float(g.constant)), np.full((1, 1), float(g.constant))
@@ -253,7 +253,7 @@ class _Germs:
         raise Unknown(type(e).__name__)
 
     def _choice(self, first: BoolArray, second: BoolArray, a: Germ, b: Germ) -> Germ:
-        """A where only the first can be, b where only the second, the hull of both elsewhere."""
+        """Choose a where only the first can be, b where only the second, else the hull of both."""
         if not second.any():
             return a
         if not first.any():
@@ -369,7 +369,7 @@ def first_inside(
 
 
 def _measures(corners: FloatArray) -> FloatArray:
-    """Of segments or triangles, shape (n,)."""
+    """Measure segments or triangles, shape (n,)."""
     edges = corners[1:] - corners[:1]
     if len(corners) == 2:
         return np.asarray(np.linalg.norm(edges[0], axis=0))
@@ -377,7 +377,7 @@ def _measures(corners: FloatArray) -> FloatArray:
 
 
 def _barycentric(corners: FloatArray, point: FloatArray) -> FloatArray:
-    """Of the nearest point in each simplex's plane, shape (d + 1, n)."""
+    """Find barycentric coordinates of the nearest point in a simplex's plane, shape (d + 1, n)."""
     edges = (corners[1:] - corners[:1]).transpose(2, 0, 1)
     gram = edges @ edges.transpose(0, 2, 1)
     right = np.einsum("ndg,ng->nd", edges, (point[:, None] - corners[0]).T)
@@ -412,7 +412,7 @@ def _candidates(expression: Any, corners: FloatArray) -> list[FloatArray]:
 def _sectors(
     offset: FloatArray, tip: IndexArray, exact: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bounds of the unit vectors that point from a point into simplices.
+    """Bound the unit vectors that point from a point into simplices.
 
     Args:
         offset: From the point to the vertices, shape (d + 1, gdim, n), d ≤ 2.

@@ -75,7 +75,7 @@ class Boxes:
         return Boxes(low, high, self.edges, cells=cells, domain=self.domain)
 
     def whole(self, which: IndexArray) -> Boxes:
-        """Some of them, of which all points are meant."""
+        """Take some of them, of which all points are meant."""
 
         def some(array: Any) -> Any:
             return None if array is None else array[..., which]
@@ -151,7 +151,7 @@ class Jet:
 
 
 def lowered(expression: Any) -> Any:
-    """The expression in terms of scalar operators, derivatives carried out."""
+    """Rewrite the expression in scalar operators, with derivatives carried out."""
     nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
     if all(isinstance(e, _KNOWN) for e in nodes):
         return expression
@@ -176,7 +176,7 @@ def has_conditions(expression: Any) -> bool:
 
 
 def differences(expression: Any, ordered: bool = True) -> list[Any]:
-    """What changes its sign where conditions of a lowered expression change; local.
+    """Find what changes its sign where conditions of a lowered expression change; local.
 
     Args:
         expression: The expression.
@@ -196,7 +196,7 @@ def differences(expression: Any, ordered: bool = True) -> list[Any]:
 
 
 def choices_first(expression: Any) -> Any:
-    """The same lowered expression as a choice between expressions without any, if these are few.
+    """Rewrite a lowered expression as a choice between expressions without any, if these are few.
 
     What jumps by itself may not do so as a part of a whole: where(x > 0, 1, 0) x is continuous.
     """
@@ -208,7 +208,7 @@ def choices_first(expression: Any) -> Any:
 
 
 def _chosen(e: Any, conditions: Sequence[Any]) -> Any:
-    """The expression, with one choice after the other."""
+    """Rewrite the expression with one choice after the other."""
     if not conditions:
         return e
     first, *more = conditions
@@ -224,9 +224,9 @@ def _chosen(e: Any, conditions: Sequence[Any]) -> Any:
 
 
 def values(expression: Any, points: Boxes) -> FloatArray:
-    """Values of a lowered expression, not enclosed, at points that are given as boxes, shape (n,).
+    """Evaluate a lowered expression, not enclosed, at points that are given as boxes, shape (n,).
 
-    Where the formula has none, as the root of what rounding has made negative, the middle of the
+    Where the formula has no value, as the root of what rounding made negative, the middle of the
     enclosure; NaN where that has no end.
 
     Raises:
@@ -281,7 +281,7 @@ class Enclosure:
         return np.minimum(self._strips * self.boxes.strip_part + self._slices, 1.0)
 
     def __call__(self, e: Any) -> Jet:
-        """The jet of an expression.
+        """Compute the jet of an expression.
 
         Raises:
             Unknown: It holds an operator that is not known here.
@@ -292,7 +292,7 @@ class Enclosure:
         return self._known[e]
 
     def inverse(self, e: Any) -> Jet:
-        """The jet of 1/e."""
+        """Compute the jet of 1/e."""
         with np.errstate(all="ignore"):
             return self._compose(self(e), power_series(-1.0))
 
@@ -330,7 +330,7 @@ class Enclosure:
         return Jet(np.array(value), np.array(value))
 
     def _linear(self, low: FloatArray, high: FloatArray, slopes: FloatArray) -> Jet:
-        """A value with constant first derivatives, shape (variables, n) or (variables, 1)."""
+        """Make a value with constant first derivatives, shape (variables, n) or (variables, 1)."""
         if not self.order:
             return Jet(low, high)
         there = np.flatnonzero(slopes.any(axis=1))
@@ -357,7 +357,7 @@ class Enclosure:
         raise Unknown(type(vector).__name__)
 
     def _entry(self, function: fem.Function, place: tuple[int, ...]) -> Jet:
-        """An entry of a tensor that is constant on each cell."""
+        """Look up an entry of a tensor that is constant on each cell."""
         box, V = self.boxes, function.function_space
         size, steady = int(np.prod(function.ufl_shape)), V.ufl_element().embedded_superdegree == 0
         if box.cells is None or box.domain is None or not steady or V.dofmap.bs != size:
@@ -370,7 +370,7 @@ class Enclosure:
         return Jet(values, values)
 
     def _function(self, function: fem.Function) -> Jet:
-        """Functions that are affine on each cell, or constant."""
+        """Enclose Functions that are affine on each cell, or constant."""
         box, domain, element = self.boxes, self.boxes.domain, function.function_space.ufl_element()
         known = (
             element.reference_value_shape == ()
@@ -422,7 +422,7 @@ class Enclosure:
         return self._product(a, self._compose(b, power_series(-1.0)))
 
     def _compose(self, a: Jet, series: Callable[[Range], Sequence[Range]]) -> Jet:
-        """φ(a), given the ranges of the Taylor coefficients φ_k over a's range.
+        """Compose φ(a), given the ranges of the Taylor coefficients φ_k over a's range.
 
         With δ for a less its value that is φ_0 + δ (φ_1 + δ (φ_2 + δ φ_3)).
         """
@@ -438,7 +438,7 @@ class Enclosure:
         return found
 
     def _number_power(self, base: Any, p: float) -> Jet:
-        """A power of roots, or of roots of these, is one of what is under them."""
+        """Raise to a power; one of roots, or of roots of these, is one of what is under them."""
         while isinstance(base, classes.Sqrt):
             base, p = base.ufl_operands[0], 0.5 * p
         return self._compose(self(base), power_series(p))
@@ -467,7 +467,7 @@ class Enclosure:
         )
 
     def _atan2(self, a: Jet, b: Jet) -> Jet:
-        """The angle of (b, a); it jumps where b < 0 and a changes its sign, and has none at 0."""
+        """Enclose the angle of (b, a), which jumps where b < 0 and a changes sign; 0 has none."""
         low = high = np.array(np.nan)
         for y in (a.low + 0.0, a.high + 0.0):
             for x in (b.low + 0.0, b.high + 0.0):
@@ -484,7 +484,7 @@ class Enclosure:
         return Jet(np.where(full, -4.0, low), np.where(full, 4.0, high), Balls(rows, mid, rad))
 
     def _of_logarithm(self, a: Jet, b: Jet, angle: Range) -> Balls:
-        """Taylor coefficients of the angle of z = b + ia, which is the logarithm's imaginary part.
+        """Compute Taylor coefficients of the angle of z = b + ia, the logarithm's imaginary part.
 
         With δ for z less its value that is δ (1/z − δ (1/(2z²) − δ/(3z³))).
         """
@@ -530,7 +530,7 @@ class Enclosure:
     def _choose(
         self, take: BoolArray, either: BoolArray, a: Jet, b: Jet, joined: BoolArray = ALWAYS
     ) -> Jet:
-        """`a` where take, else b; the hull of both where either may be.
+        """Choose `a` where take, else b; the hull of both where either may be.
 
         There coefficients are infinite from the second order on, and where they are not joined
         continuously, from the first.
@@ -561,7 +561,7 @@ class Enclosure:
         return tuple(range(1, len(indices(self.boxes.variables, self.order))))
 
     def _size(self, e: Any) -> Jet:
-        """|e| on simplices, where e may have one sign though it has both on the box."""
+        """Enclose |e| on simplices, where e may have one sign though it has both on the box."""
         a = self(e)
         low, high, _ = self._difference(a, self._constant(0.0))
         if self.boxes.along is None and self.order >= 2:
@@ -571,7 +571,7 @@ class Enclosure:
         return replace(jet, low=np.maximum(jet.low, 0.0))
 
     def _order(self, a: Jet, b: Jet) -> tuple[BoolArray, BoolArray]:
-        """Where a is not below b, and where b is not below a; on simplices, if they are meant."""
+        """Tell where a is not below b, and where b is not below a; on simplices, if meant."""
         low, high, _ = self._difference(a, b)
         return low >= 0, high <= 0
 
@@ -683,7 +683,7 @@ class Enclosure:
         return above | zero, below
 
     def _difference(self, a: Jet, b: Jet) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Bounds of a − b, and whether it takes each value on a null set only."""
+        """Bound a − b, and tell whether it takes each value on a null set only."""
         low, high = a.low - b.high, a.high - b.low  # the sign is right whatever the rounding
         unclear = np.asarray((low <= 0) & (high >= 0))
         if not np.any(unclear):
@@ -698,7 +698,7 @@ class Enclosure:
         return *self._at_corners(low, high, rest.on(tuple(range(1, n + 1)))[0], corners), thin
 
     def _by_slopes(self, low: FloatArray, high: FloatArray, left: Any, right: Any) -> Range:
-        """Narrower bounds of left − right on simplices, by its value at their centroids.
+        """Bound left − right on simplices more narrowly, by its value at their centroids.
 
         On the way from there to a corner it changes by slopes that are enclosed: it lies between
         affine functions. Where one of these has the other sign on a thin slice only, that is left
@@ -737,7 +737,7 @@ class Enclosure:
     def _at_corners(
         self, low: FloatArray, high: FloatArray, slopes: FloatArray, corners: FloatArray
     ) -> Range:
-        """Bounds of an affine function on simplices, but for strips along their boundary.
+        """Bound an affine function on simplices, but for strips along their boundary.
 
         The middle of its range on the box is its value in the middle of the box.
         """
@@ -766,7 +766,7 @@ class Enclosure:
 
 
 def _part_below(ends: FloatArray) -> FloatArray:
-    """The part of a triangle on which an affine function is below 0; 1 of other simplices.
+    """Compute the part of a triangle where an affine function is below 0; 1 of other simplices.
 
     Args:
         ends: Its values at the vertices, shape (d + 1, n).
@@ -790,7 +790,7 @@ def out(x: Range, room: float = EPS) -> Range:
 
 
 def mul(x: Range, y: Range) -> Range:
-    """The range of a product."""
+    """Enclose a product."""
     a, b, c, d = x[0] * y[0], x[0] * y[1], x[1] * y[0], x[1] * y[1]
     low, high = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
     zero = np.isnan(low)  # 0 times what has no bound
@@ -798,7 +798,7 @@ def mul(x: Range, y: Range) -> Range:
 
 
 def square_of(low: FloatArray, high: FloatArray) -> Range:
-    """The range of a square."""
+    """Enclose a square."""
     a, b = low * low, high * high
     return out((np.where((low < 0) & (high > 0), 0.0, np.minimum(a, b)), np.maximum(a, b)))
 
@@ -819,7 +819,7 @@ def _inverse(x: Range) -> Range:
 
 
 def _raised(x: Range, p: float) -> Range:
-    """x^p; where p is not whole, for what of x is not negative."""
+    """Enclose x^p; where p is not whole, for what of x is not negative."""
     if p == 0:
         return np.array(1.0), np.array(1.0)
     if p == 1:
@@ -842,7 +842,7 @@ def _rising(function: Callable[[FloatArray], FloatArray], x: Range) -> Range:
 
 
 def _wave(x: Range, function: Callable[[FloatArray], FloatArray], top: float) -> Range:
-    """The range of a sine or cosine that has a crest at `top`."""
+    """Enclose a sine or cosine that has a crest at `top`."""
     turn, room = 2 * np.pi, LOOSE * (4.0 + np.maximum(np.abs(x[0]), np.abs(x[1])))
 
     def meets(crest: float) -> BoolArray:
@@ -859,7 +859,7 @@ def _wave(x: Range, function: Callable[[FloatArray], FloatArray], top: float) ->
 
 
 def power_series(p: float) -> Callable[[Range], Sequence[Range]]:
-    """The series of x^p."""
+    """Make the series of x^p."""
     factors = (1.0, p, p * (p - 1) / 2, p * (p - 1) * (p - 2) / 6)
     zero = np.array(0.0), np.array(0.0)
 

@@ -58,7 +58,7 @@ class VolumeMoments:
         return np.maximum(self.variance - 12.0 * dot_rows(self.hats, self.hats), 0.0)
 
     def shares(self, cells: Cells, part: slice) -> FloatArray:
-        """∫_T f ψ_i for the Crouzeix-Raviart functions ψ_i = 1 − d λ_i, shape (d + 1, n)."""
+        """Compute ∫_T f ψ_i for the Crouzeix-Raviart ψ_i = 1 − d λ_i, shape (d + 1, n)."""
         d = cells.tdim
         out = np.empty((d + 1, part.stop - part.start))
         out[:] = self.mean[part] / (d + 1)
@@ -68,7 +68,7 @@ class VolumeMoments:
         return out
 
     def less(self, c: float | FloatArray, w: FloatArray) -> VolumeMoments:
-        """The same of f − c w, w affine on each cell.
+        """Compute the same of f − c w, w affine on each cell.
 
         Args:
             c: A number, or one for each cell, shape (cells,).
@@ -111,7 +111,7 @@ class VolumeMoments:
         return cls(mean, rows, variance)
 
     def refined(self, f: Volume, cells: Cells, cut: Cut) -> VolumeMoments:
-        """The same, with f integrated piece by piece where cells are cut."""
+        """Return the same, with f integrated piece by piece where cells are cut."""
         which, place = cut.of
         if self.hats is None or self.bumps is None or self.variance is None or not len(which):
             return self
@@ -218,7 +218,7 @@ class Certain:
 def mean_to_norm(
     cells: Cells, low: FloatArray, reaction: FloatArray, part: slice | None = None
 ) -> FloatArray:
-    """C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the part,).
+    """Find C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the part,).
 
     Args:
         cells: The mesh.
@@ -279,7 +279,7 @@ class NeumannMoments:
         return self.most is not self.loss
 
     def between(self, pieces: Pieces, cells: Cells) -> FloatArray:
-        """Bounds of a b that varies, on pieces of the facets, shape (2, n)."""
+        """Bound a b that varies, on pieces of the facets, shape (2, n)."""
         outer = np.stack([self.loss[pieces.parent], self.most[pieces.parent]])
         found = range_on(self.datum, pieces, cells)
         if found is None:
@@ -292,7 +292,7 @@ class NeumannMoments:
         return np.zeros_like(self.loss) if self.varies else self.loss
 
     def to_cells(self) -> FloatArray:
-        """∫_F g ψ_i for the Crouzeix-Raviart functions of the facet's cell, shape (d + 1, n).
+        """Compute ∫_F g ψ_i for the Crouzeix-Raviart ψ_i of the facet's cell, shape (d + 1, n).
 
         ψ_i = 1 − d λ_i; on the facet itself λ_i = 0.
         """
@@ -318,7 +318,7 @@ ROUNDED = 1e-13
 
 
 def to_cells(cells: Cells, side: BoundaryFacets, shares: FloatArray) -> FloatArray:
-    """Integrals of g ψ_i over facets from those of g λ_j, see `NeumannMoments`."""
+    """Integrate g ψ_i over facets from the integrals of g λ_j, see `NeumannMoments`."""
     d = cells.tdim
     out = np.tile(shares.sum(axis=0), (d + 1, 1))
     at = np.arange(shares.shape[1])
@@ -366,7 +366,7 @@ class Known:
 
 
 def trace_of(cells: Cells, side: BoundaryFacets, w: FloatArray) -> FloatArray:
-    """A function's values at the ends of boundary facets, seen from their cells, shape (d, n)."""
+    """Find a function's values at the ends of boundary facets, from their cells, shape (d, n)."""
     return w[cells.others[side.local].T, side.cells]
 
 
@@ -584,13 +584,13 @@ class Segments:
 
     @cached_property
     def rest(self) -> FloatArray:
-        """What g has beyond its mean over the facet, shape (q, n)."""
+        """The part of g that is beyond its mean over the facet, shape (q, n)."""
         n = len(self.through)
         area = np.bincount(self.place, self.measure, minlength=n)
         return self.values - (self.through / area)[self.place]
 
     def _by_cell(self, sizes: FloatArray) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg, and the sums over their facets."""
+        """Find the cells at Γg, and the sums over their facets."""
         at, place = np.unique(self.facets.cells, return_inverse=True)
         return at, np.bincount(place, sizes, minlength=len(at)).astype(np.float64)
 
@@ -620,7 +620,7 @@ class Segments:
 
     @cached_property
     def given(self) -> BoolArray:
-        """Where b takes up q − g_F more cheaply than a field in the cell does, shape (facets,)."""
+        """Whether b takes up q − g_F more cheaply than a field in the cell, shape (facets,)."""
         return self.loss * self._constant**2 > pick(self.low, self.facets.cells)
 
     @cached_property
@@ -630,7 +630,7 @@ class Segments:
 
     @cached_property
     def followed(self) -> BoolArray:
-        """Where y·n on thin cells is to have q's affine part, shape (facets,).
+        """Whether y·n on thin cells is to have q's affine part, shape (facets,).
 
         What that is wrong by, b times the error of u_h, costs little where b |F| is below κ, in
         cells of any shape.
@@ -639,7 +639,7 @@ class Segments:
         return ~self.given | weak
 
     def tau(self, carried: bool) -> FloatArray:
-        """What b takes up of q − g_F, shape (q, n).
+        """Compute what b takes up of q − g_F, shape (q, n).
 
         Args:
             carried: Whether y carries q's affine part where it is to.
@@ -651,7 +651,7 @@ class Segments:
         return tau
 
     def taken(self, shed: FloatArray | None, carried: bool) -> FloatArray:
-        """‖b^{-1/2}τ‖²_F, or more, of what b takes up, shape (facets,).
+        """Bound ‖b^{-1/2}τ‖²_F of what b takes up, shape (facets,).
 
         Args:
             shed: As in `target`.
@@ -676,7 +676,7 @@ class Segments:
         return np.asarray(5.0 * self._over_facets(moments) / self._over_facets(self.measure))
 
     def target(self, shed: FloatArray | None) -> FloatArray:
-        """What t/b − u_h is like: a quadratic's values at the ends and its bump.
+        """Find what t/b − u_h is like: a quadratic's values at the ends and its bump.
 
         Where b takes nothing up, and for d = 3, it is 0.
 
@@ -697,7 +697,7 @@ class Segments:
         return np.asarray(found * inverse)
 
     def oscillation(self, carried: bool) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg and Σ_F ‖σ‖_T for each, where b does not take up q − g_F.
+        """Find the cells at Γg and Σ_F ‖σ‖_T for each, where b does not take up q − g_F.
 
         That is C ‖q − g_F‖_F at most, or for d = 2 what a quadratic part has of its own, and C
         times what is left: σ may vanish outside of a triangle in the cell.
@@ -719,7 +719,7 @@ class Segments:
         return self._by_cell(np.minimum(self._constant * np.sqrt(np.maximum(squares, 0.0)), known))
 
     def beyond(self) -> tuple[IndexArray, FloatArray]:
-        """Cells at Γg and Σ_F c_F ‖g − q‖_F for each, where b does not take up g − q."""
+        """Find the cells at Γg and Σ_F c_F ‖g − q‖_F for each, where b does not take up g − q."""
         constant = trace_constant(self.cells, self.facets)
         return self._by_cell(constant * np.where(self.given, 0.0, self.rough))
 
@@ -731,7 +731,7 @@ class Segments:
     def at_facets(
         self, vertices: FloatArray, bumps: FloatArray, w: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Bounds of b, ‖g − b u_h‖_F and ‖v − u_h‖_F, by facet dof; 0 on other facets.
+        """Bound b, ‖g − b u_h‖_F and ‖v − u_h‖_F, by facet dof; 0 on other facets.
 
         Args:
             vertices: v at the vertices.
@@ -770,7 +770,7 @@ G_UNBOUNDED = "g is not bounded on the mesh, or not known to be"
 
 
 def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> FloatArray:
-    """χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's cells' share."""
+    """Compute χ (1.10) by facet dof for the Crouzeix-Raviart element, this rank's cells' share."""
     if load.vanishes and all(edge.g.vanishes for edge in edges):
         return np.zeros(len(cells.exterior))
     values = np.empty((cells.tdim + 1, cells.number))

@@ -84,7 +84,7 @@ class Volume:
             self._values = compat.compile_expression(expression, rule.points, mesh)
 
     def at(self, cells: Cells) -> FloatArray:
-        """Values at the quadrature points of owned cells, shape (cells, q)."""
+        """Evaluate at the quadrature points of owned cells, shape (cells, q)."""
         assert self._values is not None
         which = np.arange(cells.number, dtype=np.int32)
         values = compat.bound(self._values, cells.domain.own)
@@ -95,11 +95,11 @@ class Volume:
 
     @cached_property
     def deviation(self) -> Deviation:
-        """How far it is from polynomials."""
+        """The `Deviation` from polynomials."""
         return Deviation(self.expression)
 
     def exact_for(self, degree: int) -> Volume:
-        """The same by a rule that is exact for a degree at least."""
+        """Return the same by a rule that is exact for a degree at least."""
         if self.number is not None or self.rule.degree >= degree:
             return self
         if degree not in self._others:
@@ -152,25 +152,25 @@ class Tensor:
             self._compiled[rule.degree] = compat.compile_expression(rows, rule.points, self._mesh)
 
     def at(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
-        """Values at points of some owned cells, the symmetric part, shape (cells, q, d, d)."""
+        """Evaluate the symmetric part at points of some owned cells, shape (cells, q, d, d)."""
         found = self.as_given(domain, rule, part)
         return np.asarray(0.5 * (found + found.transpose(0, 1, 3, 2)))
 
     def as_given(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
-        """The same with what is not symmetric."""
+        """Evaluate the same with what is not symmetric."""
         self.prepare(rule)
         which = np.arange(part.start, part.stop, dtype=np.int32)
         found = compat.bound(self._compiled[rule.degree], domain.own).eval(domain.mesh, which)
         return np.asarray(found.reshape(len(which), len(rule.weights), self._d, self._d))
 
     def means(self, domain: Domain) -> FloatArray:
-        """Means over owned cells, shape (cells, d, d)."""
+        """Average over owned cells, shape (cells, d, d)."""
         number = domain.mesh.topology.index_map(domain.mesh.topology.dim).size_local
         values = self.at(domain, self.rule, slice(0, number))
         return np.asarray(np.einsum("nqij,q->nij", values, self.rule.weights))
 
     def stretch(self, domain: Domain) -> FloatArray:
-        """(κ_T/k)^{-1/2}, κ_T the mean over a cell and k^d its determinant, shape (cells, d, d).
+        """Compute (κ_T/k)^{-1/2}, κ_T a cell's mean and k^d its determinant, shape (cells, d, d).
 
         With these for `Cells.stretch` k is a scalar coefficient.
         """
@@ -279,14 +279,14 @@ class Coefficient:
         self.least, self.most = (1.0 - theta) * self.least, (1.0 + theta) * self.most
 
     def _by_mean(self, sizes: FloatArray, cells: Cells) -> FloatArray:
-        """Bounds of |κ_T^{-1/2} E κ_T^{-1/2}|, E with entries of such sizes, shape (cells,)."""
+        """Bound |κ_T^{-1/2} E κ_T^{-1/2}|, E with entries of such sizes, shape (cells,)."""
         d, stretch = cells.tdim, cells.stretch
         assert stretch is not None
         stretched = np.abs(stretch) @ sizes.T.reshape(-1, d, d) @ np.abs(stretch)
         return np.asarray(np.linalg.norm(stretched, axis=(1, 2)) / self.mean)
 
     def apart(self, cells: Cells, part: slice) -> FloatArray:
-        """κ − κ_T where lengths are stretched, at the rule's points, shape (q, cells, d, d)."""
+        """Compute κ − κ_T with lengths stretched, at the rule's points, shape (q, cells, d, d)."""
         assert self.tensor is not None and cells.stretch is not None
         stretch = cells.stretch[part]
         found = stretch[:, None] @ self.tensor.at(cells.domain, self.rule, part) @ stretch[:, None]
@@ -363,7 +363,7 @@ class Coefficient:
         self.inside = self.deviation.values(self.cut.pieces, cells, self.rule.hats)
 
     def _ratio(self, at: Enclosure, r: FloatArray, s: FloatArray) -> FloatArray:
-        """T on boxes, with R for κ and for 1/κ given, shape (n,).
+        """Compute T on boxes, with R for κ and for 1/κ given, shape (n,).
 
         Let q be the quadratic through κ⁻¹ at the rule's points. 1 − κq is within R|q| of a
         polynomial of degree 4, which is known at the points up to R|q|. Without points R for κ⁻¹
@@ -382,7 +382,7 @@ class Coefficient:
             return np.where(np.isnan(excess), np.inf, excess)
 
     def _by_points(self, values: FloatArray, r: FloatArray) -> FloatArray:
-        """T by κ at the rule's points, shape (q, n), and R for κ."""
+        """Compute T by κ at the rule's points, shape (q, n), and R for κ."""
         (of_two, basis), (of_four, _) = (bernstein(self.rule.hats, k) for k in (2, 4))
         with np.errstate(all="ignore"):
             coefficients = of_two @ (1.0 / values)
@@ -393,7 +393,7 @@ class Coefficient:
 
 
 def bernstein(hats: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Values at points to coefficients in Bernstein's basis, and back.
+    """Return the matrices from values at points to coefficients in Bernstein's basis, and back.
 
     A polynomial is nowhere larger than its largest coefficient.
 
@@ -456,7 +456,7 @@ class Trace:
 
     @property
     def expression(self) -> Expr:
-        """What it has the values of."""
+        """The expression whose values it has."""
         return self._expression
 
     @property
@@ -466,11 +466,11 @@ class Trace:
 
     @cached_property
     def deviation(self) -> Deviation:
-        """How far it is from polynomials."""
+        """The `Deviation` from polynomials."""
         return Deviation(self._expression)
 
     def at(self, domain: Domain, entities: Int32Array) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Values at the vertices, the midpoint and the quadrature points of facets.
+        """Evaluate at the vertices, the midpoint and the quadrature points of facets.
 
         Where the datum has a step at a vertex, what it is like on the facet counts, not at the
         point.
@@ -532,7 +532,7 @@ class OnFacets:
 
     @property
     def rest(self) -> FloatArray:
-        """What is left of `inside` without the quadratic through the three others, shape (q, n)."""
+        """`inside` less the quadratic through the three others, shape (q, n)."""
         ends, middle = self.ends, self.middle
         s = self.trace.hats[:, 1][:, None]
         straight = (1.0 - s) * ends[0] + s * ends[1]
@@ -556,7 +556,7 @@ class OnFacets:
         return OnFacets(self.condition, self.trace, *where, *values, self.sign)
 
     def side(self, cells: Cells) -> BoundaryFacets:
-        """The facets of owned cells, seen from these."""
+        """Return the facets of owned cells, seen from these."""
         return cells.sides[self.condition.number]
 
 
@@ -645,12 +645,12 @@ class Compiled:
         return f, c_w2
 
     def with_loss(self, condition: Condition) -> tuple[Trace, Trace]:
-        """G − b w and b w² on a condition's part, likewise; collective."""
+        """Make g − b w and b w² on a condition's part, likewise; collective."""
         b, w = condition.loss, self.stand_in
         return self.trace(condition.flux - b * w), self.trace(b * w**2)
 
     def by_cells(self, expression: Expr) -> fem.Expression:
-        """What is constant on each cell, at one point there; collective."""
+        """Compile what is constant on each cell, at one point there; collective."""
         if expression not in self._by_cells:
             middle = Rule(self.forms.mesh, 0).points
             found = compat.compile_expression(expression, middle, self.forms.mesh)
@@ -658,13 +658,13 @@ class Compiled:
         return self._by_cells[expression]
 
     def may_change(self, expression: Expr) -> bool:
-        """As `conditions.may_change`, found out once: UFL goes through the whole expression."""
+        """Ask `conditions.may_change` once: UFL goes through the whole expression."""
         if expression not in self._changing:
             self._changing[expression] = may_change(expression)
         return self._changing[expression]
 
     def trace(self, expression: Expr) -> Trace:
-        """Values of a condition's datum on facets; collective."""
+        """Prepare a condition's datum for evaluation on facets; collective."""
         if expression not in self._traces:
             degree = self.forms.problem.quadrature_degree
             self._traces[expression] = Trace(expression, self.forms.mesh, degree)

@@ -45,7 +45,7 @@ class Frame:
 
     @classmethod
     def of(cls, cells: Cells, side: BoundaryFacets) -> Frame:
-        """Of the facets of one part of the boundary."""
+        """Make those of the facets of one part of the boundary."""
         apex, ends = corner_points(cells, side)
         # Gram and Schmidt; what is left of the way to the opposite vertex points inwards
         rows: list[FloatArray] = []
@@ -78,14 +78,14 @@ class Pieces:
     span: FloatArray = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
-        """Without a span they are simplices."""
+        """Make them simplices where there is no span."""
         if self.span.shape[1] != len(self.part):
             span = np.stack([np.zeros(len(self.part)), np.ones(len(self.part))])
             object.__setattr__(self, "span", span)
 
     @classmethod
     def of_facets(cls, cells: Cells, side: BoundaryFacets) -> Pieces:
-        """Boundary facets themselves."""
+        """Take boundary facets themselves."""
         _, ends = corner_points(cells, side)
         n, corners = len(side.cells), ends.transpose(0, 2, 1)
         hats = np.repeat(np.eye(len(corners))[:, :, None], n, axis=2)
@@ -93,7 +93,7 @@ class Pieces:
 
     @classmethod
     def of_cells(cls, cells: Cells, which: IndexArray | None = None) -> Pieces:
-        """The cells themselves."""
+        """Take the cells themselves."""
         mesh = cells.domain.mesh
         which = np.arange(cells.number) if which is None else which
         nodes = cell_nodes(mesh)[which]
@@ -102,7 +102,7 @@ class Pieces:
         return cls(which, corners, hats, np.ones(len(which)))
 
     def __getitem__(self, which: BoolArray | IndexArray | slice) -> Pieces:
-        """Some of them."""
+        """Take some of them."""
         return Pieces(
             self.parent[which],
             self.corners[..., which],
@@ -113,7 +113,7 @@ class Pieces:
         )
 
     def __add__(self, others: Pieces) -> Pieces:
-        """These and others."""
+        """Join these and others."""
         return Pieces(
             np.concatenate([self.parent, others.parent]),
             np.concatenate([self.corners, others.corners], axis=-1),
@@ -124,7 +124,7 @@ class Pieces:
         )
 
     def halves(self) -> Pieces:
-        """Both halves of each, cut through the longest edge's middle."""
+        """Halve each, through the longest edge's middle."""
         d = len(self.corners) - 1
         pairs = np.array([(i, j) for i in range(d + 1) for j in range(i)])
         lengths = np.sum((self.corners[pairs[:, 0]] - self.corners[pairs[:, 1]]) ** 2, axis=1)
@@ -139,7 +139,7 @@ class Pieces:
         return halves[0] + halves[1]
 
     def finer(self, rounds: int) -> Pieces:
-        """Their halves' halves, and so on."""
+        """Halve them again and again, so many times."""
         return self.halves().finer(rounds - 1) if rounds else self
 
     def around(self, point: FloatArray, hats: FloatArray) -> Pieces:
@@ -154,11 +154,11 @@ class Pieces:
         return sum(found[1:], found[0])
 
     def quarters(self) -> tuple[Pieces, IndexArray]:
-        """Four of each, and from which."""
+        """Cut each into four; also tell from which."""
         return self.halves().halves(), np.tile(np.arange(len(self.part)), 4)
 
     def slabs(self, axis: int) -> tuple[Pieces, IndexArray]:
-        """Triangles cut across an axis, at the middle vertex and in between; from which."""
+        """Cut triangles across an axis, at the middle vertex and in between; tell from which."""
         at, x = np.arange(len(self.part)), self.corners[:, axis]
         low, middle, high = np.argsort(x, axis=0)
         length = x[high, at] - x[low, at]
@@ -182,7 +182,7 @@ class Pieces:
         return sum(pieces[1:], pieces[0]), np.concatenate(origin)
 
     def along(self, levels: Levels) -> tuple[Pieces, IndexArray]:
-        """Triangles cut along lines on which something changes its sign, nearly; from which.
+        """Cut triangles along lines on which something changes its sign, nearly; tell from which.
 
         That is one line where it is affine. Others are the nearer to one the smaller the triangle:
         it is cut into quarters first. So it is where there is no line.
@@ -199,7 +199,7 @@ class Pieces:
         return cut, origin[of]
 
     def capped(self, level: FloatArray) -> tuple[Pieces, IndexArray]:
-        """Triangles cut along the line on which an affine function is 0; from which.
+        """Cut triangles along the line on which an affine function is 0; tell from which.
 
         Args:
             level: Its values at the vertices, shape (3, n).
@@ -233,7 +233,7 @@ class Pieces:
         return pieces[0] + pieces[1] + pieces[2] + pieces[3], np.concatenate(origin)
 
     def thinner(self) -> tuple[Pieces, IndexArray]:
-        """Both halves of each slab; from which."""
+        """Halve each slab; tell from which."""
         start, end = self.span
         middle, halves = 0.5 * (start + end), []
         for a, b in ((start, middle), (middle, end)):
@@ -242,7 +242,7 @@ class Pieces:
         return halves[0] + halves[1], np.tile(np.arange(len(self.part)), 2)
 
     def triangles(self) -> tuple[Pieces, IndexArray]:
-        """Slabs as triangles; all, and from which."""
+        """Cut slabs into triangles; return all, and from which."""
         thin = ~self.whole
         if not thin.any():
             return self, np.arange(len(self.part))
@@ -259,18 +259,18 @@ class Pieces:
 
     @property
     def whole(self) -> BoolArray:
-        """Which are simplices and no slabs, shape (n,)."""
+        """Whether each is a simplex and no slab, shape (n,)."""
         return np.asarray((self.span[0] == 0.0) & (self.span[1] == 1.0))
 
     def _ends(self, array: FloatArray) -> FloatArray:
-        """A slab's four vertices, two at its start and two at its end; a simplex' own."""
+        """Return a slab's four vertices, two at its start and two at its end; a simplex' own."""
         if self.corners.shape[:2] != (3, 2):
             return array
         apex, sides = array[0], array[1:] - array[0]
         return np.concatenate([apex + self.span[0] * sides, apex + self.span[1] * sides])
 
     def shrunk(self, axes: tuple[int, ...]) -> Pieces:
-        """Pieces half as wide along some axes."""
+        """Make pieces half as wide along some axes."""
         ends = self._ends(self.corners)
         middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
         scale = np.ones((len(middle), 1))
@@ -316,7 +316,7 @@ class Pieces:
         return whole, every, ways[every]
 
     def boxes(self, cells: Cells, decide: bool = False) -> Boxes:
-        """The boxes around them; for `decide` see `Boxes.corners`, it is for simplices."""
+        """Make the boxes around them; for `decide` see `Boxes.corners`, it is for simplices."""
         if decide or self.whole.all():
             low, high = self.corners.min(axis=0), self.corners.max(axis=0)
         else:
@@ -331,7 +331,7 @@ class Pieces:
         return replace(boxes, slanted=slanted, edges=edges)
 
     def points(self, cells: Cells, hats: FloatArray) -> Boxes:
-        """Points with some barycentric coordinates, shape (d + 1, q), piece by piece for each."""
+        """Find the points with some barycentric coordinates, shape (d + 1, q), piece by piece."""
         points = np.einsum("cgn,cq->gqn", self.corners, hats)
         flat = points.reshape(len(points), -1)
         return self._boxes(flat, flat, np.tile(self.parent, hats.shape[1]), cells, None)
@@ -351,7 +351,7 @@ class Pieces:
         return Boxes(low, high, along, corners, frame.cells[parent], normal, domain)
 
     def _slanted(self, low: FloatArray, high: FloatArray) -> tuple[IndexArray, FloatArray]:
-        """Triangles whose boxes are much larger than they are, and two edges; see `Boxes`."""
+        """Find triangles whose boxes are much larger than they are, and two edges; see `Boxes`."""
         (a, b), (c, d) = self.corners[1:] - self.corners[0]
         large = (high - low).prod(axis=0) > SLANTED * np.abs(a * d - b * c)
         which = np.flatnonzero(large & self.whole)
@@ -363,7 +363,7 @@ class Pieces:
         return which, np.stack(ends).transpose(0, 2, 1)
 
     def half(self, boxes: Boxes) -> FloatArray:
-        """Half extents in the boxes' variables."""
+        """Compute half extents in the boxes' variables."""
         if boxes.along is None:
             return 0.5 * (boxes.high - boxes.low)
         offset = self.corners - self.corners.mean(axis=0)
@@ -371,7 +371,7 @@ class Pieces:
 
 
 def _crossed(levels: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Whether a function that changes its sign is not affine, and its values at the vertices.
+    """Tell whether a function that changes its sign is not affine, and its values at vertices.
 
     Of several functions on a triangle the first that does.
 
@@ -387,7 +387,7 @@ def _crossed(levels: FloatArray) -> tuple[BoolArray, FloatArray]:
 
 
 def _between(x: FloatArray, start: IndexArray, end: IndexArray, where: FloatArray) -> FloatArray:
-    """Points on sides of simplices that start and end at some vertices, shape (·, n)."""
+    """Find points on sides of simplices that start and end at some vertices, shape (·, n)."""
     at = np.arange(len(where))
     first = x[start, :, at].T
     return np.asarray(first + where * (x[end, :, at].T - first))

@@ -81,7 +81,7 @@ class _Reader:
         return values[expression]
 
     def _node(self, node: Any, operands: list[Any]) -> Any:
-        """A pair, a tuple of them for a vector, or a tuple of such tuples for a matrix."""
+        """Evaluate a node: a pair, a tuple of them for a vector, or of such tuples for a matrix."""
         if isinstance(node, classes.MultiIndex):
             return None
         if isinstance(node, classes.Zero):
@@ -126,7 +126,7 @@ class _Reader:
 
 
 def _filled(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], Value]) -> Any:
-    """Nested tuples of a shape."""
+    """Make nested tuples of a shape."""
 
     def fill(index: tuple[int, ...]) -> Any:
         if len(index) == len(shape):
@@ -153,7 +153,7 @@ def _quotient(a: Value, b: Value) -> Value:
 
 
 def _function_of(function: Callable[..., Any], period: float = np.inf) -> Callable[..., Value]:
-    """A function of NumPy's: how far it moves when its arguments do.
+    """Make the rule for a function of NumPy's: how far it moves when its arguments do.
 
     Args:
         function: Of one argument or more.

@@ -42,7 +42,7 @@ _CUBIC = {1: 1.0, 2: 0.5, 3: 0.25}
 
 
 def range_of(expression: ufl.core.expr.Expr, cells: Cells) -> Range | None:
-    """Lower and upper bounds on each owned cell, shapes (cells,) or ().
+    """Bound an expression below and above on each owned cell, shapes (cells,) or ().
 
     Args:
         expression: A scalar.
@@ -55,7 +55,7 @@ def range_of(expression: ufl.core.expr.Expr, cells: Cells) -> Range | None:
 
 
 def range_on(expression: ufl.core.expr.Expr, whole: Pieces, cells: Cells) -> Range | None:
-    """Lower and upper bounds on pieces, shapes (n,); see `range_of`."""
+    """Bound an expression below and above on pieces, shapes (n,); see `range_of`."""
     data, n = lowered(expression), len(whole.part)
     try:
         jet = Enclosure(whole.boxes(cells), order=0)(data)
@@ -73,7 +73,7 @@ def range_on(expression: ufl.core.expr.Expr, whole: Pieces, cells: Cells) -> Ran
 def remainders(
     jet: Jet, half: FloatArray, in_the_mean: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """R and W for simplices within half extents of a point, shapes (n,).
+    """Compute R and W for simplices within half extents of a point, shapes (n,).
 
     Taylor's polynomial of the point, with the middles of the coefficients of the highest order
     for these, is off by no more than their radii allow; a cubic is replaced by a quadratic.
@@ -106,7 +106,7 @@ _ONES = 1.0, 1.0, 1.0, 1.0
 
 
 def means(variables: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Bounds of (mean t^2i)^½ and of the mean of |t^i| for multi-indices i, by their order.
+    """Bound (mean t^2i)^½ and the mean of |t^i| for multi-indices i, by their order.
 
     t runs through a simplex in the cube [−1, 1]^d that touches all of its faces, or through a slab
     of a triangle; means may be a rule's. t₁² and t₁⁴ have the means given here or less, and the
@@ -139,7 +139,7 @@ class Deviation:
         hats: FloatArray | None = None,
         largest: float = 1.0,
     ) -> tuple[FloatArray, FloatArray]:
-        """R and W, shapes (n,).
+        """Compute R and W, shapes (n,).
 
         Args:
             at: On the boxes that are asked about.
@@ -181,7 +181,7 @@ class Deviation:
         return pieces
 
     def levels(self, cells: Cells) -> Levels | None:
-        """What changes its sign where the data may jump; None where nothing does."""
+        """Find what changes its sign where the data may jump; None where nothing does."""
         if not self.differences:
             return None
         hats = np.hstack([np.eye(3), EDGES])
@@ -196,7 +196,7 @@ class Deviation:
         return enclosure.inverse(self.expression) if inverse else enclosure(self.expression)
 
     def values(self, pieces: Pieces, cells: Cells, hats: FloatArray) -> FloatArray:
-        """Values at points of pieces, shape (q, n).
+        """Evaluate at points of pieces, shape (q, n).
 
         Args:
             pieces: The pieces.
@@ -246,7 +246,7 @@ class Deviation:
 
 
 def chunks(n: int) -> list[slice]:
-    """Consecutive ranges whose jets fit into the processor's cache; one at least."""
+    """Cut into consecutive ranges whose jets fit into the processor's cache; one at least."""
     return [slice(a, min(a + CHUNK, n)) for a in range(0, max(n, 1), CHUNK)]
 
 

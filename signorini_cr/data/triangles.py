@@ -39,7 +39,7 @@ class Triangles:
         return 0.5 * self.length * self.height
 
     def nearer(self) -> Triangles:
-        """Triangles in them that are about as high as wide, aslant or not, or themselves.
+        """Take triangles in them about as high as wide, aslant or not, or themselves.
 
         P comes nearer to the point of F that is nearest to it, until it is as far as F is long.
         """
@@ -61,7 +61,7 @@ class Triangles:
         return np.stack([(1.0 + reach**2) * steep**2, 2.0 * reach * size * steep, size**2])
 
     def constant(self, measure: FloatArray) -> FloatArray:
-        """C with ‖e − e_T‖_F ≤ C ‖∇e‖_T, see `trace_constant`; measure is |F|, unstretched."""
+        """Find C with ‖e − e_T‖_F ≤ C ‖∇e‖_T, see `trace_constant`; measure is |F|, unstretched."""
         longest = np.maximum(np.abs(self.foot), np.abs(self.foot + self.length))
         h = np.maximum(self.length, np.hypot(longest, self.height))
         c = poincare(2) * h
@@ -85,7 +85,7 @@ class Triangles:
 
 
 def trace_constant(cells: Cells, side: BoundaryFacets) -> FloatArray:
-    """c_F with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, shape (n,).
+    """Compute c_F with ‖e − e_T‖_F ≤ c_F ‖∇e‖_T, shape (n,).
 
     |F|⁻¹ ∫_F w² = |T|⁻¹ (∫_T w² + (2/d) ∫_T w (x − P)·∇w), P opposite F.
     """
