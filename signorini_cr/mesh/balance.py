@@ -60,7 +60,7 @@ def balance(domain: Domain, parent: Int32Array) -> Refined:
 
 
 def _moved(mesh: Mesh) -> Mesh:
-    """The same cells, as many on each rank; collective."""
+    """Share out the same cells, as many to each rank; collective."""
     nodes, x = compat.cell_nodes(mesh), mesh.geometry.x[:, : mesh.geometry.dim]
     ranks = _ranks(mesh)
 

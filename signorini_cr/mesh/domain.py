@@ -114,14 +114,14 @@ class Domain:
     descent: tuple[Refinement, ...] = ()
 
     def __repr__(self) -> str:
-        """A line; the facets are those of this rank."""
+        """Describe the domain in a line; the facets are those of this rank."""
         cells = self.mesh.topology.index_map(self.mesh.topology.dim).size_global
         facets = ", ".join(f"{len(self.facets(part))} {name}" for name, part in self.parts.items())
         here = f" on rank {self.mesh.comm.rank}" if self.mesh.comm.size > 1 else ""
         return f"<Domain: {cells} cells; facets{here}: {facets}>"
 
     def facets(self, part: int) -> Int32Array:
-        """Local indices of the facets of one part that this rank owns.
+        """Find the local indices of the facets of one part that this rank owns.
 
         Args:
             part: A value of `parts`.
@@ -130,7 +130,7 @@ class Domain:
         return found[found < self.mesh.topology.index_map(self.mesh.topology.dim - 1).size_local]
 
     def names_of(self, facets: Int32Array) -> npt.NDArray[Any]:
-        """Names of the parts that some facets of this rank are in, shape (n,)."""
+        """Name the parts that some facets of this rank are in, shape (n,)."""
         names, values = np.array(list(self.parts)), np.array(list(self.parts.values()))
         own = self.tags.values[np.searchsorted(self.tags.indices, facets)]
         order = np.argsort(values)
@@ -150,7 +150,7 @@ class Domain:
 
     @cached_property
     def _own(self) -> dict[fem.Function, fem.Function]:
-        """What `own` has made."""
+        """The functions that `own` has made."""
         return {}
 
     def own(self, function: fem.Function) -> fem.Function:
@@ -182,7 +182,7 @@ class Domain:
         return fine
 
     def instead(self, function: fem.Function) -> fem.Function:
-        """A function of this mesh that stands here for one of the same kind on any other."""
+        """Return a function of this mesh that stands here for one of the same kind on any other."""
         if function not in self._own:
             kind = function.function_space.ufl_element()
             self._own[function] = fem.Function(fem.functionspace(self.mesh, kind))
@@ -256,7 +256,7 @@ class Domain:
 def _wanted(
     given: Mapping[str, int | Sequence[int] | None], parts: Mapping[str, int], needed: set[str]
 ) -> dict[str, Int32Array]:
-    """The values in a user's facet tags that stand for each part, ascending, by name.
+    """Find the values in a user's facet tags that stand for each part, ascending, by name.
 
     Args:
         given: What the user says of them.
@@ -287,7 +287,7 @@ def _values(
     wanted: Mapping[str, Int32Array],
     parts: Mapping[str, int],
 ) -> Int32Array:
-    """The part that each local facet belongs to, shape (facets,); collective.
+    """Find the part that each local facet belongs to, shape (facets,); collective.
 
     Args:
         mesh: The user's.
@@ -363,7 +363,7 @@ def _is_of_degree_0(function: fem.Function) -> bool:
 
 
 def get_by_cells(function: fem.Function) -> FloatArray:
-    """What a function of degree 0 is on this rank's cells, shape (cells, entries)."""
+    """Return a function of degree 0 on this rank's cells, shape (cells, entries)."""
     dofmap = function.function_space.dofmap
     values: FloatArray = function.x.array.reshape(-1, dofmap.bs)[dofmap.list[:, 0]]
     return values

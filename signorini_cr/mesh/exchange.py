@@ -42,7 +42,7 @@ class Exchange:
         self.rows = self.give_back(asked.astype(np.int32))  # the lower half
 
     def fetch(self, table: npt.NDArray) -> npt.NDArray:
-        """The rows asked for; collective.
+        """Fetch the rows asked for; collective.
 
         Args:
             table: What this rank has; of one kind on all ranks.

@@ -27,7 +27,7 @@ def structured(
     jitter: float = 0.0,
     seed: int = 0,
 ) -> Domain:
-    """Squares of side 1/n, each cut in two by its rising diagonal; collective.
+    """Mesh a polygon by squares of side 1/n, each cut in two by its rising diagonal; collective.
 
     Refining such a mesh gives the one with 2 n. With ``shift`` it is mapped by
 
@@ -96,7 +96,7 @@ def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -
 
 
 def _grid(columns: int, rows: int) -> tuple[FloatArray, Int64Array]:
-    """Squares of side 1, each in two triangles: their corners, and the corners of each triangle."""
+    """Make squares of side 1, in two triangles each: their corners, and those of each triangle."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(columns), np.arange(rows)))
     corner = i + (columns + 1) * j
     right, up, across = corner + 1, corner + columns + 1, corner + columns + 2
@@ -106,14 +106,14 @@ def _grid(columns: int, rows: int) -> tuple[FloatArray, Int64Array]:
 
 
 def _require_kept(polygon: Polygon, middle: float, half: float) -> None:
-    """A mapped mesh has the polygon's shape if no vertex lies between its left and right end."""
+    """Insist that no vertex lies between the polygon's left and right end: it would move."""
     loops = [polygon.vertices, *(hole.vertices for hole in polygon.holes)]
     if not np.allclose(np.abs(np.concatenate(loops)[:, 0] - middle), half):
         raise InputError("shift would move a vertex of the polygon: give a rectangle")
 
 
 def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, Int32Array]:
-    """Starts and ends of all edges, shapes (n, 2), and the numbers of their parts."""
+    """Return starts and ends of all edges, shapes (n, 2), and the numbers of their parts."""
     loops = [polygon, *polygon.holes]
     starts = np.concatenate([loop.vertices for loop in loops])
     ends = np.concatenate([np.roll(loop.vertices, -1, axis=0) for loop in loops])
@@ -122,7 +122,7 @@ def _edges(polygon: Polygon) -> tuple[FloatArray, FloatArray, Int32Array]:
 
 
 def _boundary(triangles: Int64Array) -> Int64Array:
-    """Ends of the facets of one triangle only, shape (facets, 2)."""
+    """Find the ends of the facets of one triangle only, shape (facets, 2)."""
     facets = np.sort(triangles[:, [[1, 2], [0, 2], [0, 1]]].reshape(-1, 2), axis=1)
     unique, count = np.unique(facets, axis=0, return_counts=True)
     single: Int64Array = unique[count == 1]
@@ -130,7 +130,7 @@ def _boundary(triangles: Int64Array) -> Int64Array:
 
 
 def _edge_of(starts: FloatArray, ends: FloatArray, points: FloatArray) -> Int64Array:
-    """The edge that each point lies on, or is nearest to."""
+    """Find the edge that each point lies on, or is nearest to."""
     along = ends - starts
     offset = points[:, None] - starts
     share = np.clip((offset * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
@@ -149,7 +149,7 @@ def _moves(
     jitter: float,
     seed: int,
 ) -> FloatArray:
-    """Random movements of the vertices that keep the polygon's shape.
+    """Draw random movements of the vertices that keep the polygon's shape.
 
     Args:
         points: The vertices, shape (points, 2).

@@ -78,7 +78,7 @@ def _keep_sigpipe() -> None:
 
 @contextmanager
 def _session() -> Iterator[Any]:
-    """A silent gmsh with an empty model; a session of the user's own is left as it was."""
+    """Open a silent gmsh with an empty model; a session of the user's own is left as it was."""
     try:
         import gmsh
     except (ImportError, OSError) as error:  # the wheel wants libraries of the system
@@ -153,7 +153,7 @@ def triangulate(
 
 
 def _away(outline: FloatArray) -> FloatArray:
-    """How far a polygon is to be moved towards the origin, shape (2,).
+    """Compute how far a polygon is to be moved towards the origin, shape (2,).
 
     gmsh compares coordinates with their distances, and loses points far out. Its vertices come back
     to the digit, as differences of numbers of like size are exact.
@@ -245,7 +245,7 @@ def _draw(gmsh: Any, outline: _Outline, loops: Sequence[int], size: float) -> li
 
 
 def _numbered(ends: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Points in the order in which edges meet them, and the edges' ends among them.
+    """Number points in the order in which edges meet them, and find the edges' ends among them.
 
     Args:
         ends: Shape (edges, 2, 2).
@@ -256,14 +256,14 @@ def _numbered(ends: FloatArray) -> tuple[FloatArray, IndexArray]:
 
 
 def _graded(lengths: FloatArray, facets: FloatArray, sizes: FloatArray) -> float:
-    """About how many facets there are on edges that are graded, sizes linear between their ends."""
+    """Estimate the number of facets on graded edges, sizes linear between their ends."""
     low, high = np.sort(sizes, axis=1).T
     mean = (high - low) / np.log(np.maximum(high / low, 1 + 1e-9))
     return float(np.sum((lengths / np.maximum(mean, low))[low <= _UNEVEN * facets]))
 
 
 def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
-    """Facet length at every vertex: the shortest of its edges', growing slowly.
+    """Compute the facet length at vertices: the shortest of their edges', growing slowly.
 
     Args:
         x: The vertices, shape (n, 2).
@@ -345,7 +345,7 @@ def _read(
 def _of_materials(
     file: MshFile, materials: Mapping[str, int]
 ) -> tuple[Int32Array, tuple[str, ...]]:
-    """The number of the physical surface that each triangle lies in, or 0, shape (triangles,).
+    """Find the number of the physical surface that each triangle is in, or 0, shape (triangles,).
 
     Beside them the names of the surfaces of which no triangle has a material.
 
@@ -511,7 +511,7 @@ def _check_labels(
 
 
 def _elements(gmsh: Any, dim: int, kind: int, entity: int = -1) -> Int64Array:
-    """Node tags of the elements of one type, shape (elements, dim + 1)."""
+    """Return the node tags of the elements of one type, shape (elements, dim + 1)."""
     tags = gmsh.model.mesh.getElementsByType(kind, entity)[1]
     return tags.astype(np.int64).reshape(-1, dim + 1)
 

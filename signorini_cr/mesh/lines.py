@@ -47,7 +47,7 @@ def arranged(
     points: list[FloatArray] = []
 
     def number(x: FloatArray) -> int:
-        """The point's number; a new one, unless there is one already."""
+        """Return the point's number; a new one, unless there is one already."""
         if points:
             distance = np.abs(np.array(points) - x).max(axis=1)
             if distance.min() <= near:
@@ -97,7 +97,7 @@ def _crossings(edge: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _through(edge: IndexArray, x: FloatArray, near: float) -> IndexArray:
-    """The points on an edge, from one end to the other."""
+    """Find the points on an edge, from one end to the other."""
     start, u = x[edge[0]], x[edge[1]] - x[edge[0]]
     t = (x - start) @ u / (u @ u)
     on = np.linalg.norm(x - start - t[:, None] * u, axis=1) <= near
@@ -109,7 +109,7 @@ def _through(edge: IndexArray, x: FloatArray, near: float) -> IndexArray:
 def sorted_out(
     middles: FloatArray, polygons: Mapping[str, FloatArray], numbers: Mapping[str, int]
 ) -> Int32Array:
-    """The number of the polygon that each cell lies in, or 0, shape (cells,).
+    """Find the number of the polygon that each cell lies in, or 0, shape (cells,).
 
     Args:
         middles: The cells' midpoints, shape (cells, 2); no cell is cut by a polygon.

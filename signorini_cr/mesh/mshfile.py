@@ -76,12 +76,12 @@ class MshFile(NamedTuple):
     names: dict[tuple[int, int], str]
 
     def groups(self, dim: int) -> list[int]:
-        """Tags of the physical groups of one dimension."""
+        """Return the tags of the physical groups of one dimension."""
         named = {tag for d, tag in self.names if d == dim}
         return sorted(named.union(*(b.groups for b in self.blocks if KINDS[b.kind][1] == dim)))
 
     def elements(self, kind: int, group: int | None = None) -> Int64Array:
-        """Node tags of all elements of a type, or of those in one physical group."""
+        """Return the node tags of all elements of a type, or of those in one physical group."""
         found = [b.nodes for b in self.blocks if b.kind == kind and group in (None, *b.groups)]
         return np.concatenate([np.empty((0, KINDS[kind][2]), dtype=np.int64), *found])
 
@@ -94,13 +94,13 @@ class _Source(Protocol):
     """Numbers of a section, in ASCII or binary."""
 
     def take(self, kinds: str) -> list[Any]:
-        """Some numbers: n for a size or tag of nodes and elements, i for an integer, d."""
+        """Take some numbers: n for a size or tag of nodes and elements, i for an integer, d."""
 
     def end_row(self) -> None:
         """Insist on the end of a line."""
 
     def table(self, rows: int, columns: int, kind: str) -> Array:
-        """Lines of numbers of one kind, shape (rows, columns)."""
+        """Take lines of numbers of one kind, shape (rows, columns)."""
 
 
 class _Text:
@@ -129,19 +129,19 @@ class _Text:
         raise _Damaged(f"in line {self.number(self.at - 1)} ({shown}) {fault}")
 
     def number(self, at: int) -> int:
-        """Number in the file of a line that is not blank."""
+        """Find the number in the file of a line that is not blank."""
         every = enumerate(self.body.split(b"\n"), self.first)
         return [i for i, line in every if line and not line.isspace()][at]
 
     def next_line(self) -> bytes:
-        """The next line."""
+        """Go to the next line."""
         if self.at >= len(self.lines):
             raise _Damaged(f"it ends with line {self.number(-1)}" if self.lines else "it is empty")
         self.at += 1
         return self.lines[self.at - 1]
 
     def take(self, kinds: str) -> list[Any]:
-        """As in `_Source`, from one line."""
+        """Take numbers as in `_Source`, from one line."""
         if not self.words:
             self.words = self.next_line().split()
         if len(self.words) < len(kinds):
@@ -153,12 +153,12 @@ class _Text:
             self.fail(_expected(kinds))
 
     def end_row(self) -> None:
-        """As in `_Source`."""
+        """Insist on the end of a line, as in `_Source`."""
         if self.words:
             self.fail(f"{counted(len(self.words), 'number')} too many")
 
     def table(self, rows: int, columns: int, kind: str) -> Array:
-        """As in `_Source`."""
+        """Take lines of numbers, as in `_Source`."""
         found = self.lines[self.at : self.at + rows]
         for i, line in enumerate(found, self.at + 1):
             if len(line.split()) != columns:
@@ -187,7 +187,7 @@ def _expected(kinds: str) -> str:
 
 
 def _parsed(lines: list[bytes], columns: int, kind: str) -> Array | None:
-    """Numbers from lines of so many words each, None if a word is no number of this kind."""
+    """Read so many numbers from each line, None if a word is no number of this kind."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # what comes of words that are none
         try:
@@ -213,7 +213,7 @@ class _Binary:
         self.codes = {"n": "q" if wide else "i", "i": "i", "d": "d"}
 
     def numbers(self, count: int, kind: str) -> Array:
-        """Some numbers of one kind."""
+        """Take some numbers of one kind."""
         dtype = np.dtype(self.order + self.codes[kind])
         if not 0 <= count <= (len(self.data) - self.at) // dtype.itemsize:
             raise _Damaged(
@@ -225,14 +225,14 @@ class _Binary:
         return found.astype(np.float64 if kind == "d" else np.int64)
 
     def take(self, kinds: str) -> list[Any]:
-        """As in `_Source`."""
+        """Take numbers, as in `_Source`."""
         return [self.numbers(1, kind)[0].item() for kind in kinds]
 
     def end_row(self) -> None:
-        """As in `_Source`."""
+        """Insist on the end of a line, as in `_Source`."""
 
     def table(self, rows: int, columns: int, kind: str) -> Array:
-        """As in `_Source`."""
+        """Take lines of numbers, as in `_Source`."""
         return self.numbers(rows * columns, kind).reshape(rows, columns)
 
 
@@ -268,7 +268,7 @@ class _Reader:
         self.blocks: list[Block] | None = None
 
     def read(self) -> MshFile:
-        """All sections, in the order of the file."""
+        """Read all sections, in the order of the file."""
         known: dict[str, Callable[[], None]] = {
             "MeshFormat": self.format,
             "PhysicalNames": self.physical_names,
@@ -377,7 +377,7 @@ class _Reader:
         text.end()
 
     def format(self) -> None:
-        """$MeshFormat: version, whether binary, and the size of a number."""
+        """Read $MeshFormat: version, whether binary, and the size of a number."""
         found = re.compile(rb"[ \t]*([^\s]+)[ \t]+(\d+)[ \t]+(\d+)[ \t\r]*\n").match(
             self.data, self.at
         )
@@ -396,7 +396,7 @@ class _Reader:
             self.at += 4
 
     def physical_names(self) -> None:
-        """$PhysicalNames, in ASCII always."""
+        """Read $PhysicalNames, in ASCII always."""
         body, first = self.body("PhysicalNames")
         rows = [(i, row) for i, row in enumerate(body.split(b"\n"), first) if row.strip()]
         pattern = re.compile(rb'\s*([0-3])\s+(\d{1,9})\s+"(.*)"\s*')
@@ -413,7 +413,7 @@ class _Reader:
             self.names[key] = found[3].decode("utf-8", "replace")
 
     def entities(self, source: _Source, partitioned: bool = False) -> None:
-        """$Entities or $PartitionedEntities: the physical groups of points, curves, surfaces."""
+        """Read $Entities or $PartitionedEntities: physical groups of points, curves, surfaces."""
         if self.version == 2:
             raise _Damaged("there is no such section in format 2.2")
         if self.groups is None:
@@ -441,14 +441,14 @@ class _Reader:
 
     @staticmethod
     def several(source: _Source, kind: str) -> list[int]:
-        """A number and so many numbers."""
+        """Take a number and so many numbers."""
         (count,) = source.take("n")
         if not 0 <= count <= _MOST_TAGS:
             raise _Damaged(f"{count} numbers are announced where there are few")
         return [source.take(kind)[0] for _ in range(count)]
 
     def nodes(self, source: _Source) -> None:
-        """$Nodes."""
+        """Read $Nodes."""
         if self.version == 2:
             self.nodes_of_2(source)
         else:
@@ -492,7 +492,7 @@ class _Reader:
         self.tags, self.points = values[:, 0].astype(np.int64), values[:, 1:]
 
     def elements(self, source: _Source) -> None:
-        """$Elements."""
+        """Read $Elements."""
         self.blocks = []
         if self.version == 4:
             blocks, total, _, _ = source.take("nnnn")
@@ -519,7 +519,7 @@ class _Reader:
             self.elements_of_2(source)
 
     def run_of_2(self, source: _Binary, most: int) -> int:
-        """A block in binary, or a run of blocks of one element each; how many elements."""
+        """Read a block in binary, or a run of blocks of one element each; return the count."""
         start = source.at
         kind, count, labels = source.take("iii")
         width = 1 + labels + self.nodes_of(kind)
@@ -539,7 +539,7 @@ class _Reader:
         return run
 
     def elements_of_2(self, source: _Text) -> None:
-        """One element a line: number, type, how many tags, the tags, the nodes."""
+        """Read one element a line: number, type, how many tags, the tags, the nodes."""
         lines = source.lines[source.at :]
         if len(lines) != self.count:
             raise _Damaged(f"{self.count} elements are announced, {len(lines)} are there")
@@ -562,7 +562,7 @@ class _Reader:
             self.add(kind, labels, values[:, 2:])
 
     def add(self, kind: int, labels: int, rows: Array) -> None:
-        """Elements of format 2: a number, tags, nodes; the first tag is the physical group."""
+        """Add elements of format 2: a number, tags, nodes; the first tag is the physical group."""
         assert self.blocks is not None
         groups = np.abs(rows[:, 1]) if labels else np.zeros(len(rows), dtype=np.int64)
         for group in np.unique(groups):

@@ -39,7 +39,7 @@ def bisect(points: FloatArray, parts: int) -> Int32Array:
 
 
 def by_position(points: FloatArray, cells: Int64Array) -> Callable:
-    """A partitioner for DOLFINx's `create_mesh`, which makes no ghost cells.
+    """Make a partitioner for DOLFINx's `create_mesh`, which makes no ghost cells.
 
     It is better than the graph partitioners at what small meshes need: every rank gets cells as
     long as there are enough, the same ones whatever partitioner DOLFINx was built with. Refining

@@ -69,7 +69,7 @@ def overlap(
 
 
 def _angles(corners: FloatArray) -> FloatArray:
-    """The angle at each corner of triangles, shape (triangles, 3)."""
+    """Compute the angle at each corner of triangles, shape (triangles, 3)."""
     u, v = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     cross = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     return np.arctan2(np.abs(cross), (u * v).sum(axis=-1))
@@ -111,7 +111,7 @@ def _crossing(points: FloatArray, sides: Int64Array) -> str | None:
 
 
 def _close(along: FloatArray) -> Iterator[tuple[Int64Array, Int64Array]]:
-    """Pairs of sides of which neither lies before the other.
+    """Find pairs of sides of which neither lies before the other.
 
     Args:
         along: Position of the ends of every side, shape (sides, 2).
@@ -133,7 +133,7 @@ def _close(along: FloatArray) -> Iterator[tuple[Int64Array, Int64Array]]:
 
 
 def _turn(side: FloatArray, x: FloatArray) -> FloatArray:
-    """On which side of a line a point lies: 1 left, -1 right, 0 on it; shape (pairs,)."""
+    """Tell on which side of a line a point lies: 1 left, -1 right, 0 on it; shape (pairs,)."""
     u, v = side[:, 1] - side[:, 0], x - side[:, 0]
     left, right = u[:, 0] * v[:, 1], u[:, 1] * v[:, 0]
     scale = np.abs(left) + np.abs(right) + np.hypot(*u.T) * np.hypot(*v.T)

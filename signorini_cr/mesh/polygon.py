@@ -24,7 +24,7 @@ MOST_FACETS = 2000
 
 
 def coordinates(vertices: npt.ArrayLike, least: int = 3) -> FloatArray:
-    """Vertices as a read-only array, shape (n, 2), if they are that, finite and enough."""
+    """Return vertices as a read-only array, shape (n, 2), if they are that, finite and enough."""
     try:
         points = np.array(vertices, dtype=np.float64)
     except (TypeError, ValueError):
@@ -96,7 +96,7 @@ def circle(center: Sequence[float], radius: float, size: float) -> FloatArray:
 
 
 def _one(point: Sequence[float]) -> FloatArray:
-    """A point, shape (2,)."""
+    """Return a point as an array, shape (2,)."""
     x = np.array(point, dtype=np.float64)
     if x.shape != (2,) or not np.abs(x).max() <= FARTHEST:
         raise InputError(f"a point [x, y] of numbers up to {FARTHEST:g} is needed, found {point}")
@@ -104,7 +104,7 @@ def _one(point: Sequence[float]) -> FloatArray:
 
 
 def _arc(start: FloatArray, through: FloatArray, end: FloatArray, size: float) -> FloatArray:
-    """The ends of an arc's facets, its own end left out."""
+    """Compute the ends of an arc's facets, its own end left out."""
     d, e = through - start, end - start
     d2, e2, area = d @ d, e @ e, d[0] * e[1] - d[1] * e[0]
     if abs(area) <= 1e-9 * max(d2, e2):
@@ -125,7 +125,7 @@ def _arc(start: FloatArray, through: FloatArray, end: FloatArray, size: float) -
 def _turned(
     center: FloatArray, radius: float, first: float, turn: float, size: float
 ) -> FloatArray:
-    """Points at equal angles from `first` on, as many as there are to be facets."""
+    """Compute points at equal angles from `first` on, as many as there are to be facets."""
     if not size > 0:
         raise InputError(f"size is {size}: a positive number is needed")
     number = abs(turn) * max(radius / size, 1 / TURN)
@@ -213,7 +213,7 @@ def _where(ring: int) -> str:
 
 
 def _side(a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
-    """Sign of the area of the triangles a, b, x."""
+    """Compute the sign of the area of the triangles a, b, x."""
     u, v = b - a, x - a
     return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 

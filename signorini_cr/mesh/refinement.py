@@ -138,7 +138,7 @@ def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]
 
 
 def labels(domain: Domain) -> Int32Array:
-    """The value in the tags of each facet of each cell of this rank, 0 without one.
+    """Find the value in the tags of each facet of each cell of this rank, 0 without one.
 
     Shape (cells, 3), for a mesh of triangles that knows the facets of its cells.
     """
@@ -150,7 +150,7 @@ def labels(domain: Domain) -> Int32Array:
 
 
 def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
-    """The tags of exterior facets with the values that `labels` tells, 0 for none; collective."""
+    """Make the tags of exterior facets with values from `labels`, 0 for none; collective."""
     mesh.topology.create_connectivity(2, 1)
     mesh.topology.create_connectivity(1, 2)
     facet = _table(mesh.topology.connectivity(2, 1))[label > 0]
@@ -159,7 +159,7 @@ def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
 
 
 def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
-    """The fine domain: its cells consist of what their parents do."""
+    """Make the fine domain: its cells consist of what their parents do."""
     materials = domain.materials.of_children(parent)
     descent = (*domain.descent, Refinement(weakref.ref(domain.mesh), parent))
     return Domain(fine, tags, parts=domain.parts, materials=materials, descent=descent)
@@ -170,18 +170,18 @@ def _count(index_map: Any) -> int:
 
 
 def _third(k: int, j: int) -> int:
-    """The local number that is neither k nor j."""
+    """Return the local number that is neither k nor j."""
     return 3 - k - j if k != j else k
 
 
 def _table(links: Any) -> Int32Array:
-    """A connectivity with equally many links for each entity, as a table."""
+    """Return a connectivity with equally many links for each entity as a table."""
     array: Int32Array = links.array
     return array.reshape(links.num_nodes, -1) if links.num_nodes else array.reshape(0, 3)
 
 
 def _prepared(mesh: Mesh) -> Mesh:
-    """The mesh, if it can be refined, with the connectivities that takes."""
+    """Check that the mesh can be refined, and make the connectivities that takes."""
     check_refinable(mesh)
     for dims in ((2, 1), (1, 2), (1, 0)):
         mesh.topology.create_connectivity(*dims)
@@ -299,7 +299,7 @@ def _ghosts_in(index_map: Any, entities: Int32Array) -> Int32Array:
 
 
 def _shared(mesh: Mesh) -> Int32Array:
-    """The facets of this rank that another one sees, too; collective."""
+    """Find the facets of this rank that another one sees, too; collective."""
     facet_map = mesh.topology.index_map(1)
     seen = la.vector(facet_map, dtype=np.int32)
     seen.array[facet_map.size_local :] = 1
@@ -310,7 +310,7 @@ def _shared(mesh: Mesh) -> Int32Array:
 def _between_ranks(
     coarse: Mesh, facets: Int32Array, vertices: _Vertices, children: Int32Array
 ) -> tuple[Any, Int32Array | None]:
-    """A topology that knows what lies between ranks, and numbers to fit; collective.
+    """Make a topology that knows what lies between ranks, and numbers to fit; collective.
 
     DOLFINx notes that where it looks for facets, and nowhere else. Here it looks for those of the
     few cells beside other ranks. What it will take to lie there are then the facets with the
@@ -399,7 +399,7 @@ def _give_facets(
 
 
 def _ends(coarse: Mesh, vertices: _Vertices, m: Int32Array, together: bool) -> Int32Array:
-    """The vertices of the fine facets, the one first that comes first, shape (fine facets, 2).
+    """Find the vertices of fine facets, the one first that comes first, shape (fine facets, 2).
 
     Args:
         coarse: The coarse mesh.
@@ -429,7 +429,7 @@ def _ends(coarse: Mesh, vertices: _Vertices, m: Int32Array, together: bool) -> I
 def _neighbours(
     coarse: Mesh, corners: Int32Array, facets: Int32Array, together: bool
 ) -> tuple[Int32Array, Int32Array, Int32Array]:
-    """The fine facets of the children, shape (4 cells, 3), and the children at each fine facet.
+    """Find the children's fine facets, shape (4 cells, 3), and the children at each fine facet.
 
     Args:
         coarse: The coarse mesh.
@@ -472,7 +472,7 @@ def _neighbours(
 
 
 def _numbered_anew(coarse: Mesh, index_map: Any, number: Int32Array) -> Any:
-    """The index map of the fine facets, halves of other ranks' facets as ghosts; collective.
+    """Make the index map of the fine facets, other ranks' halves as ghosts; collective.
 
     Args:
         coarse: The coarse mesh.
@@ -489,12 +489,12 @@ def _numbered_anew(coarse: Mesh, index_map: Any, number: Int32Array) -> Any:
 
 
 def _everyones(index_map: Any) -> Int64Array:
-    """The global numbers of local indices, ghosts included."""
+    """Return the global numbers of local indices, ghosts included."""
     return np.concatenate([np.arange(*index_map.local_range), index_map.ghosts])
 
 
 def _starts(size: Int32Array) -> Int32Array:
-    """Where each of so many groups of these sizes begins, and where the last ends."""
+    """Compute where each of so many groups of these sizes begins, and where the last ends."""
     starts: Int32Array = np.zeros(len(size) + 1, dtype=np.int32)
     np.cumsum(size, out=starts[1:])
     return starts
@@ -532,7 +532,7 @@ def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: Int32Array
 
 
 def _child_tags(domain: Domain, fine: Mesh, facets: Int32Array) -> Any:
-    """The boundary parts on the fine mesh: facet j of a cell is shared out to two of its children.
+    """Tag the parts of the fine boundary: facet j of a cell goes to two of its children.
 
     Args:
         domain: The coarse domain.

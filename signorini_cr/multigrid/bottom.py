@@ -46,7 +46,7 @@ NO_HYPRE = "GAMG (PETSc is without hypre)"
 
 
 def is_small(matrix: PETSc.Mat) -> bool:
-    """Whether a matrix at the bottom is to be factorised."""
+    """Tell whether a matrix at the bottom is to be factorised."""
     return matrix.getSize()[0] <= DIRECT
 
 
@@ -93,7 +93,7 @@ class Bottom:
         self._pc.apply(b, x)
 
     def describe(self, why: str = "") -> str:
-        """What it is, in words, and why unless it is what users have asked for."""
+        """Say in words what it is, and why unless it is what users have asked for."""
         kind = self._type if self._pc is None else self._pc.getType()
         if kind != self._type:
             return f"{kind} (option -{self._prefix}pc_type)"
@@ -106,7 +106,7 @@ class Bottom:
 
 
 def _choice(matrix: PETSc.Mat, dimension: int, alone: bool) -> tuple[str, Mapping[str, object]]:
-    """The solver for a matrix unless options say otherwise, and its settings; collective.
+    """Choose the solver for a matrix unless options say otherwise, and its settings; collective.
 
     Some are read when it is made, some when it is set up.
     """
@@ -120,7 +120,7 @@ def _choice(matrix: PETSc.Mat, dimension: int, alone: bool) -> tuple[str, Mappin
 
 
 def _suits_amg(matrix: PETSc.Mat) -> bool:
-    """Whether the matrix is, nearly, an M-matrix: what BoomerAMG was made for; collective."""
+    """Tell whether the matrix is, nearly, an M-matrix: BoomerAMG was made for these; collective."""
     if AMG != PETSc.PC.Type.HYPRE:
         return False
     start, column, value = matrix.getValuesCSR()

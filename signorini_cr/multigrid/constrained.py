@@ -24,7 +24,7 @@ from ..garbage import release
 def rows_of(
     A: PETSc.Mat, numbers: npt.NDArray[np.integer]
 ) -> tuple[Int32Array, Int32Array, FloatArray]:
-    """Some rows of A, which may be those of other ranks; collective.
+    """Take some rows of A, which may be those of other ranks; collective.
 
     PETSc has submatrices on several ranks, too, but they take a time that grows with A.
 
@@ -44,7 +44,7 @@ def rows_of(
 
 
 def with_entries(A: PETSc.Mat, made: Callable[[FloatArray], FloatArray]) -> PETSc.Mat:
-    """A matrix with A's pattern and entries of its own; collective.
+    """Make a matrix with A's pattern and entries of its own; collective.
 
     Args:
         A: The matrix.
@@ -58,7 +58,7 @@ def with_entries(A: PETSc.Mat, made: Callable[[FloatArray], FloatArray]) -> PETS
 
 
 def numbers_of(A: PETSc.Mat, dofs: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-    """Global numbers of owned rows of A, in integers that hold them."""
+    """Return the global numbers of owned rows of A, in integers that hold them."""
     numbers: npt.NDArray[np.integer] = dofs.astype(PETSc.IntType) + A.getOwnershipRange()[0]
     return numbers
 
@@ -132,12 +132,12 @@ class ConstrainedMatrix:
             self._write(which, self._value[which])
 
     def times(self, x: PETSc.Vec) -> FloatArray:
-        """A x in the dofs that can be constrained, shape (n,), whether or not they are."""
+        """Compute A x in the dofs that can be constrained, shape (n,), whether or not they are."""
         self._rows.mult(x, self._product)
         return self._product.array_r.copy()
 
     def magnitude(self, x: PETSc.Vec) -> FloatArray:
-        """|A| |x| in the dofs that can be constrained, shape (n,): what a row of A x is made of."""
+        """Compute |A| |x|, of which rows of A x are made, in the constrainable dofs, shape (n,)."""
         if self._magnitudes is None:
             self._magnitudes = with_entries(self._rows, np.abs)
         sizes = x.duplicate()
@@ -147,7 +147,7 @@ class ConstrainedMatrix:
         return self._product.array_r.copy()
 
     def flows(self, x: PETSc.Vec, b: PETSc.Vec) -> FloatArray:
-        """What a row of A x − b is made of but for constants in x, in the same dofs, shape (n,).
+        """Sum what a row of A x − b is made of but for constants in x, in these dofs, shape (n,).
 
         That is Σ_j |a_ij| |x_j − x_i| + |Σ_j a_ij x_i − b_i|; collective.
         """
@@ -165,7 +165,7 @@ class ConstrainedMatrix:
         release(self._marks, self._at_columns, self._to_columns)
 
     def _named(self, numbers: Int32Array) -> BoolArray:
-        """Which owned dofs any rank names by their global numbers; collective."""
+        """Find which owned dofs any rank names by their global numbers; collective."""
         marks = self.matrix.createVecRight()
         add = PETSc.InsertMode.ADD_VALUES
         marks.setValues(numbers.astype(PETSc.IntType, copy=False), np.ones(len(numbers)), add)
@@ -175,7 +175,7 @@ class ConstrainedMatrix:
         return found
 
     def _seen(self, dofs: Int32Array) -> BoolArray:
-        """Which dofs whose columns this rank has entries in are among some; collective.
+        """Find which dofs whose columns this rank has entries in are among some; collective.
 
         Args:
             dofs: Each rank's owned ones, local numbers.

@@ -133,7 +133,7 @@ class Grid:
                 self.held = self.dirichlet
 
     def rounding(self, x: PETSc.Vec, constrained: Int32Array) -> float:
-        """Norm of the diagonal times x over the free dofs: what the residual's digits are lost in.
+        """Take the norm of diagonal times x over free dofs: the residual's digits are lost in it.
 
         Args:
             x: A vector.
@@ -149,7 +149,7 @@ class Grid:
         return float(norm)
 
     def remade(self, matrix: PETSc.Mat) -> Grid:
-        """The same space with another matrix; the transfer is shared, nothing else is."""
+        """Make the same space with another matrix; the transfer is shared, nothing else is."""
         operator = ConstrainedMatrix(matrix, self.operator.dofs)
         return Grid(operator, self.dofs, self.dirichlet, self.transfer, self._sweeps)
 
@@ -169,7 +169,7 @@ class TwoGrids:
         self._smoother.constrain(dofs)
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[Grid]) -> None:
-        """One V-cycle for A x = b, from x = 0: smooth, correct in the coarser spaces, smooth.
+        """Do one V-cycle for A x = b, from x = 0: smooth, correct in the coarser spaces, smooth.
 
         Args:
             b: Right-hand side, 0 in the dofs that are held.
@@ -261,11 +261,11 @@ class Multigrid:
             yield
 
     def apply(self, _: PETSc.PC | None, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """One V-cycle, as PETSc's preconditioner of type python."""
+        """Do one V-cycle, as PETSc's preconditioner of type python."""
         self.finest.solver.solve(b, x, self.grids[1:])
 
     def describe(self) -> str:
-        """What the cycle is, in words."""
+        """Say in words what the cycle is."""
         bottom = self.grids[-1].solver
         assert not isinstance(bottom, TwoGrids)
         if self.given_up:
@@ -285,7 +285,7 @@ class Multigrid:
 
 
 def is_galerkin_product(grid: Grid, finer: PETSc.Mat, transfer: Transfer) -> bool:
-    """Whether a space's matrix is, nearly, the Galerkin product of a finer one's; collective.
+    """Tell whether a space's matrix is, nearly, the Galerkin product of a finer one's; collective.
 
     It is not where a mesh does not see what the coefficient does between its quadrature points.
 
@@ -310,7 +310,7 @@ def is_galerkin_product(grid: Grid, finer: PETSc.Mat, transfer: Transfer) -> boo
 
 
 def galerkin_products(chain: Sequence[Grid], finer: PETSc.Mat, transfer: Transfer) -> list[Grid]:
-    """The same chain with Galerkin products of a finer space's matrix; collective.
+    """Make the same chain with Galerkin products of a finer space's matrix; collective.
 
     Args:
         chain: Grids, finest first; their transfers are shared.

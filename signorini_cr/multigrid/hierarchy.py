@@ -215,7 +215,7 @@ def _free(grid: Grid) -> None:
 
 @defaults(MATRICES, prefix="")
 def conforming(mesh: NestedMesh) -> tuple[ConstrainedMatrix, Layout, Int32Array]:
-    """P1 beside CR on a mesh: its matrix, its dofs, and those of them on Γ0; collective."""
+    """Assemble P1 beside CR on a mesh: its matrix, its dofs, those of them on Γ0; collective."""
     data = mesh.data
     p1 = Layout.of_p1(mesh.domain.mesh, data.V.dofmap.index_map_bs)
     form, scale = data.conforming(p1.cells, p1.index_map)

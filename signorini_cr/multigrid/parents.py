@@ -52,13 +52,13 @@ class Layout:
 
     @classmethod
     def of_space(cls, V: fem.FunctionSpace) -> Layout:
-        """The dofs of a CR or P1 space."""
+        """Describe the dofs of a CR or P1 space."""
         cr = V.element.basix_element.family is basix.ElementFamily.CR
         return cls(V.mesh, V.dofmap.list, V.dofmap.index_map, cr, V.dofmap.index_map_bs)
 
     @classmethod
     def of_p1(cls, mesh: Mesh, block: int = 1) -> Layout:
-        """P1 without new numbers: the nodes of a straight-sided mesh are its vertices."""
+        """Describe P1 without new numbers: the nodes of a straight-sided mesh are its vertices."""
         if compat.coordinate_map(mesh).degree == 1:
             return cls(mesh, compat.cell_nodes(mesh), mesh.geometry.index_map(), False, block)
         return replace(cls.of_space(function_space(mesh, "P1")), block=block)
@@ -75,7 +75,7 @@ class Layout:
         return self.block * nodes
 
     def numbers(self, dofs: Int32Array) -> Int32Array:
-        """Global numbers of local dofs."""
+        """Return the global numbers of local dofs."""
         if self.mesh.comm.size == 1:
             return dofs
         nodes, component = np.divmod(dofs.ravel(), self.block)
@@ -83,19 +83,19 @@ class Layout:
         return (numbers + component).reshape(dofs.shape)
 
     def ends(self, facets: Int32Array) -> Int32Array:
-        """The nodes of P1 at the vertices of exterior facets, shape (n, d)."""
+        """Find the nodes of P1 at the vertices of exterior facets, shape (n, d)."""
         cells, local = facet_entities(self.mesh, facets).T
         ends: Int32Array = self.cells[cells[:, None], facet_corners(self.mesh)[local]]
         return ends
 
     def owned_at(self, imposed: Sequence[Imposed]) -> Int32Array:
-        """The owned dofs of P1 at whose vertices any rank has something imposed, ascending."""
+        """Find the owned dofs of P1 at whose vertices any rank has something imposed, ascending."""
         dofs = [self.block * self.ends(i.facets)[:, :, None] + i.components for i in imposed]
         none = np.empty(0, dtype=np.int32)
         return self.owned_among(np.concatenate([none, *(each.ravel() for each in dofs)]))
 
     def owned_among(self, dofs: Int32Array) -> Int32Array:
-        """The owned dofs among those that any rank names, local numbers, ascending."""
+        """Find the owned dofs among those that any rank names, local numbers, ascending."""
         named = np.zeros(self.local)
         named[dofs] = 1.0
         # numpy is ten times as fast over truth values as over numbers
@@ -136,7 +136,7 @@ class Parents:
     def take(
         self, values: npt.NDArray, nodes: Int32Array, cells: Int32Array | slice = slice(None)
     ) -> npt.NDArray:
-        """Values at the nodes of fine cells' parents; collective.
+        """Take the values at the nodes of fine cells' parents; collective.
 
         Args:
             values: For each local node of the coarse mesh, shape (nodes, …).
@@ -152,7 +152,7 @@ class Parents:
         return self._exchange.fetch(values[nodes])[parents]
 
     def collected(self, values: FloatArray, ufunc: np.ufunc = np.add) -> FloatArray:
-        """What the children of each coarse cell of this rank have, put together; collective.
+        """Put together what the children of each coarse cell of this rank have; collective.
 
         Args:
             values: For each fine cell of this rank.
@@ -176,7 +176,7 @@ class Parents:
         return result
 
     def layout(self, coarse: Layout) -> Layout:
-        """The coarse dofs, with the cells that `cell` numbers; collective."""
+        """Describe the coarse dofs, with the cells that `cell` numbers; collective."""
         if self._exchange is None:
             return coarse
         index_map = coarse.index_map
@@ -235,7 +235,7 @@ class Parents:
         return barycentric_coordinates(self.take(x_coarse, parents), x[nodes])
 
     def weights(self, coarse: Layout, fine: Layout) -> FloatArray:
-        """The parent's shape functions at the dofs of each fine cell.
+        """Evaluate the parent's shape functions at the dofs of each fine cell.
 
         Returns:
             Shape (cells, d + 1, d + 1): dof of the fine cell, dof of its parent; as many rows as
@@ -251,7 +251,7 @@ class Parents:
 
 
 def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:
-    """Barycentric coordinates of points in simplices.
+    """Compute barycentric coordinates of points in simplices.
 
     Args:
         simplices: Vertices, shape (n, d + 1, 3).

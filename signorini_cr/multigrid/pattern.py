@@ -16,7 +16,7 @@ from .parents import Layout
 
 
 def empty_matrix(dofs: Layout) -> PETSc.Mat:
-    """A matrix that takes the entries of all owned cells without allocating anything.
+    """Make a matrix that takes the entries of all owned cells without allocating anything.
 
     Args:
         dofs: The dofs of CR or P1.

@@ -170,7 +170,7 @@ def smoother(matrix: PETSc.Mat, dofs: Layout, sweeps: int) -> Smoother:
 
 
 def _entries_between_ranks(matrix: PETSc.Mat, dofs: Layout) -> tuple[Int32Array, PETSc.Mat, float]:
-    """The entries of owned rows in columns of other ranks.
+    """Find the entries of owned rows in columns of other ranks.
 
     Returns:
         The rows that may have such entries, ascending local numbers; the entries as a matrix with

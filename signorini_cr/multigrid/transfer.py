@@ -64,7 +64,7 @@ class Transfer:
         self._own = self._rows.createVecLeft()
 
     def coarse_vector(self) -> PETSc.Vec:
-        """A vector for coarse functions, with room for ghosts."""
+        """Make a vector for coarse functions, with room for ghosts."""
         coarse = self._coarse
         return ghosted(coarse.mesh.comm, coarse.index_map, block=coarse.block)
 
@@ -85,12 +85,12 @@ class Transfer:
         b_coarse.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
 
     def coarse_support(self, dofs: Int32Array) -> Int32Array:
-        """The owned coarse dofs whose functions don't vanish at given owned fine dofs."""
+        """Find the owned coarse dofs whose functions don't vanish at given owned fine dofs."""
         _, columns, values = rows_of(self._rows, dofs)
         return self._coarse.owned_among(columns[values != 0.0])
 
     def matrix(self) -> PETSc.Mat:
-        """As a matrix of all ranks, for products."""
+        """Return it as a matrix of all ranks, for products."""
         start, dofs, values = self._csr
         numbers = self._coarse.numbers(dofs.astype(np.int32, copy=False))
         csr = start, numbers.astype(PETSc.IntType, copy=False), values
@@ -117,7 +117,7 @@ def _for_each_unknown(
 
 
 def inclusion(p1: Layout, cr: Layout) -> Transfer:
-    """P1 in CR on the same mesh: d entries 1/d in each row."""
+    """Include P1 in CR on the same mesh: d entries 1/d in each row."""
     d = cr.cells.shape[1] - 1
     owned = cr.index_map.size_local
     columns = np.empty((owned + cr.index_map.num_ghosts, d), dtype=np.int32)
@@ -129,7 +129,7 @@ def inclusion(p1: Layout, cr: Layout) -> Transfer:
 
 
 def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
-    """P1 on a coarse mesh in P1 or CR on a nested one: any fine cell of a dof tells all.
+    """Prolong P1 on a coarse mesh to P1 or CR on a nested one: any fine cell of a dof tells all.
 
     Args:
         coarse: The coarse dofs.

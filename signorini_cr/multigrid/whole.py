@@ -29,7 +29,7 @@ ACCURACY = 1e-6
 
 
 def suits_whole(matrix: PETSc.Mat, dimension: int, bounded: int) -> bool:
-    """Whether a matrix is small enough.
+    """Tell whether a matrix is small enough.
 
     Args:
         matrix: The matrix.
@@ -88,7 +88,7 @@ class Whole:
             values[self._constrained] = 0.0
 
     def is_accurate(self) -> bool:
-        """Whether constants are found: a matrix that hardly anything holds may be singular to it.
+        """Tell whether constants are found: a matrix that hardly anything holds may seem singular.
 
         With dofs on the obstacle it need not be; so other solvers are to be taken.
         """
@@ -99,7 +99,7 @@ class Whole:
         return bool(np.abs(self._unit.array_r - 1.0).max(initial=0.0) <= ACCURACY)
 
     def describe(self, why: str = "") -> str:
-        """What it is, in words."""
+        """Say in words what it is."""
         kind = self._pc.getType()
         if kind != PETSc.PC.Type.CHOLESKY:
             return f"{kind} (option -{ALONE_PREFIX}pc_type)"

@@ -63,7 +63,7 @@ class Example:
     rates: tuple[float, float] = (1.0, 2.0)
 
     def mesh(self, size: float, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
-        """An unstructured mesh with facets of about the length ``size``; collective."""
+        """Make an unstructured mesh with facets of about the length ``size``; collective."""
         return self.polygon.mesh(size, comm)
 
     def structured(
@@ -75,17 +75,17 @@ class Example:
         jitter: float = 0.0,
         seed: int = 0,
     ) -> Domain:
-        """A mesh of squares of side 1/n cut in two, see `families.structured`; collective."""
+        """Make a mesh of squares of side 1/n cut in two, see `families.structured`; collective."""
         return families.structured(self.polygon, n, comm, shift=shift, jitter=jitter, seed=seed)
 
 
 def radius(x: Expr) -> Expr:
-    """The distance r from the origin."""
+    """Return the distance r from the origin."""
     return ufl.sqrt(x[0] ** 2 + x[1] ** 2)
 
 
 def angle(x: Expr) -> Expr:
-    """θ, smooth across the whole axis y = 0 but the origin: its jump is on x = 0 below it.
+    """Return θ, smooth across all of the axis y = 0 but the origin: it jumps on x = 0 below it.
 
     On Γ1 rounding may leave y a little below 0, where atan2(y, x) would jump to −π.
     """
@@ -93,7 +93,7 @@ def angle(x: Expr) -> Expr:
 
 
 def positive(t: Expr) -> Expr:
-    """The positive part of t."""
+    """Return the positive part of t."""
     return ufl.max_value(t, 0.0)
 
 
@@ -136,7 +136,7 @@ def from_pair(
 
 
 def root(s: float, name: str = "") -> Example:
-    """The harmonic u = r^s cos(sθ), s = 3/2, 7/2, 11/2, …: contact on x < 0, λ = s|x|^{s−1}.
+    """Make the harmonic u = r^s cos(sθ), s = 3/2, 7/2, 11/2, …: contact, λ = s|x|^{s−1} on x < 0.
 
     At θ = π cos(sπ) = 0 and sin((s − 1)π) = 1: u vanishes there and the pressure is positive. At
     s = 5/2, 9/2, … it would be negative.
@@ -205,14 +205,14 @@ def made(
     """
 
     def pressure(x: Expr, kind: str) -> tuple[Expr, Expr, Expr]:
-        """λ, and how far α and β are from u."""
+        """Return λ, and how far α and β are from u."""
         s, m = switch(x), MARGIN if kind == "between" else 0.0
         low = positive(s - m) if kind != "above" else ufl.as_ufl(0.0)
         high = positive(-s - m) if kind != "below" else ufl.as_ufl(0.0)
         return low - high, positive(m - s), positive(m + s)
 
     def flux(x: Expr) -> Expr:
-        """κ∂ₙu + b (u − u_ext)."""
+        """Return κ∂ₙu + b (u − u_ext)."""
         kappa = as_expression(coefficient, x)
         if line is not None and east is not None and east.coefficient is not None:
             own = as_expression(east.coefficient, x)
@@ -277,7 +277,7 @@ def kinked(v: Function, line: float, west: float, east: float) -> Function:
 
 
 def raised(example: Example, alpha: Function) -> Example:
-    """The same contact on the obstacle α: u + α, with α given such that ∂ₙα = 0 on Γ1.
+    """Make the same contact on the obstacle α: u + α, with α given such that ∂ₙα = 0 on Γ1.
 
     Raises:
         ValueError: The example's solution is not known.
@@ -302,7 +302,7 @@ def _w(x: Expr) -> Expr:
 
 
 def _s1_load(x: Expr) -> Expr:
-    """−Δ of S1's u, without the second derivatives of w, whose sum is 0."""
+    """Return −Δ of S1's u, without the second derivatives of w, whose sum is 0."""
     w_x = 1.5 * ufl.sqrt(radius(x)) * ufl.cos(0.5 * angle(x))
     w_y = -1.5 * ufl.sqrt(radius(x)) * ufl.sin(0.5 * angle(x))
     return (
@@ -317,7 +317,7 @@ def _bubble(x: Expr) -> Expr:
 
 
 def _spikes(sign: float, order: int = 0) -> Function:
-    """x⁶ max(0, ± sin(π/x))³ for x > 0, and 0 for x < 0; or its first or second derivative.
+    """Return x⁶ max(0, ± sin(π/x))³ for x > 0, else 0; or its first or second derivative.
 
     The powers of x are collected, so that one sees that it is small where x is.
     """
@@ -342,7 +342,7 @@ def _spikes(sign: float, order: int = 0) -> Function:
 
 
 def _i_load(x: Expr) -> Expr:
-    """−Δ of I's u = (a − y b) φ."""
+    """Return −Δ of I's u = (a − y b) φ."""
     left = positive(-x[0])
     a, da, dda = (_spikes(1.0, order)(x[0]) for order in range(3))
     b, db, ddb = (_spikes(-1.0, order)(x[0]) for order in range(3))

@@ -19,7 +19,7 @@ from ..solution import Solution
 
 
 def rates(h: Sequence[float], errors: Sequence[float]) -> FloatArray:
-    """Orders observed between successive levels, log(e_k / e_{k+1}) / log(h_k / h_{k+1}).
+    """Compute orders observed between levels, log(e_k / e_{k+1}) / log(h_k / h_{k+1}).
 
     Returns:
         One less than there are levels; not a number where an error is 0.
@@ -30,7 +30,7 @@ def rates(h: Sequence[float], errors: Sequence[float]) -> FloatArray:
 
 
 def errors(solution: Solution, degree: int) -> tuple[float, float]:
-    """Like `Solution.errors`, with a quadrature of another degree; collective.
+    """Compute `Solution.errors` with a quadrature of another degree; collective.
 
     Returns:
         ‖u − u_h‖_h in the broken norm (1.6) and ‖u − u_h‖ in L2.
@@ -47,7 +47,7 @@ def errors(solution: Solution, degree: int) -> tuple[float, float]:
 
 
 def pressure_error(solution: Solution, pressure: Data, degree: int = 12) -> float:
-    """‖λ − λ_h‖ in L2(Γ1), with λ_h constant on each facet; collective.
+    """Compute ‖λ − λ_h‖ in L2(Γ1), with λ_h constant on each facet; collective.
 
     Args:
         solution: u_h and λ_h.
@@ -61,7 +61,7 @@ def pressure_error(solution: Solution, pressure: Data, degree: int = 12) -> floa
 
 
 def distance(coarse: Solution, fine: Solution) -> float:
-    """‖u_H − u_h‖_h of the solutions on a mesh and on the next in its sequence; collective.
+    """Compute ‖u_H − u_h‖_h of the solutions on a mesh and on the next in sequence; collective.
 
     Where u is not known, these distances fall as the errors do.
 
@@ -84,7 +84,7 @@ def distance(coarse: Solution, fine: Solution) -> float:
 
 
 def cell_gradients(u: fem.Function) -> tuple[FloatArray, FloatArray]:
-    """The gradient of a CR or P1 function on each cell of this rank.
+    """Compute the gradient of a CR or P1 function on each cell of this rank.
 
     Returns:
         Gradients, shape (cells, gdim), and the cells' volumes, shape (cells,).

@@ -115,7 +115,7 @@ def judge(solution: Solution, example: Example) -> Judgement:
 
 
 def interpolate(domain: Domain, data: Data, degree: int = 12) -> fem.Function:
-    """Π_h v, the CR function with v's mean on every facet; collective.
+    """Compute Π_h v, the CR function with v's mean on every facet; collective.
 
     Args:
         domain: Where.
@@ -228,7 +228,7 @@ _DIRICHLET, _NEUMANN, _INTERIOR = 3, 4, 5
 
 
 def _sides(domain: Domain, sets: npt.NDArray[np.int8]) -> dict[int, Int32Array]:
-    """The sides of the owned cells by kind: BOUND, MIXED, FREE, Γ0, Γg, or both sides inside.
+    """Sort the sides of the owned cells by kind: BOUND, MIXED, FREE, Γ0, Γg, or both sides inside.
 
     DOLFINx takes any list of sides for a one-sided integral, interior facets' as well; thus no
     integral over jumps is needed, and no ghost cells.

@@ -27,14 +27,14 @@ class Bounds:
     upper: FloatArray
 
     def side(self, x: FloatArray) -> FloatArray:
-        """1 where the lower bound is nearer to x, else −1, shape (n,)."""
+        """Return 1 where the lower bound is nearer to x, else −1, shape (n,)."""
         return np.where(x - self.lower <= self.upper - x, 1.0, -1.0)
 
     def gap(self, x: FloatArray) -> FloatArray:
-        """How far x is from the nearer bound, below 0 beyond it, shape (n,)."""
+        """Compute how far x is from the nearer bound, below 0 beyond it, shape (n,)."""
         gap: FloatArray = np.minimum(x - self.lower, self.upper - x)
         return gap
 
     def on(self, side: FloatArray) -> FloatArray:
-        """The bound on a side, shape (n,)."""
+        """Return the bound on a side, shape (n,)."""
         return np.where(side > 0.0, self.lower, self.upper)

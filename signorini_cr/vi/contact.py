@@ -101,7 +101,7 @@ class Contact:
     _table: dict[str, npt.NDArray] | None
 
     def __repr__(self) -> str:
-        """A line."""
+        """Describe the contact in a line."""
         return (
             f"<Contact: {self.number_active} of {counted(self.number, 'facet')}, "
             f"length {self.length:.6g}, force {self.force:.6g}>"
@@ -121,7 +121,7 @@ class Contact:
         return self.vertices.mean(axis=1)
 
     def table(self) -> dict[str, npt.NDArray] | None:
-        """All contact facets in order along the boundary, on rank 0; None on the others.
+        """Return all contact facets in order along the boundary, on rank 0; None on the others.
 
         Columns: part (connected piece of Γ1, from 0), arc_length (of the facet's midpoint, from
         the part's beginning, Ω to the left), x, y, length, obstacle, upper (where any facet has
@@ -190,7 +190,7 @@ def contact_facts(
 def _at_facets(
     data: OnMesh, system: System, u: fem.Function, at_dofs: _AtDofs, pressure: FloatArray
 ) -> dict[str, npt.NDArray]:
-    """What `Contact` has of each facet, by name; collective.
+    """Compute what `Contact` has of each facet, by name; collective.
 
     Args:
         data: The physics on the mesh.
@@ -203,7 +203,7 @@ def _at_facets(
     layout = Layout.of_space(u.function_space)
 
     def seen(values: FloatArray) -> FloatArray:
-        """Values at bounded dofs, 0 at others, as the facets see them."""
+        """Return values at bounded dofs, 0 at others, as the facets see them."""
         everywhere = np.zeros(len(u.x.array))
         everywhere[system.bounded] = values
         return layout.shared_sum(everywhere)[dofs]
@@ -264,5 +264,5 @@ class _AtDofs:
 
 
 def _bound(values: FloatArray) -> FloatArray:
-    """Bounds as they are told: infinite where PETSc's number says that there is none."""
+    """Return bounds as they are told: infinite where PETSc's number says that there is none."""
     return np.where(np.abs(values) < PETSc.INFINITY, values, np.copysign(np.inf, values))

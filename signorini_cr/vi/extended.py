@@ -195,35 +195,35 @@ class Extended:
         self.residual.axpy(1.0, self._work)
 
     def _gap(self) -> FloatArray:
-        """How far bounded dofs are from the nearer bound, shape (n,)."""
+        """Compute how far bounded dofs are from the nearer bound, shape (n,)."""
         bounded = self.active.bounded
         x, low = (each.array_r[bounded] for each in (self._vectors.x, self._remainder))
         return self._bounds.gap(x) + self._bounds.side(x) * low
 
     def _pushes(self) -> FloatArray:
-        """The residual in bounded dofs, above 0 where it pushes them off, shape (n,)."""
+        """Return the residual in bounded dofs, above 0 where it pushes them off, shape (n,)."""
         bounded = self.active.bounded
         side = self._bounds.side(self._vectors.x.array_r[bounded])
         return side * self.residual.array_r[bounded]
 
     def _forces(self) -> FloatArray:
-        """Forces on active dofs, 0 on others, shape (n,)."""
+        """Return the forces on active dofs, 0 on others, shape (n,)."""
         return np.where(self.active.mask, self._pushes(), 0.0)
 
     def _wanted(self) -> BoolArray:
-        """Which dofs are to be active."""
+        """Find which dofs are to be active."""
         wanted: BoolArray = np.where(self.active.mask, self._pushes() > 0.0, self._gap() < 0.0)
         return wanted
 
     def _misclassified(self, wanted: BoolArray) -> FloatArray:
-        """The forces that are to go, or to come, with another active set, by class; collective."""
+        """Sum the forces that are to go, or come, with another active set, by class; collective."""
         pulls = np.maximum(-self._pushes(), 0.0)
         missing = self._operator.diagonal * np.maximum(-self._gap(), 0.0)
         wrong = np.where(self.active.mask, pulls, missing)
         return self._stiffness.totals(np.where(wanted != self.active.mask, wrong, 0.0))
 
     def _flow(self) -> float:
-        """What the rows are made of where the domain is softest, all together; collective."""
+        """Sum what the rows are made of where the domain is softest; collective."""
         x = self._vectors.x
         found = self._stiffness.flows(x)
         if self._masses is not None:
@@ -232,20 +232,20 @@ class Extended:
 
     @property
     def _bottom(self) -> float:
-        """What forces are measured against at least."""
+        """The least that forces are measured against."""
         return float(BOTTOM * self._stiffness.made_of.max())
 
     def _sizes(self, forces: FloatArray) -> FloatArray:
-        """What errors of the forces are measured against, by class, from the sums of these."""
+        """Compute what errors of the forces are measured against, by class, from their sums."""
         sizes: FloatArray = np.maximum(np.maximum(forces, self._stiffness.least), self._bottom)
         return sizes
 
     def _could_touch(self, moved: FloatArray) -> FloatArray:
-        """The forces that dofs off the obstacle would have if they moved once more, shape (n,)."""
+        """Compute the forces of dofs off the obstacle, should they move once more, shape (n,)."""
         return self._operator.diagonal * np.maximum(2.0 * moved - np.abs(self._gap()), 0.0)
 
     def _answer(self, load: FloatArray, bounds: FloatArray, seed: int) -> FloatArray:
-        """What changes of the data change in the forces, by class; collective."""
+        """Compute what changes of the data change in the forces, by class; collective."""
         bounded, mask = self.active.bounded, self.active.mask
         change, answer = self._vectors.x.duplicate(), self._vectors.x.duplicate()
         change.set(0.0)

@@ -160,7 +160,7 @@ class Floating:
                 x[there] = side[piece] * held[there]
 
     def _net(self, system: System) -> FloatArray:
-        """The net force ∫ f + ∫ g on each piece, shape (count + 1,); collective."""
+        """Compute the net force ∫ f + ∫ g on each piece, shape (count + 1,); collective."""
         owned = system.A.getLocalSize()[0]
         chi = np.bincount(self.piece[:owned], system.chi[:owned], self.count + 1)
         net: FloatArray = system.u_D.function_space.mesh.comm.allreduce(chi)
@@ -185,13 +185,13 @@ def _of_contact(below: bool, above: bool, amount: str) -> str:
 
 
 def _floors(system: System, side: float) -> FloatArray:
-    """α, or −β for the other side, by dof; −∞ where there is none."""
+    """Return α, or −β for the other side, by dof; −∞ where there is none."""
     floor = system.lower if side > 0.0 else -system.upper
     return np.where(floor > PETSc.NINFINITY, floor, -np.inf)
 
 
 def _cell_dofs(V: fem.FunctionSpace) -> Int32Array:
-    """Dofs of the owned cells that hang together, a row for each of a node's unknowns."""
+    """Find the dofs of the owned cells that hang together, a row for each of a node's unknowns."""
     topology, block = V.mesh.topology, V.dofmap.index_map_bs
     nodes = V.dofmap.list[: topology.index_map(topology.dim).size_local, None]
     dofs: Int32Array = block * nodes + np.arange(block, dtype=np.int32)[:, None]
@@ -199,7 +199,7 @@ def _cell_dofs(V: fem.FunctionSpace) -> Int32Array:
 
 
 def _labels(V: fem.FunctionSpace) -> FloatArray:
-    """For each local dof the largest number of all dofs that it is connected with; collective."""
+    """Find for each local dof the largest number of all that it is connected with; collective."""
     dofs, layout = _cell_dofs(V), Layout.of_space(V)
     piece = pieces(dofs, layout.local)
     labels = layout.numbers(np.arange(layout.local, dtype=np.int32)).astype(np.float64)

@@ -41,7 +41,7 @@ class Level:
         self._snapshot = self.physics.snapshot([each.domain for each in self.meshes])
 
     def as_made(self) -> AbstractContextManager[None]:
-        """A block in which data that may change are what they were when this was made."""
+        """Open a block in which data that may change are what they were when this was made."""
         return self._snapshot.again()
 
     @property
@@ -51,7 +51,7 @@ class Level:
 
     @property
     def physics(self) -> Physics:
-        """What is solved, shared by all levels."""
+        """The physics that is solved, shared by all levels."""
         return self.meshes[-1].physics
 
     @property

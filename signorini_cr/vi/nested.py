@@ -136,7 +136,7 @@ def _put_on_bounds(start: fem.Function, system: System, expected: _Expected) -> 
 
 
 def _margin(start: fem.Function, bound: FloatArray) -> FloatArray:
-    """A distance from bounds that rounding cannot hide; collective."""
+    """Compute a distance from bounds that rounding cannot hide; collective."""
     comm = start.function_space.mesh.comm
     scale = comm.allreduce(float(np.abs(start.x.array).max(initial=0.0)), op=MPI.MAX)
     finite = np.where(np.isfinite(bound), np.abs(bound), 0.0)
@@ -222,7 +222,7 @@ class _Inherited:
 
 
 def _front(solution: Solved) -> BoolArray:
-    """Whether contact begins or ends at a vertex, for all local ones; collective."""
+    """Tell whether contact begins or ends at a vertex, for all local ones; collective."""
     contact, p1 = solution.contact, Layout.of_p1(solution.domain.mesh)
     ends = p1.ends(contact.facets)
     there = np.ones(p1.size[0] + p1.index_map.num_ghosts, dtype=bool)

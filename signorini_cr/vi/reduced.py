@@ -157,7 +157,7 @@ class ReducedSolver:
         return self._cycle.matrix
 
     def describe(self) -> str:
-        """The preconditioner taken, and why."""
+        """Say which preconditioner was taken, and why."""
         if self._uses_cycle:
             return self._cycle.describe()
         return f"{self.ksp.getPC().getType()} (option -{PREFIX}pc_type)"
@@ -274,17 +274,17 @@ class ReducedSolver:
         return self._step
 
     def moved(self) -> FloatArray:
-        """How far the last step took the bounded dofs, shape (n,)."""
+        """Return how far the last step took the bounded dofs, shape (n,)."""
         moved: FloatArray = np.abs(self._step.array_r[self.active.bounded])
         return moved
 
     def active_now(self) -> ActiveSet:
-        """The active set of the iterate as it is now, which SNES will go on with."""
+        """Return the active set of the iterate as it is now, which SNES will go on with."""
         bounded = self.active.bounded
         return ActiveSet.of(bounded, self.bounds.gap(self._x.array_r[bounded]), self.forces())
 
     def forces(self) -> FloatArray:
-        """The residual in the bounded dofs, above 0 where it pushes them off, shape (n,)."""
+        """Return the residual in the bounded dofs, above 0 where it pushes them off, shape (n,)."""
         bounded = self.active.bounded
         return self.bounds.side(self._x.array_r[bounded]) * self._residual.array_r[bounded]
 
@@ -362,11 +362,11 @@ class ReducedSystem:
         return Outlook(float(np.sqrt(facts[0])), bool(facts[1]), moved, forces)
 
     def rounding(self) -> float:
-        """Norm of what rounding makes of A x, over the dofs that are solved for; collective."""
+        """Return the norm of A x's rounding over the dofs that are solved for; collective."""
         return NOISE * self.grid.rounding(self.x, self.active.dofs)
 
     def lost_forces(self) -> FloatArray:
-        """Forces that are lost in rounding, summed over each class of stiffness; collective."""
+        """Sum the forces that are lost in rounding over each class of stiffness; collective."""
         return LOST * NOISE * self.stiffness.magnitude(self.x)
 
 
@@ -441,7 +441,7 @@ class LinearTest:
         self._moved = moved
 
     def _forces_are_known(self, norm: float, forces: FloatArray) -> bool:
-        """Whether they are, or rounding makes it useless to go on for their sake; collective."""
+        """Tell whether they are, or rounding makes it useless to go on for them; collective."""
         if (self.force_errors <= self._share * forces).all():
             return True
         if self._floors is None:

@@ -246,7 +246,7 @@ def _reporting(
 
 
 def _stopped(reason: int, inner: int, contrast: float) -> str:
-    """What to say when SNES gives up, and the linear solver perhaps before it."""
+    """Say why SNES gave up, and perhaps the linear solver before it."""
     words = f"SNES stopped with {_name(PETSc.SNES.ConvergedReason, reason)}"
     if inner < 0:
         words += f" (KSP {_name(PETSc.KSP.ConvergedReason, inner)})"
@@ -308,7 +308,7 @@ class NewtonTest:
         return self._as_far_as_it_goes(snes.getSolution())
 
     def _small(self, snes: PETSc.SNES, step: int, norm: float) -> float:
-        """What the residual's norm may be; a tolerance that is looser than ours loosens all."""
+        """Compute what the residual's norm may be; a tolerance looser than ours loosens all."""
         if step == 0:
             self._start = norm
         rtol, atol, _, _ = snes.getTolerances()
@@ -317,19 +317,19 @@ class NewtonTest:
         return float(small)
 
     def _is_solved_by_the_start(self, norm: float, small: float) -> bool:
-        """Whether no step is needed: by our own tolerance one is made, to look at the set."""
+        """Tell whether no step is needed: by our own tolerance one is made, to look at the set."""
         enough = norm == 0.0 or (self._slack > 1.0 and norm <= small)
         if enough:
             self.force_error = self.imbalance = 0.0
         return enough
 
     def _forget(self) -> None:
-        """What was measured in another set says nothing."""
+        """Forget what was measured in another set, as it says nothing."""
         self.force_error = self.imbalance = np.inf
         self.forceless = False
 
     def _is_large(self, snes: PETSc.SNES, step: int, norm: float, small: float) -> bool:
-        """Whether the residual is too large, and no rounding; collective."""
+        """Tell whether the residual is too large, and no rounding; collective."""
         if norm <= small:
             return False
         active = self._linear.active.dofs
@@ -337,7 +337,7 @@ class NewtonTest:
         return step == 1 or norm > NOISE * finest.rounding(snes.getSolution(), active)
 
     def _looks_at_the_set(self, step: int, small: float, facts: _ContactFacts) -> bool:
-        """Whether a step is made only because dofs are in the wrong set."""
+        """Tell whether a step is made only because dofs are in the wrong set."""
         allowed = SET_STEPS if step <= SET_STEPS else 1
         wrong = facts.misclassified_norm > SET_TOLERANCE * small
         if self._for_the_set >= allowed or not wrong:
@@ -355,7 +355,7 @@ class NewtonTest:
         return noise
 
     def _has_another_set(self, facts: _ContactFacts, noise: FloatArray) -> bool:
-        """Whether dofs in the wrong set are what is wrong, and it has not been so too often."""
+        """Tell whether dofs in the wrong set are what is wrong, and were so not too often."""
         allowed = np.maximum(self._slack * FORCES * facts.sizes, noise)
         if not (facts.misclassified > allowed).any():
             return False
@@ -366,7 +366,7 @@ class NewtonTest:
         return True
 
     def _refines(self, force_error: float, imbalance: float) -> bool:
-        """Whether to solve once more in the same set, as that has helped.
+        """Tell whether to solve once more in the same set, as that has helped.
 
         Args:
             force_error: As it was a step before.
@@ -413,7 +413,7 @@ class NewtonTest:
     def _force_errors(
         self, x: PETSc.Vec, norm: float, facts: _ContactFacts
     ) -> tuple[FloatArray, FloatArray]:
-        """What may be wrong with the forces of each class, in parts, and what is their rounding."""
+        """Estimate the errors of the forces of each class, in parts, and their rounding."""
         stiffness, slack = self._stiffness, self._slack
         # the linear solver knows what it left, unless rounding has added to the residual; a
         # misclassified dof has its force there, its neighbours as much, and so may other forces
@@ -443,7 +443,7 @@ class NewtonTest:
         return relative, noise
 
     def _close(self, x: PETSc.Vec, active: ActiveSet, moving: bool) -> FloatArray:
-        """The forces of dofs off the obstacle, but not certainly so, by class; collective."""
+        """Sum the forces of dofs off the obstacle, but not certainly so, by class; collective."""
         operator, at = self._cycle.operator, x.array_r[active.bounded]
         reach = DATUM * (x.norm(PETSc.NormType.INFINITY) + self._offset)
         moved = 2.0 * self._linear.moved() if moving else 0.0
@@ -452,7 +452,7 @@ class NewtonTest:
         return self._stiffness.totals(np.where(active.mask, 0.0, force))
 
     def _of_data(self, x: PETSc.Vec, active: ActiveSet, total: float) -> float:
-        """What rounding of the data may add to the forces, all together; collective.
+        """Estimate what rounding of the data may add to the forces, all together; collective.
 
         An entry of the matrix that c or b has a part in is off by a rounding of the largest in its
         cell, even where it is 0.
@@ -485,7 +485,7 @@ class NewtonTest:
         return 0.0 if self._data is None else abs(self._data.offset)
 
     def _lost_in_rounding(self, x: PETSc.Vec, from_data: bool = False) -> str:
-        """What to say to users."""
+        """Say to users what is lost in rounding."""
         if self.force_error >= self.imbalance:
             known = f"the contact forces are known to {self.force_error:.1e} of their sum only"
         else:

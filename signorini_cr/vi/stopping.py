@@ -180,7 +180,7 @@ class Stiffness:
         return sums.astype(np.float64, copy=False)
 
     def totals(self, values: FloatArray) -> FloatArray:
-        """The same over all ranks, shape (classes,); collective."""
+        """Sum values of the bounded dofs over all of each class, shape (classes,); collective."""
         return summed(self.comm, self.sums(values))
 
     def magnitude(self, x: PETSc.Vec, which: BoolArray | None = None) -> FloatArray:
@@ -264,7 +264,7 @@ class Stiffness:
 
 
 def windows(comm: MPI.Comm, places: FloatArray) -> IndexArray:
-    """The number of the square, or cube, around each dof with a bound, shape (n,); collective.
+    """Number the square, or cube, around each dof with a bound, shape (n,); collective.
 
     Args:
         comm: The ranks that have such dofs.
@@ -279,7 +279,7 @@ def windows(comm: MPI.Comm, places: FloatArray) -> IndexArray:
 
 
 def _spread(values: FloatArray) -> FloatArray:
-    """The largest of each square's, or cube's, value and those around it, as `windows` counts."""
+    """Find the largest value of each square, or cube, and those around it, see `windows`."""
     for stride in WINDOWS ** np.arange(3):
         rows = values.reshape(-1, WINDOWS, stride)
         values = rows.copy()
@@ -289,7 +289,7 @@ def _spread(values: FloatArray) -> FloatArray:
 
 
 def _differences(A: PETSc.Mat) -> tuple[PETSc.Mat, FloatArray]:
-    """The matrix whose rows take differences x_j − x_i, j > i with a_ij ≠ 0, and the a_ij.
+    """Make the matrix whose rows take differences x_j − x_i, j > i with a_ij ≠ 0, and the a_ij.
 
     D the first and w the second, A = −Dᵀ diag(w) D but for row sums.
     """

@@ -204,7 +204,7 @@ class System:
         self.obstacles_at_vertices: FloatArray = like.obstacles_at_vertices
 
     def _lifting(self) -> FloatArray:
-        """What u_D and the offset add to b, ghosts up to date, shape (dofs,); collective."""
+        """Sum what u_D and the offset add to b, ghosts up to date, shape (dofs,); collective."""
         found: FloatArray = np.zeros(len(self.u_D.x.array))
         if self.offset and (of_constants := self._data.of_constants()) is not None:
             found -= self.offset * of_constants
@@ -227,12 +227,12 @@ class System:
         return facet_measures(self.u_D.function_space.mesh, self.bounded_facets)
 
     def facets_by_dof(self) -> IndexArray:
-        """The place in `bounded_facets` of each dof's own facet, shape (n,); CR only."""
+        """Find the place in `bounded_facets` of each dof's own facet, shape (n,); CR only."""
         return np.argsort(self.contact_dofs[:, 0])
 
     @cached_property
     def windows(self) -> IndexArray:
-        """Where on Γ1 the dofs with a bound are, see `stopping.windows`; collective at first."""
+        """The places of the bounded dofs on Γ1, from `stopping.windows`; collective at first."""
         if self._like is not None:
             return self._like.windows
         V, (vertices, _) = self.u_D.function_space, self.measured
@@ -253,7 +253,7 @@ class System:
         return self._trivial()
 
     def _trivial(self) -> list[FloatArray]:
-        """A times the most trivial start, and A times that without its constant; collective."""
+        """Multiply A by the most trivial start, and by that without its constant; collective."""
         bounded = (self.lower > PETSc.NINFINITY) | (self.upper < PETSc.INFINITY)
         products, start = [], self.A.createVecRight()
         product, owned = self.A.createVecLeft(), self.A.getLocalSize()[0]
@@ -269,7 +269,7 @@ class System:
         return products
 
     def _middle(self) -> float:
-        """The number that u_D is around; collective."""
+        """Compute the number that u_D is around; collective."""
         values = self.u_D.x.array[self.dirichlet]
         bottom, top = _range(self.u_D.function_space.mesh.comm, values)
         return 0.5 * (bottom + top) if bottom <= top else 0.0
@@ -319,7 +319,7 @@ class System:
         return np.flatnonzero(layout.shared_sum(of_constants) > 0.0).astype(np.int32)
 
     def _bc(self, values: fem.Function) -> fem.DirichletBC:
-        """Values on Γ0, where all unknowns of a node are set."""
+        """Impose values on Γ0, where all unknowns of a node are set."""
         block = values.function_space.dofmap.index_map_bs
         return fem.dirichletbc(values, np.unique(self.dirichlet // block))
 
@@ -355,7 +355,7 @@ class System:
         return sums.x.array[: self.A.getLocalSize()[0]].copy()
 
     def masses(self) -> FloatArray | None:
-        """What c and b have in a row of A and in those of its neighbours, shape (dofs,).
+        """Compute what c and b have in a row of A and in its neighbours', shape (dofs,).
 
         An entry of A that is next to nothing may be what rounding has left of these.
 
@@ -417,7 +417,7 @@ class System:
         return of_load, drawn(least + abs(self.offset))
 
     def start(self) -> fem.Function:
-        """The function that is u_D on Γ0 and 0 elsewhere, but for the offset; collective.
+        """Make the function that is u_D on Γ0 and 0 elsewhere, but for the offset; collective.
 
         Where the most trivial one is the solution, as there is no load at all, it is that.
         """
@@ -452,13 +452,13 @@ def _sum_of_sizes(values: FloatArray) -> float:
 
 
 def _range(comm: MPI.Comm, values: FloatArray) -> tuple[float, float]:
-    """The least and the largest of all ranks' values; ∞ and −∞ where there are none."""
+    """Find the least and the largest of all ranks' values; ∞ and −∞ where there are none."""
     bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
     return bottom, comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
 
 
 def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
-    """The matrix of a_h, with the identity's rows and columns on Γ0; collective."""
+    """Assemble the matrix of a_h, with the identity's rows and columns on Γ0; collective."""
     with defaults(MATRICES, prefix=""):
         A = (
             assemble_matrix(empty_matrix(layout), a, [bc])
@@ -479,7 +479,7 @@ def _require_positive(comm: MPI.Comm, diagonal: FloatArray) -> None:
 
 
 def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:
-    """Data on the boundary as the element takes them: CR facet means, P1 values at vertices.
+    """Take data on the boundary as the element does: CR facet means, P1 values at vertices.
 
     Returns:
         Which dofs have some, and a Function with the values there.
