@@ -50,7 +50,7 @@ def _page() -> type[Figure]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches that knows how to become a PNG."""
+    """Make an empty figure of so many inches that knows how to become a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure = _page()(figsize=(width, height), dpi=150, layout="constrained")
@@ -59,7 +59,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def as_png(figure: Figure | SubFigure) -> bytes:
-    """The bytes of a PNG."""
+    """Return the bytes of a PNG."""
     file = io.BytesIO()
     # whatever the layout has left no room for, a title of several lines for one, is on it
     figure.canvas.print_figure(file, format="png", bbox_inches="tight", pad_inches=0.1)
@@ -77,7 +77,7 @@ def label_bar(bar: Colorbar, units: Units) -> None:
 def plane_axes(
     points: FloatArray, room: float = 0.0, ax: Axes | None = None, units: Units = PLAIN
 ) -> tuple[Figure | SubFigure, Axes, float]:
-    """Axes of equal scale for what lies in the box of `points`.
+    """Make axes of equal scale for what lies in the box of `points`.
 
     Only a very slender domain is stretched, and its axis says so.
 
@@ -172,7 +172,7 @@ def legend(
 
 
 def headline(title: str, what: str) -> str:
-    """The problem's name, dollar signs and all, and what is seen of it."""
+    """Return the problem's name, dollar signs and all, and what is seen of it."""
     if not title:
         return what
     name = textwrap.fill(title, LONGEST).replace("$", r"\$")
@@ -207,7 +207,7 @@ def label_ends(
 
 
 def apart(wanted: Sequence[float] | FloatArray, heights: Sequence[float]) -> list[float]:
-    """Middles of things in a column that do not overlap, as near as can be to where they belong.
+    """Place things in a column so that none overlap, as near as can be to where they belong.
 
     Args:
         wanted: Where their middles belong, ascending.
@@ -231,7 +231,7 @@ def apart(wanted: Sequence[float] | FloatArray, heights: Sequence[float]) -> lis
 
 
 def log_ticks(axis: XAxis | YAxis) -> None:
-    """Decades with what is between; where there are few of them, 1, 2 and 5 of each."""
+    """Mark decades with what is between; where there are few of them, 1, 2 and 5 of each."""
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
     low, high = axis.get_view_interval()
@@ -248,7 +248,7 @@ def log_ticks(axis: XAxis | YAxis) -> None:
 
 
 def chains(segments: FloatArray) -> list[FloatArray]:
-    """Straight lines put together where two of them meet, so that they are drawn as one.
+    """Join straight lines where two of them meet, so that they are drawn as one.
 
     Args:
         segments: Their ends, shape (n, 2, 2).
@@ -281,7 +281,7 @@ def chains(segments: FloatArray) -> list[FloatArray]:
 
 
 def grouped(number: float) -> str:
-    """A number with its digits in groups of three."""
+    """Format a number with its digits in groups of three."""
     return f"{number:,}".replace(",", "\u2009")
 
 

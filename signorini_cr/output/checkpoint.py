@@ -79,7 +79,7 @@ def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, Any] | None:
-    """What `write_arrays` has written, None if there is no such file; called on one rank.
+    """Read what `write_arrays` has written, None if there is no such file; called on one rank.
 
     Raises:
         InputError: It can't be read, or is not as it was written.
@@ -100,12 +100,12 @@ def read_arrays(path: Path) -> dict[str, Any] | None:
 
 
 def _letters(value: Any) -> npt.NDArray[np.uint8]:
-    """What JSON knows, as an array."""
+    """Encode what JSON knows in an array."""
     return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
 
 
 def _sum(arrays: dict[str, Any]) -> npt.NDArray[np.uint8]:
-    """What tells that an archive is whole and nobody has changed it, as good as sure."""
+    """Compute what tells that an archive is whole and nobody has changed it, as good as sure."""
     found = hashlib.blake2b(digest_size=16)
     for name, array in sorted(arrays.items()):
         found.update(f"{name} {array.dtype.str} {array.shape} ".encode())

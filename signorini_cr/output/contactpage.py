@@ -84,7 +84,7 @@ def contact_page(
 
 
 def _names(table: Table) -> dict[str, str]:
-    """What the bounds are called that there are, by their columns."""
+    """Name the bounds that there are, by their columns."""
     there = [
         name for name in ("obstacle", "upper") if name in table and np.isfinite(table[name]).any()
     ]
@@ -119,7 +119,7 @@ def _name_curves(axes: Axes, entries: dict[str, Any]) -> None:
 
 
 def _page(width: float, height: float, ax: Axes | None) -> Figure | SubFigure:
-    """A new figure, or what takes the place of the axes."""
+    """Make a new figure, or take what holds the axes."""
     if ax is None:
         return new_figure(width, height)
     place = ax.get_subplotspec()
@@ -131,7 +131,7 @@ def _page(width: float, height: float, ax: Axes | None) -> Figure | SubFigure:
 
 
 def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
-    """The rows of the longest parts in the order along the boundary, and their lengths."""
+    """Take the rows of the longest parts in order along the boundary, and their lengths."""
     lengths = np.bincount(table["part"], weights=table["length"]).astype(np.float64)
     longest = np.sort(np.argsort(-lengths, kind="stable")[:MOST_PARTS])
     rows = [{name: column[table["part"] == part] for name, column in table.items()}
@@ -140,7 +140,7 @@ def _parts(table: Table) -> tuple[list[dict[str, npt.NDArray]], FloatArray]:
 
 
 def _backwards(rows: Table) -> bool:
-    """Whether the boundary, Ω to its left, runs leftwards or downwards in a part that is open."""
+    """Tell whether the boundary, Ω to its left, runs leftwards or downwards in an open part."""
     dx, dy = rows["x"][-1] - rows["x"][0], rows["y"][-1] - rows["y"][0]
     closed = np.hypot(dx, dy) < 1.5 * rows["length"].max() and len(rows["x"]) > 2
     return not closed and bool((dx if abs(dx) >= abs(dy) else dy) < 0)
@@ -198,7 +198,7 @@ def _contact_part(
 
 
 def _moved(places: FloatArray, points: FloatArray, facet: float) -> FloatArray:
-    """Ends of active facets moved to where contact ends, inside the next one."""
+    """Move the ends of active facets to where contact ends, inside the next one."""
     if not len(points) or not len(places):
         return places
     nearest = points[np.argmin(np.abs(places[:, None] - points), axis=1)]
@@ -206,7 +206,7 @@ def _moved(places: FloatArray, points: FloatArray, facet: float) -> FloatArray:
 
 
 def _enlarge(panels: Sequence[Axes], values: npt.NDArray, size: float) -> None:
-    """Where there is nothing but differences below 1e-6 of `size`, say so, and the value."""
+    """Say so where all differences are below 1e-6 of `size`, and the value."""
     values = values[np.isfinite(values)]
     value = float(values[0])
     if np.ptp(values) >= 1e-6 * size:
@@ -218,5 +218,5 @@ def _enlarge(panels: Sequence[Axes], values: npt.NDArray, size: float) -> None:
 
 
 def _upright(x: FloatArray, heights: Sequence[float]) -> FloatArray:
-    """Points at abscissas of shape (n, k), row by row at the same k heights, shape (n, k, 2)."""
+    """Make points at abscissas of shape (n, k), row by row at k heights, shape (n, k, 2)."""
     return np.stack([x, np.broadcast_to(heights, x.shape)], axis=2)

@@ -164,6 +164,6 @@ def write_text(path: Path, make: Callable[[], str]) -> None:
 
 
 def _nearest(path: Path) -> Path:
-    """The path itself if it is there, or else the nearest of the folders it would be made in."""
+    """Return the path itself if it is there, or else the nearest folder it would be made in."""
     # a link that leads nowhere is there, too
     return next(place for place in (path, *path.absolute().parents) if os.path.lexists(place))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def as_html(solution: Solution) -> str:
-    """A table and, below it, the picture of u_h; not collective.
+    """Write a table and, below it, the picture of u_h; not collective.
 
     Nothing is solved or certified for it: of the certificate there is what has been made. There is
     no picture where there are several ranks, which would have to draw it together, nor of

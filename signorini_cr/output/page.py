@@ -47,7 +47,7 @@ def run_page(
     words: Sequence[str],
     problem: Mapping[str, str],
 ) -> str:
-    """The HTML of a run; of the pictures there are those that lie in the folder.
+    """Write the HTML of a run; of the pictures there are those that lie in the folder.
 
     Args:
         folder: With the run's results.
@@ -125,7 +125,7 @@ def _levels(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
 
 
 def _search(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The meshes that were tried."""
+    """List the meshes that were tried."""
     if not records:
         return []
     words = "Meshes on which all steps were solved, to find the last: bound is the largest of all."
@@ -153,7 +153,7 @@ def _list(items: Sequence[str]) -> str:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
-    """The first row is the head; what is too wide can be moved sideways."""
+    """Make a table whose first row is the head; what is too wide can be moved sideways."""
     lines = "".join(
         "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
         for kind, row in zip(["th", *["td"] * (len(rows) - 1)], rows, strict=True)

@@ -87,7 +87,7 @@ MOST_EDGES = 40_000
 
 
 def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]]:
-    """How the parts of the boundary are drawn, and what holds there, as far as it is known."""
+    """Choose how the parts of the boundary are drawn, and say what holds there if it is known."""
     kinds = {}
     for key, condition in getattr(problem, "conditions", {}).items():
         kind = type(condition).__name__
@@ -102,7 +102,7 @@ def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]
 
 
 def can_draw(comm: MPI.Comm) -> bool:
-    """Whether rank 0 has Matplotlib; collective."""
+    """Tell whether rank 0 has Matplotlib; collective."""
     return on_root(comm, lambda: find_spec("matplotlib") is not None)
 
 
@@ -260,7 +260,7 @@ def plot_contact(
 
 
 def convergence_series(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The keys of the records that `plot_convergence` has something to draw of."""
+    """Return the keys of the records that `plot_convergence` has something to draw of."""
     return [key for key in SERIES if sum(bool(record[key]) for record in records) > 1]
 
 
@@ -341,14 +341,14 @@ def plot_convergence(
 
 
 def _power(x: FloatArray, values: FloatArray, rate: float | None, uniform: bool) -> str:
-    """The power of h or N with which the last two values fall."""
+    """Say with which power of h or N the last two values fall."""
     if rate is None:
         rate = float(np.log(values[-1] / values[-2]) / np.log(x[-1] / x[-2]))
     return f"${'h' if uniform else 'N'}^{{{rate:.2f}}}$"
 
 
 def _message(falls: Mapping[str, str]) -> str:
-    """What a picture of convergence shows."""
+    """Say what a picture of convergence shows."""
     if "error_h1" in falls:
         follows = falls.get("bound_h1") is not None
         return f"the error falls like {falls['error_h1']}{', the bound with it' * follows}"
@@ -370,13 +370,13 @@ def _plane(domain: Domain) -> Mesh:
 
 
 def _gather(comm: MPI.Comm, array: FloatArray) -> FloatArray:
-    """The rows of all ranks on rank 0, none elsewhere."""
+    """Gather the rows of all ranks on rank 0, none elsewhere."""
     pieces = comm.gather(array, root=0)
     return array[:0] if pieces is None else np.concatenate(pieces)
 
 
 def _edges(mesh: Mesh) -> FloatArray:
-    """Ends of all edges, on rank 0, shape (n, 2, 2); none if there are too many to draw."""
+    """Gather ends of all edges on rank 0, shape (n, 2, 2); none if there are too many to draw."""
     mesh.topology.create_entities(1)
     mesh.topology.create_connectivity(1, 2)
     mesh.topology.create_connectivity(2, 1)
@@ -389,7 +389,7 @@ def _edges(mesh: Mesh) -> FloatArray:
 
 
 def _triangles(domain: Domain, material: str) -> FloatArray:
-    """Corners of a material's cells, on rank 0, shape (n, 3, 2); none where edges aren't drawn."""
+    """Gather corners of a material's cells on rank 0, shape (n, 3, 2); none without edges drawn."""
     mesh = domain.mesh
     number = mesh.topology.index_map(2).size_local
     few = mesh.topology.index_map(1).size_global <= MOST_EDGES
@@ -398,7 +398,7 @@ def _triangles(domain: Domain, material: str) -> FloatArray:
 
 
 def _smooth(solution: Solution, limits: tuple[float, float]) -> tuple[fem.Function, list[float]]:
-    """The function to draw contour lines of, and the values that it has on whole parts; collective.
+    """Make the function to draw contours of, and find its values on whole parts; collective.
 
     Means at vertices only nearly have the value that u_h has at all midpoints of a part, and its
     contour line would follow the part in shreds. There they get the value itself.
@@ -422,7 +422,7 @@ def _smooth(solution: Solution, limits: tuple[float, float]) -> tuple[fem.Functi
 def _beside(
     heights: FloatArray, values: Sequence[float], limits: tuple[float, float]
 ) -> FloatArray:
-    """Heights of contour lines, off those of whole parts by nothing that shows.
+    """Move heights of contour lines off those of whole parts by nothing that shows.
 
     A line then stays away from the part where all is on the other side, as most is.
     """
@@ -435,6 +435,6 @@ def _beside(
 
 
 def _segments(domain: Domain, part: int) -> FloatArray:
-    """Ends of the facets of a boundary part, on rank 0, shape (n, 2, 2)."""
+    """Gather ends of the facets of a boundary part on rank 0, shape (n, 2, 2)."""
     ends, _ = facet_measures(domain.mesh, domain.facets(part))
     return _gather(domain.mesh.comm, ends[..., :2])

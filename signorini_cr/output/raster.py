@@ -57,7 +57,7 @@ def raster(
 
 
 def averaged(u: fem.Function) -> fem.Function:
-    """The continuous P1 function of the means at the vertices; collective.
+    """Make the continuous P1 function of the means at the vertices; collective.
 
     Contour lines of u itself would be torn at every edge.
 
@@ -112,6 +112,6 @@ def _paint(image: FloatArray, x: FloatArray, y: FloatArray, values: FloatArray) 
 
 
 def _between(x: FloatArray) -> tuple[Int64Array, Int64Array]:
-    """The first whole number between the least and the greatest of each column, and how many."""
+    """Find the first whole number between the least and greatest of each column, and how many."""
     first = np.ceil(x.min(axis=0) - 1e-9).astype(int)
     return first, np.maximum(np.floor(x.max(axis=0) + 1e-9).astype(int) - first + 1, 0)

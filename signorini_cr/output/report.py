@@ -75,7 +75,7 @@ def level_record(
     previous: Mapping[str, Any] | None = None,
     quantities: Mapping[str, Quantity] = MappingProxyType({}),
 ) -> Record:
-    """The numbers of one level, as they stand in report.json.
+    """Collect the numbers of one level, as they stand in report.json.
 
     Args:
         solution: What was found on this mesh.
@@ -135,7 +135,7 @@ def level_record(
 
 
 def bounded(solution: Solution, quantities: Mapping[str, Quantity]) -> dict[str, Record]:
-    """What is wanted of a solution, as it stands in report.json; collective."""
+    """Bound what is wanted of a solution, as it stands in report.json; collective."""
     return {
         name: {"kind": what.kind, "weighted": what.weight is not None, **_bounded(solution, what)}
         for name, what in quantities.items()
@@ -143,7 +143,7 @@ def bounded(solution: Solution, quantities: Mapping[str, Quantity]) -> dict[str,
 
 
 def _bounded(solution: Solution, what: Quantity | None) -> Record:
-    """A quantity, None for the contact force, or nothing, and why; collective."""
+    """Bound a quantity, None for the contact force, or say why not; collective."""
     try:
         if what is not None:
             return {**what.of(solution)._asdict(), "reason": None}
@@ -163,7 +163,7 @@ def make_report(
     complete: bool = True,
     units: Units = PLAIN,
 ) -> Record:
-    """The whole of report.json from the records of its levels.
+    """Make the whole of report.json from the records of its levels.
 
     Args:
         title: The problem's.
@@ -193,7 +193,7 @@ def make_report(
 
 
 def plain(value: Any) -> Any:
-    """`value` with nothing in it that JSON does not know (NumPy, NaN, infinities)."""
+    """Return `value` with nothing in it that JSON does not know (NumPy, NaN, infinities)."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -298,7 +298,7 @@ def write_output(
 
 
 def _clear_mesh(solution: Solution, path: Path, title: str) -> tuple[Domain, Path, str]:
-    """The finest mesh whose cells can be told apart in a picture, and a title that says which."""
+    """Find the finest mesh whose cells can be told apart in a picture, and a title that says so."""
     domains = [mesh.domain for mesh in solution.level.meshes]
     sizes = [domain.mesh.topology.index_map(2).size_global for domain in domains]
     level = max((i for i, size in enumerate(sizes) if size <= MOST_CELLS), default=0)
@@ -308,7 +308,7 @@ def _clear_mesh(solution: Solution, path: Path, title: str) -> tuple[Domain, Pat
 
 
 def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
-    """The report, which vouches for what lies beside it, and the tables; collective."""
+    """Prepare the report, which vouches for what lies beside it, and the tables; collective."""
     comm, records = solution.domain.mesh.comm, report["levels"]
     table = solution.contact.table()
 
@@ -324,14 +324,14 @@ def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
 
 
 def report_json(report: Mapping[str, Any]) -> str:
-    """The text of report.json."""
+    """Return the text of report.json."""
     return json.dumps(plain(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _rate(
     key: str, value: float | None, solution: Solution, previous: Mapping[str, Any] | None
 ) -> float | None:
-    """log(e/e') / log(h/h'), None where there are no two errors to compare.
+    """Compute log(e/e') / log(h/h'), None where there are no two errors to compare.
 
     On meshes that are not refined everywhere h, the largest diameter, says nothing; N^(−1/d) with
     the number N of dofs takes its place.
@@ -349,7 +349,7 @@ def _rate(
 
 @functools.cache  # looking takes longer than writing the report of a level
 def _version(package: str) -> str | None:
-    """The installed version, None if it can't be told."""
+    """Find the installed version, None if it can't be told."""
     module = sys.modules.get(package)
     if (version := getattr(module, "__version__", None)) is not None:
         return str(version)

@@ -58,7 +58,7 @@ def step_record(
     solution: Solution,
     quantities: Mapping[str, Quantity] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """The numbers of a step, as they stand in report.json; collective.
+    """Collect the numbers of a step, as they stand in report.json; collective.
 
     Args:
         step: Its number, from 1.
@@ -89,18 +89,18 @@ def step_record(
 
 
 def header() -> str:
-    """The head of the printed table."""
+    """Return the head of the printed table."""
     return " ".join(f"{name:>{width}}" for name, width, _ in COLUMNS)
 
 
 def row(record: Mapping[str, Any], first: Mapping[str, Any]) -> str:
-    """A row of the printed table, whose times have the digits of the first step's."""
+    """Return a row of the printed table, whose times have the digits of the first step's."""
     told = _told(record, first)
     return " ".join(f"{cell(told):>{width}}" for _, width, cell in COLUMNS)
 
 
 def _told(record: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]:
-    """A record, and its time in digits that suit the whole table."""
+    """Return a record, and its time in digits that suit the whole table."""
     usual = f"{first['time']:.5g}"
     _, _, decimals = usual.partition(".")
     told = f"{record['time']:.{len(decimals)}f}"
@@ -110,22 +110,22 @@ def _told(record: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]
 
 
 def search_header() -> str:
-    """The head of what is told of meshes that are tried."""
+    """Return the head of what is told of meshes that are tried."""
     return " ".join(f"{name:>{width}}" for name, width, _ in SEARCH)
 
 
 def search_row(record: Mapping[str, Any]) -> str:
-    """What is told of a mesh that was tried; the record is from `search_record`."""
+    """Say what is known of a mesh that was tried; the record is from `search_record`."""
     return " ".join(f"{cell(record):>{width}}" for _, width, cell in SEARCH)
 
 
 def search_rows(records: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """The cells of these rows, their head first."""
+    """Return the cells of these rows, their head first."""
     return rows_of(SEARCH, records, {}, PLAIN)
 
 
 def search_record(last: Solution, bound: float) -> dict[str, Any]:
-    """What is known of a mesh on which all steps were solved; collective.
+    """Collect what is known of a mesh on which all steps were solved; collective.
 
     Args:
         last: Of the last step.
@@ -137,17 +137,17 @@ def search_record(last: Solution, bound: float) -> dict[str, Any]:
 
 
 def table_rows(records: Sequence[Mapping[str, Any]], units: Units) -> list[list[str]]:
-    """The cells of the printed table, its head first, which has the units."""
+    """Return the cells of the printed table, its head first, which has the units."""
     return rows_of(COLUMNS, [_told(record, records[0]) for record in records], MEASURED, units)
 
 
 def legend(units: Units) -> str:
-    """What the printed columns mean, and what they are measured in, as far as that is told."""
+    """Say what the printed columns mean, and what they are measured in, as far as that is told."""
     return explained({name: OF_STEPS[name][0] for name, *_ in COLUMNS}, MEASURED, units)
 
 
 def certified(records: Sequence[Mapping[str, Any]]) -> str:
-    """What is certain about the steps."""
+    """Say what is certain about the steps."""
     bounds = [record["bound_h1"] for record in records if record["bound_h1"] is not None]
     if len(bounds) < len(records):
         missing = len(records) - len(bounds)
@@ -160,7 +160,7 @@ def certified(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
-    """What is certain about each quantity in all steps, a sentence each."""
+    """Say what is certain about each quantity in all steps, a sentence each."""
     said = []
     for name, last in records[-1]["quantities"].items():
         found = [record["quantities"][name] for record in records]
@@ -178,7 +178,7 @@ def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:
-    """How long the steps have taken."""
+    """Say how long the steps have taken."""
     total = sum(record["seconds"] for record in records)
     whole, each = (known(seconds, None, 2) for seconds in (total, total / len(records)))
     return f"{whole}{GLUE}s for {counted(len(records), 'step')}, {each}{GLUE}s a step"
@@ -238,7 +238,7 @@ def write_search(
 
 
 def _of_former_runs(folder: str | os.PathLike[str], comm: MPI.Comm) -> set[str]:
-    """Names of what runs leave, in time or not; collective."""
+    """Find the names of what runs leave, in time or not; collective."""
     found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
     return {*FILES, *found}
 
@@ -289,7 +289,7 @@ def write_steps(
 
 
 def read_moments(folder: str | os.PathLike[str], comm: MPI.Comm) -> list[Moment]:
-    """The moments of a run that is resumed; collective.
+    """Read the moments of a run that is resumed; collective.
 
     Raises:
         InputError: They can't be read.
@@ -303,7 +303,7 @@ def _field(step: int) -> str:
 
 
 def _series(records: Sequence[Mapping[str, Any]]) -> str:
-    """ParaView's list of files with their times."""
+    """Return ParaView's list of files with their times."""
     sets = "".join(
         f'<DataSet timestep="{record["time"]!r}" file="{_field(record["step"])}"/>\n'
         for record in records

@@ -69,13 +69,13 @@ class Moment:
 
 
 def as_arrays(moments: Sequence[Moment]) -> dict[str, Any]:
-    """What `from_arrays` makes moments of again."""
+    """Make arrays of moments, of which `from_arrays` makes moments again."""
     facts = [asdict(each) for each in moments]
     return {f"{name}{k}": np.array(v) for k, each in enumerate(facts) for name, v in each.items()}
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> list[Moment]:
-    """Moments, from what `as_arrays` has made of them."""
+    """Make moments of what `as_arrays` has made of them."""
     names = [each.name for each in fields(Moment)]
     found: list[Moment] = []
     while f"time{len(found)}" in arrays:
@@ -86,7 +86,7 @@ def from_arrays(arrays: Mapping[str, Any]) -> list[Moment]:
 
 
 def chosen(steps: int) -> set[int]:
-    """The steps of so many that a strip shows, evenly apart, first and last among them."""
+    """Choose the steps of so many that a strip shows, evenly apart, first and last among them."""
     return set(np.rint(np.linspace(1, steps, min(MOST, steps))).astype(int).tolist())
 
 

@@ -24,17 +24,17 @@ MEASURED = {"h": "x", "contact": "x"}
 
 
 def table_header(first: Mapping[str, Any]) -> str:
-    """The head of the printed table; `first` is the record that decides on the columns."""
+    """Return the head of the printed table; `first` is the record that decides on the columns."""
     return " ".join(f"{name:>{width}}" for name, width, _ in _columns(first))
 
 
 def legend(first: Mapping[str, Any], units: Units = PLAIN) -> str:
-    """What the printed columns mean, and what they are measured in."""
+    """Say what the printed columns mean, and what they are measured in."""
     return explained({name: PRINTED[name][0] for name, *_ in _columns(first)}, MEASURED, units)
 
 
 def explained(words: Mapping[str, str], measured: Mapping[str, str], units: Units) -> str:
-    """A legend: columns, what they mean, and their units.
+    """Explain columns in a legend: what they mean, and their units.
 
     Args:
         words: What the columns mean, by name; those without words are left out.
@@ -50,7 +50,7 @@ def explained(words: Mapping[str, str], measured: Mapping[str, str], units: Unit
 
 
 def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
-    """What happens on Γ1, in a sentence, with the digits that are known.
+    """Say what happens on Γ1, in a sentence, with the digits that are known.
 
     A place on Γ1 is known to within a facet, the force as well as it is certain.
 
@@ -77,7 +77,7 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
 
 
 def certified(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:
-    """What is certain about a level, rounded so that it stays certain.
+    """Say what is certain about a level, rounded so that it stays certain.
 
     Args:
         record: The last level's.
@@ -116,7 +116,7 @@ def _is_all_of(force: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
 
 
 def unit_of(found: Mapping[str, Any], units: Units) -> str:
-    """The unit of a quantity, "" where it depends on a weight's or is not told."""
+    """Return the unit of a quantity, "" where it depends on a weight's or is not told."""
     if found.get("kind") == "mean":
         return units.after("u")
     told = found.get("kind") != "integral" and not found.get("weighted")
@@ -124,7 +124,7 @@ def unit_of(found: Mapping[str, Any], units: Units) -> str:
 
 
 def _interval(lower: float, upper: float, measured: str = "") -> str:
-    """An interval that holds [lower, upper], its unit, and its width in parts of the middle."""
+    """Format an interval that holds [lower, upper], its unit, its width in parts of the middle."""
     width, middle = upper - lower, 0.5 * abs(lower + upper)
     apart = 0.0 < width < 2.0 * middle  # from 0
     # rounded up, but not for what is rounding itself: 1.1 − 0.9 is 20 % of 1
@@ -134,7 +134,7 @@ def _interval(lower: float, upper: float, measured: str = "") -> str:
 
 
 def times(records: Sequence[Mapping[str, Any]]) -> str:
-    """How long the levels have taken, and what with."""
+    """Say how long the levels have taken, and what with."""
     names = {"mesh": "meshes", "assemble": "assembly", "solve": "solver", "estimate": "certificate"}
     each = {
         words: sum(record["seconds"].get(phase) or 0.0 for record in records)
@@ -153,12 +153,12 @@ def _time(seconds: float) -> str:
 
 
 def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None) -> str:
-    """The row of `record` in the printed table (80 columns at most below 10⁷ cells)."""
+    """Return the row of `record` in the printed table (80 columns at most below 10⁷ cells)."""
     return " ".join(f"{cell(record):>{width}}" for _, width, cell in _columns(first or record))
 
 
 def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> str:
-    """The printed table in Markdown, units in its head."""
+    """Return the printed table in Markdown, units in its head."""
     columns = _columns(records[0]) if records else []
     head, *rows = rows_of(columns, records, MEASURED, units)
     rows = [head, [(w - 1) * "-" + ":" for _, w, _ in columns], *rows]
@@ -170,7 +170,7 @@ def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -
 
 
 def table_rows(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> list[list[str]]:
-    """The cells of the printed table, its head first, which has the units."""
+    """Return the cells of the printed table, its head first, which has the units."""
     return rows_of(_columns(records[0]), records, MEASURED, units)
 
 
@@ -180,7 +180,7 @@ def rows_of(
     measured: Mapping[str, str],
     units: Units,
 ) -> list[list[str]]:
-    """The cells of a table, its head first.
+    """Return the cells of a table, its head first.
 
     Args:
         columns: Name, width and contents of each.
@@ -194,7 +194,7 @@ def rows_of(
 
 
 def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
-    """One line a level, all of the record: `kkt_min_gap` is `min_gap` in `kkt`, and so on.
+    """Write one line a level, all of the record: `kkt_min_gap` is `min_gap` in `kkt`, and so on.
 
     What is null is left empty; the transition points read `x y; x y`.
     """
@@ -213,7 +213,7 @@ def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def contact_csv(table: Mapping[str, npt.NDArray]) -> str:
-    """One line a contact facet, in order along the boundary; `active` is 0 or 1.
+    """Write one line a contact facet, in order along the boundary; `active` is 0 or 1.
 
     Args:
         table: From `Contact.table`.
@@ -231,7 +231,7 @@ def _csv(names: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
 
 
 def _columns(first: Mapping[str, Any]) -> list[Column]:
-    """Name, width and contents of the printed columns, for records like `first`."""
+    """Return name, width and contents of the printed columns, for records like `first`."""
     bound, exact = first["bound_h1"] is not None, first["error_h1"] is not None
     columns: list[Column] = [
         ("level", 5, lambda r: str(r["level"])),
@@ -264,7 +264,7 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
 
 
 def _energy(record: Mapping[str, Any]) -> str:
-    """J(u_h) with the digits that J(u) has for certain."""
+    """Format J(u_h) with the digits that J(u) has for certain."""
     if record["energy"] is None:
         return "-"
     low, high = (record["energy_bounds"][end] for end in ("lower", "upper"))
@@ -272,7 +272,7 @@ def _energy(record: Mapping[str, Any]) -> str:
 
 
 def _short(value: float | None) -> str:
-    """Three digits in at most seven characters (below 1e10)."""
+    """Format a number in three digits and at most seven characters (below 1e10)."""
     if value is None:
         return "-"
     if value == 0 or 1e-3 <= abs(value) < 1e4:
@@ -282,7 +282,7 @@ def _short(value: float | None) -> str:
 
 
 def _fixed(value: float | None) -> str:
-    """Three digits in at most four characters, where they are between -9.9 and 999."""
+    """Format a number in three digits, in at most four characters between -9.9 and 999."""
     if value is None:
         return "-"
     digits = 2 if 0 <= value < 9.995 else 1 if value < 99.95 else 0

@@ -9,7 +9,7 @@ from ..vi.contact import Contact
 
 
 def contact_lines(contact: Contact) -> tuple[FloatArray, FloatArray]:
-    """The parts of a plane Γ1 in contact, and those that are not; collective.
+    """Find the parts of a plane Γ1 in contact, and those that are not; collective.
 
     Where contact ends inside a facet, so does the line.
 
@@ -37,7 +37,7 @@ def contact_lines(contact: Contact) -> tuple[FloatArray, FloatArray]:
 
 
 def in_words(contact: Contact) -> str:
-    """How much of Γ1 is in contact, for a title; collective."""
+    """Say how much of Γ1 is in contact, for a title; collective."""
     whole = contact.comm.allreduce(float(contact.measure.sum()))
     if contact.number_active in (0, contact.number):
         return "no contact" if contact.number_active == 0 else r"all of $\Gamma_1$ in contact"

@@ -32,11 +32,11 @@ class Units:
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> Units:
-        """Those of a report, from `record`."""
+        """Take the units and names of a report, from `record`."""
         return cls(**report.get("units", {}), names=report.get("names", {}))
 
     def record(self) -> dict[str, dict[str, str]]:
-        """Everything that is told, as it stands in report.json; empty if there is nothing."""
+        """Return all that is told, as it stands in report.json; empty if there is nothing."""
         units = {
             each.name: getattr(self, each.name)
             for each in fields(self)
@@ -46,16 +46,16 @@ class Units:
         return {key: words for key, words in told.items() if words}
 
     def after(self, key: str) -> str:
-        """The unit as it follows a number, with a space before it at which no line breaks."""
+        """Return the unit as it follows a number, after a space at which no line breaks."""
         unit = getattr(self, key)
         return f"{GLUE}{unit}" if unit else ""
 
     def within(self, key: str) -> str:
-        """The unit as it follows a name in a picture, " in m" for one."""
+        """Return the unit as it follows a name in a picture, " in m" for one."""
         return " in" + self.after(key).replace("$", r"\$") if self.after(key) else ""
 
     def name(self, key: str, usual: str = "") -> str:
-        """The name as it precedes a symbol in a picture, with a space behind it."""
+        """Return the name as it precedes a symbol in a picture, with a space behind it."""
         name = self.names.get(key, usual).replace("$", r"\$")
         return f"{name} " if name else ""
 

@@ -86,7 +86,7 @@ def write_solution(solution: Solution, path: str | os.PathLike[str]) -> None:
     ends = facet_corners(mesh)[local]
 
     def at_corners(values: npt.NDArray) -> list[npt.NDArray]:
-        """Of the values at all cells' corners those of own cells, and of the facets."""
+        """Choose among values at all cells' corners those of own cells, and of the facets."""
         return [values[:owned], np.take_along_axis(values[behind], ends, axis=1)]
 
     def flat(values: npt.NDArray) -> npt.NDArray:
@@ -185,7 +185,7 @@ def _write(
 def _encoded(
     comm: MPI.Comm, arrays: list[npt.NDArray]
 ) -> tuple[list[tuple[int, bytes]], list[int]]:
-    """This rank's share of the base64 of arrays, of which each rank has a part; collective.
+    """Encode this rank's share of arrays, of which each rank has a part, in base64; collective.
 
     Three bytes become four letters, so a rank leaves bytes at its beginning that belong to letters
     of the one before, and takes as many from behind.
