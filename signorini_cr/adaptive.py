@@ -95,7 +95,7 @@ class Shares(NamedTuple):
 
     @classmethod
     def of(cls, solution: Solution) -> Shares:
-        """What the certificate says; collective.
+        """Take the shares from what the certificate says; collective.
 
         Raises:
             InputError: There is no bound; the message says why.
@@ -179,7 +179,7 @@ def adapt_to_run(
 def adaptively(
     limits: Limits, *, tolerance: float, levels: int | None, max_dofs: int, fraction: float
 ) -> Callable[[Solution], Refined | None]:
-    """A step for `solve_sequence`, or for `solve_physics`, that refines where the error is.
+    """Make a step for `solve_sequence`, or for `solve_physics`, that refines where the error is.
 
     Args:
         limits: What the levels may take in all.
@@ -200,7 +200,7 @@ def _by_shares(
     fraction: float,
     runs: float = 1.0,
 ) -> Callable[[Solution, Shares], Refined | None]:
-    """The same, from what is said about where the error is; for ``runs`` see `Limits.admit`."""
+    """Make such a step from what is said of where the error is; for ``runs`` see `Limits.admit`."""
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None and levels < 1:
@@ -229,7 +229,7 @@ def _by_shares(
 
 
 def _smallest(domain: Domain, marked: BoolArray) -> float:
-    """Least diameter of the marked cells, in parts of the largest coordinate; collective."""
+    """Find the least diameter of marked cells, in parts of the largest coordinate; collective."""
     mesh = domain.mesh
     h = mesh.h(mesh.topology.dim, np.flatnonzero(marked).astype(np.int32))
     largest = mesh.comm.allreduce(float(np.abs(mesh.geometry.x).max(initial=0.0)), op=MPI.MAX)
@@ -237,7 +237,7 @@ def _smallest(domain: Domain, marked: BoolArray) -> float:
 
 
 def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> BoolArray:
-    """Dörfler's marking: the largest indicators that make up a fraction of their sum; collective.
+    """Mark the largest indicators that make up a fraction of their sum (Dörfler); collective.
 
     The ranks agree on the value that separates them by bisection; cells that share this value as
     far as the solver knows it are all marked, so that meshes don't depend on what it leaves.

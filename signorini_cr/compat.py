@@ -22,13 +22,13 @@ _TAG = 1998
 
 
 def cell_nodes(mesh: Mesh) -> Int32Array:
-    """Rows of `mesh.geometry.x` for every local cell, shape (cells, nodes)."""
+    """Return the rows of `mesh.geometry.x` for every local cell, shape (cells, nodes)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
 
 
 def submesh(mesh: Mesh, dim: int, entities: Int32Array) -> tuple[Mesh, Int32Array]:
-    """The mesh that some entities of a mesh make up; collective.
+    """Make the mesh that some entities of a mesh make up; collective.
 
     Args:
         mesh: The mesh.
@@ -46,7 +46,7 @@ def submesh(mesh: Mesh, dim: int, entities: Int32Array) -> tuple[Mesh, Int32Arra
 
 
 def coordinate_map(mesh: Mesh) -> Any:
-    """The map from the reference cell, as the C++ object."""
+    """Return the map from the reference cell, as the C++ object."""
     geometry = mesh.geometry
     cmap = geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
     return cmap._cpp_object
@@ -55,7 +55,7 @@ def coordinate_map(mesh: Mesh) -> Any:
 def index_map(
     comm: MPI.Comm, owned: int, ghosts: Int64Array, owners: Int32Array
 ) -> cpp.common.IndexMap:
-    """Distribution of entities over the ranks; collective.
+    """Distribute entities over the ranks; collective.
 
     Args:
         comm: The ranks that share the entities.
@@ -77,7 +77,7 @@ def create_topology(
     corners: Int32Array,
     topology: Any = None,
 ) -> Any:
-    """A C++ topology that knows its vertices and cells only.
+    """Make a C++ topology that knows its vertices and cells only.
 
     Args:
         comm: The ranks that share the mesh.
@@ -138,7 +138,7 @@ def set_facets(
 
 
 def with_dofs(V: fem.FunctionSpace, cells: Int32Array, index_map: Any) -> fem.FunctionSpace:
-    """The element of one space at work on the dofs of another, to assemble over cells only.
+    """Put the element of one space to work on the dofs of another, to assemble over cells only.
 
     Which entities the dofs belong to is still what V says.
 
@@ -183,7 +183,7 @@ _functions: WeakKeyDictionary[fem.Expression, list[Any]] = WeakKeyDictionary()
 
 
 def bound(expression: fem.Expression, own: Callable[[Any], Any]) -> fem.Expression:
-    """A compiled expression with other functions in it, of the same element.
+    """Bind a compiled expression to other functions, of the same element.
 
     Args:
         expression: From `compile_expression`.

@@ -28,7 +28,7 @@ class Diffusion(Forms):
 
     @property
     def not_definite(self) -> str | None:
-        """What to say of a form of the user's own that is found not to be positive definite."""
+        """The message for a form of the user's own that is found not to be positive definite."""
         return NOT_DEFINITE if self.problem.form is not None else None
 
     def check(self, domain: Domain) -> None:

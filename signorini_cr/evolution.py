@@ -125,7 +125,7 @@ class Solver:
                 set_by_cells(fine.own(function), values)
 
     def _have_changed(self) -> tuple[bool, bool]:
-        """Whether a_h, and u_D or bounds, would be others by now; collective."""
+        """Tell whether a_h, and u_D or bounds, would be others by now; collective."""
         comm, moments = self._domain.mesh.comm, (self._assembled, self._checked)
         changed = summed(comm, np.array([not moment.lasts for moment in moments], dtype=float))
         return bool(changed[0]), bool(changed[1])
@@ -194,7 +194,7 @@ class Solver:
     def _of_this(
         self, source: fem.Function | None, before: Solution | fem.Function | None
     ) -> tuple[FloatArray | None, Start]:
-        """The source's values, and the start, if they are what this solver can do with; collective.
+        """Return the source's values, and the start, if this solver can do with them; collective.
 
         Raises:
             InputError: They are not, or it is closed.
@@ -212,7 +212,7 @@ class Solver:
         return None if source is None else source.x.array, Start(known=known)
 
     def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
-        """Numbers of materials on owned cells, shape (cells,), or () where all are the same."""
+        """Spread materials' numbers over owned cells, shape (cells,), or () if all are the same."""
         if not own:
             return np.array(usual)
         domain = self._level.domain
@@ -223,7 +223,7 @@ class Solver:
         return found
 
     def projected(self, data: Data) -> fem.Function:
-        """The function of `V` that is nearest to data in L²; collective."""
+        """Find the function of `V` that is nearest to data in L²; collective."""
         forms, on_mesh = self.physics, diffusion(self._level.data)
         rule = Rule(forms.mesh, forms.problem.quadrature_degree)
         found, V = fem.Function(self.V), self.V
@@ -238,7 +238,7 @@ class Solver:
 
 
 def _given(levels: object, domain: Domain) -> tuple[list[Refined], int]:
-    """The meshes above the coarsest that are there, and how many are to be made."""
+    """Return the meshes above the coarsest that are there, and how many are to be made."""
     if isinstance(levels, Integral) and int(levels) >= 1:
         return [], int(levels) - 1
     if not isinstance(levels, Sequence) or not all(isinstance(each, tuple) for each in levels):
@@ -254,7 +254,7 @@ def _given(levels: object, domain: Domain) -> tuple[list[Refined], int]:
 
 
 def _uniform(domain: Domain, number: int) -> Iterator[Refined]:
-    """So many meshes, each with four triangles for one of that below; collective."""
+    """Refine so many times, each cell into four triangles; collective."""
     for _ in range(number):
         refined: Refined = (*refine(domain), None)
         yield refined
@@ -367,7 +367,7 @@ def solve_in_time(
 
 
 def _capacities(problem: Problem, usual: float) -> dict[str, float]:
-    """The capacities of materials that have their own, by name; all of them are above 0."""
+    """Take the capacities of materials that have their own, by name; all of them are above 0."""
     given = {name: each.capacity for name, each in problem.materials.items()}
     own = {name: each for name, each in given.items() if each is not None}
     for name, each in {"": usual, **own}.items():
@@ -378,7 +378,7 @@ def _capacities(problem: Problem, usual: float) -> dict[str, float]:
 
 
 def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:
-    """The reactions of materials that have their own, by name; "" is for all others."""
+    """Take the reactions of materials that have their own, by name; "" is for all others."""
     given = {name: each.reaction for name, each in problem.materials.items()}
     x = ufl.SpatialCoordinate(domain.mesh)
     return {
@@ -391,7 +391,7 @@ def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:
 def _stepping(
     problem: Problem, reactions: Mapping[str, Expr], rates: Mapping[str, float]
 ) -> Problem:
-    """The problem of a step: c + rate in the place of c.
+    """Make the problem of a step: c + rate in the place of c.
 
     Args:
         problem: The data.
@@ -421,7 +421,7 @@ def _gone_on(
 
 
 def _at_first(solver: Solver, initial: Data, time: Clock | None) -> FloatArray:
-    """u_h at the time 0, shape (dofs,); collective."""
+    """Compute u_h at the time 0, shape (dofs,); collective."""
     if time is None:
         return solver.projected(initial).x.array
     now, time.value = float(time.value), 0.0

@@ -35,7 +35,7 @@ __all__ = ["Interval", "flux", "force_bounds"]
 
 
 def force_bounds(solution: Certified) -> tuple[float, float]:
-    """Two numbers with the contact force of u itself between them; collective.
+    """Bound the contact force of u itself by two numbers; collective.
 
     The force is ∫_Γ1 λ, λ = κ∂ₙu + b (u − u_ext) − g, which is κ∂ₙu unless the condition says more.
 

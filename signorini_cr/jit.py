@@ -122,7 +122,7 @@ def _moved(comm: MPI.Comm) -> bool:
 
 
 def _fault(folder: Path) -> str | None:
-    """What keeps us from writing into a folder, in words."""
+    """Say in words what keeps us from writing into a folder."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -134,7 +134,7 @@ def _fault(folder: Path) -> str | None:
 
 
 def _own_folder() -> str:
-    """A temporary folder, gone when the process ends; those of processes that were killed go."""
+    """Make a temporary folder, gone when the process ends; remove those of killed processes."""
     for left in Path(tempfile.gettempdir()).glob(f"{OWN}*"):
         number = left.name.removeprefix(OWN).split("-")[0]
         if number.isdigit() and not Path(f"/proc/{number}").exists():
@@ -166,12 +166,12 @@ def _sum(library: Path) -> str:
 
 
 def _mark(folder: Path, name: str) -> Path:
-    """What FFCx puts beside a form's source file when its library is whole."""
+    """Name what FFCx puts beside a form's source file when its library is whole."""
     return folder / f"{name}.c.cached"
 
 
 def _library(folder: Path, name: str) -> Path | None:
-    """A form's shared library, if it is there."""
+    """Find a form's shared library, if it is there."""
     places = (folder / (name + suffix) for suffix in EXTENSION_SUFFIXES)
     return next((place for place in places if place.exists()), None)
 
@@ -186,7 +186,7 @@ def _write_note(library: Path) -> None:
 
 
 def _ends_early(library: Path) -> bool:
-    """Whether a shared library is shorter than its head says, which ends in a bus error."""
+    """Tell whether a shared library is shorter than its head says, which ends in a bus error."""
     with library.open("rb") as file:
         head = file.read(64)
     if head[:5] != b"\x7fELF\x02":  # another system's, of which nothing is known here

@@ -105,7 +105,7 @@ class Limits:
             raise NotConverged(f"it would take about {self._words(seconds)}")
 
     def _words(self, seconds: float) -> str:
-        """What is asked for, and what there is."""
+        """Say what is asked for, and what there is."""
         assert self._max_time is not None
         left = max(self._max_time - self._passed, 0.0)
         return f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"

@@ -84,7 +84,7 @@ def integral(
 def _bounded(
     solution: Certified, where: str | int | None, weight: Data | None
 ) -> tuple[Pairing, Interval]:
-    """What is known of ψ, and ∫ ψ u between two numbers; collective."""
+    """Bound ∫ ψ u by two numbers, and return what is known of ψ."""
     certificate, level = solution.certificate, solution.level
     forms = diffusion(level.data).forms
     place = _place(forms, level.domain, where)
@@ -119,7 +119,7 @@ def _bounded(
 
 
 def _place(forms: Forms, domain: Domain, where: str | int | None) -> str | None:
-    """A part or a material, None for all of the domain; refuse others, and where u is a datum."""
+    """Name a part or a material, None for all of Ω; refuse others, and where u is a datum."""
     place = None if where is None else named(domain.parts, where)
     materials = list(domain.materials.numbers)
     own = [c.part for c in forms.conditions if c.fixed is None] + materials
@@ -151,7 +151,7 @@ def _insist_on_extent(cells: Cells, where: str | None) -> None:
 
 
 def _dual(forms: Forms, where: str | None, weight: Data, held: Sequence[Condition] = ()) -> Problem:
-    """The linear problem whose solution z has a(z, e) = ∫ ψ e for all e that vanish on Γ0.
+    """Make the linear problem with solution z, a(z, e) = ∫ ψ e for all e that vanish on Γ0.
 
     On Γ1 e is free, and so is z, but for the parts that are held.
     """
@@ -222,7 +222,7 @@ def _simple(made: Made, cells: Cells) -> bool:
 def _corrected(
     made: Made, cells: Cells, bound: float, dual: Certificate
 ) -> list[tuple[float, float]]:
-    """∫ e over the place, and how far it may be from that, for e = u − v − ℓ; or nothing.
+    """Estimate ∫ e over the place, and how far it may be from that, e = u − v − ℓ; or nothing.
 
     It is a(z₀, e) + a(φ, e) + a(z − z₀ − φ, e) with z₀ and φ in P1. z₀ vanishes on Γ1: a(z₀, u) is
     known. φ takes z's companion's values on Γ1, and there is the ball that A e is in.
@@ -264,7 +264,7 @@ def _settled(
     where: str | None,
     weight: Data | None,
 ) -> list[tuple[float, float]]:
-    """The same where contact is everywhere or nowhere on each part, to second order; or nothing.
+    """Estimate ∫ e to second order if contact is everywhere or nowhere on each part; or nothing.
 
     Where there is none, λ is next to nothing, and φ may be whatever z is. Where there is, e is, and
     z is solved for once more, so that it vanishes there.

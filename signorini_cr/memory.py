@@ -56,7 +56,7 @@ def too_little() -> str | None:
 
 
 def most_memory() -> float:
-    """The most memory, in bytes, that this program has held at a time."""
+    """Return the most memory, in bytes, that this program has held at a time."""
     # ru_maxrss counts what the process held before it became this program, as a copy of another
     ours = _status().get("VmHWM")
     return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss if ours is None else ours
@@ -101,7 +101,7 @@ def _status() -> dict[str, float]:
 
 
 def _spare() -> float:
-    """Memory in bytes that is left to the processes of this machine, or of this cgroup."""
+    """Find the memory, in bytes, left to the processes of this machine, or of this cgroup."""
     spare = [math.inf]
     for line in _text(Path("/proc/meminfo")).splitlines():
         if line.startswith("MemAvailable:"):

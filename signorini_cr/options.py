@@ -206,7 +206,7 @@ def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:
 
 
 def read_number(name: str, default: float) -> float:
-    """An option that is a number, 0 or more.
+    """Read an option that is a number, 0 or more.
 
     Raises:
         InputError: It is something else.
@@ -221,7 +221,7 @@ def read_number(name: str, default: float) -> float:
 
 
 def read_word(name: str, allowed: Sequence[str]) -> str:
-    """An option that is one of some words; the first is the default.
+    """Read an option that is one of some words; the first is the default.
 
     Raises:
         InputError: It is something else.
@@ -311,5 +311,5 @@ def defaults(options: Mapping[str, object], prefix: str = PREFIX) -> Iterator[No
 
 
 def _words(error: BaseException) -> str:
-    """The last line of an error of PETSc, which says what went wrong; those before say where."""
+    """Return the last line of a PETSc error, which says what went wrong; those before say where."""
     return str(error).splitlines()[-1].split("] ", 1)[-1]

@@ -9,7 +9,7 @@ from .errors import InputError
 
 
 def read_regular(path: Path, most: int) -> bytes:
-    """What a file holds that has an end; not a pipe, a terminal or /dev/zero.
+    """Read what a file holds that has an end; not a pipe, a terminal or /dev/zero.
 
     Args:
         path: The file.

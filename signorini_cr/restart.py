@@ -115,7 +115,7 @@ class Restart:
             domain = refined[0]
 
     def function(self, V: fem.FunctionSpace, number: int) -> fem.Function:
-        """u_h on the last mesh (0) or on the one below (1), or so many steps back; collective.
+        """Read u_h on the last mesh (0) or on the one below (1), or so many steps back; collective.
 
         Raises:
             InputError: The mesh is another one.
@@ -132,24 +132,24 @@ class Restart:
 
 
 def _added(meshes: Sequence[NestedMesh], comm: MPI.Comm) -> tuple[Places, ...]:
-    """The vertices that each mesh but the first has beyond the one below it; collective."""
+    """Find the vertices that each mesh but the first has beyond the one below it; collective."""
     found = [_gathered(_nodes(each.domain.mesh), comm) for each in meshes]
     return tuple(np.setdiff1d(fine, coarse) for coarse, fine in pairwise(found))
 
 
 def _corners(mesh: Mesh) -> Places:
-    """The corners of this rank's cells, shape (cells, 3)."""
+    """Return the corners of this rank's cells, shape (cells, 3)."""
     return _nodes(mesh)[compat.cell_nodes(mesh)]
 
 
 def _nodes(mesh: Mesh) -> Places:
-    """The vertices of this rank's cells."""
+    """Return the vertices of this rank's cells."""
     x = mesh.geometry.x
     return x[:, 0] + 1j * x[:, 1]
 
 
 def _by_nodes(u: fem.Function) -> FloatArray:
-    """The values at the nodes that this rank owns, shape (nodes, block)."""
+    """Return the values at the nodes that this rank owns, shape (nodes, block)."""
     dofmap = u.function_space.dofmap
     values: FloatArray = u.x.array.reshape(-1, dofmap.index_map_bs)[: dofmap.index_map.size_local]
     return values
@@ -164,19 +164,19 @@ def _places(V: fem.FunctionSpace) -> Places:
 
 
 def _midpoints(corners: Places) -> Places:
-    """Those of the sides opposite the corners, shape (cells, 3); a + b is b + a to the last bit."""
+    """Compute midpoints of the sides opposite corners, shape (cells, 3); a + b is b + a exactly."""
     return 0.5 * (corners[:, [1, 2, 0]] + corners[:, [2, 0, 1]])
 
 
 def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
-    """The edges of this rank's cells whose midpoints are among some places."""
+    """Find the edges of this rank's cells whose midpoints are among some places."""
     mesh.topology.create_connectivity(2, 1)
     edges = mesh.topology.connectivity(2, 1).array.reshape(-1, 3)
     return np.unique(edges[np.isin(_midpoints(_corners(mesh)), places)]).astype(np.int32)
 
 
 def _gathered(values: npt.NDArray, comm: MPI.Comm) -> npt.NDArray:
-    """All ranks' values on rank 0, nothing elsewhere; collective."""
+    """Gather all ranks' values on rank 0, nothing elsewhere; collective."""
     if comm.size == 1:
         return values
     parts = comm.gather(values)

@@ -10,7 +10,7 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
 
 
 def rounded_up(value: float, digits: int = 3) -> float:
-    """The least number of so many digits that is not below a value; not finite, as it is."""
+    """Find the least number of so many digits not below a value; leave what is not finite."""
     if not math.isfinite(value) or value == 0.0:
         return value
     exact = _exact(value)
@@ -18,12 +18,12 @@ def rounded_up(value: float, digits: int = 3) -> float:
 
 
 def at_most(value: float, digits: int = 3) -> str:
-    """A bound from above in so many digits; what is printed is not below it."""
+    """Format a bound from above in so many digits; what is printed is not below it."""
     return told(rounded_up(value, digits))
 
 
 def interval(lower: float, upper: float) -> str:
-    """An interval that holds [lower, upper], with two digits of its width, at both ends."""
+    """Format an interval that holds [lower, upper], with two digits of its width, at both ends."""
     width = upper - lower
     if not (0.0 < width < math.inf):
         return f"[{lower!r}, {upper!r}]"
@@ -33,7 +33,7 @@ def interval(lower: float, upper: float) -> str:
 
 
 def known(value: float, within: float | None, digits: int = 6, least: int = 2) -> str:
-    """A figure with the digits that mean something.
+    """Format a figure with the digits that mean something.
 
     Args:
         value: It.
@@ -53,12 +53,12 @@ def known(value: float, within: float | None, digits: int = 6, least: int = 2) -
 
 
 def told(value: float) -> str:
-    """A number that has few digits, in them; 100 as 100, not as 1e+02."""
+    """Format a number of few digits in full; 100 as 100, not as 1e+02."""
     return _told(_exact(value)) if math.isfinite(value) else str(value)
 
 
 def counted(number: int, thing: str) -> str:
-    """A number of things, which are called by the word for one of them and an s."""
+    """Format a number of things, called by the word for one of them and an s."""
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
@@ -67,7 +67,7 @@ def _exact(value: float) -> Decimal:
 
 
 def _last(width: float) -> int:
-    """The power of ten of the second digit."""
+    """Find the power of ten of the second digit."""
     return math.floor(math.log10(width)) - 1
 
 
@@ -76,7 +76,7 @@ def _rounded(value: Decimal, last: int, way: str) -> Decimal:
 
 
 def _placed(number: Decimal) -> str:
-    """As it is rounded, with zeros at the end of its decimals."""
+    """Format a rounded number with the zeros at the end of its decimals."""
     plain = number != 0 and -5 <= number.adjusted() < 10
     return f"{number:f}" if plain else _told(number)
 

@@ -50,7 +50,7 @@ class Solution:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """A line; of the certificate only if it has been made, as making it is collective."""
+        """Describe it in a line; the certificate only if it is made, as making it is collective."""
         contact, known = self.contact, self.__dict__.get("certificate")
         line = (
             f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
@@ -60,7 +60,7 @@ class Solution:
         return line + (">" if bound is None else f", error at most {at_most(bound)}>")
 
     def _repr_html_(self) -> str:
-        """A table and a picture, for notebooks; of the certificate what has been made."""
+        """Write a table and a picture, for notebooks; of the certificate what has been made."""
         return HTML["Solution"](self)
 
     @property
@@ -110,7 +110,7 @@ class Solution:
 
     @cached_property
     def certificate(self) -> Certificate:
-        """What is certain about the error; made when first asked for, collectively."""
+        """The certificate of u_h's error; made when first asked for, collectively."""
         try:
             with self._estimating():
                 certificate: Certificate = self.level.physics.certify(self)
@@ -119,7 +119,7 @@ class Solution:
             self.level.tidy()
 
     def force_bounds(self) -> tuple[float, float]:
-        """Two numbers with the contact force of u itself between them; collective.
+        """Bound the contact force of u itself by two numbers; collective.
 
         See :func:`signorini_cr.force.force_bounds`.
         """
@@ -127,7 +127,7 @@ class Solution:
             return force.force_bounds(self)
 
     def flux(self, *parts: str | int, weight: Data | None = None) -> Interval:
-        """What flows into Ω through Dirichlet or contact parts, as an interval; collective.
+        """Bound what flows into Ω through Dirichlet or contact parts, as an interval; collective.
 
         See :func:`signorini_cr.force.flux`.
         """
@@ -135,7 +135,7 @@ class Solution:
             return force.flux(self, *parts, weight=weight)
 
     def mean(self, where: str | int | None = None, weight: Data | None = None) -> Interval:
-        """The mean of u over a part, a material or all of Ω, as an interval; collective.
+        """Bound the mean of u over a part, a material or all of Ω, as an interval; collective.
 
         See :func:`signorini_cr.means.mean`.
         """
@@ -143,7 +143,7 @@ class Solution:
             return means.mean(self, where, weight)
 
     def integral(self, where: str | int | None = None, weight: Data | None = None) -> Interval:
-        """∫ ψ u over a part, a material or all of Ω, as an interval; collective.
+        """Bound ∫ ψ u over a part, a material or all of Ω, as an interval; collective.
 
         See :func:`signorini_cr.means.integral`.
         """
@@ -168,11 +168,11 @@ class Solution:
         self.seconds["estimate"] = self.seconds.get("estimate", 0.0) + time.perf_counter() - began
 
     def u_dg(self) -> fem.Function:
-        """u_h as a discontinuous P1 function, which DOLFINx's writers draw right; collective."""
+        """Make u_h a discontinuous P1 function, which DOLFINx's writers draw right; collective."""
         return fields.discontinuous(self.u)
 
     def functions(self) -> dict[str, fem.Function]:
-        """All there is to draw, in spaces that DOLFINx's writers draw right; collective.
+        """Return all there is to draw, in spaces that DOLFINx's writers draw right; collective.
 
         The certificate is made if it has not been asked for before.
 

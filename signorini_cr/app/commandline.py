@@ -294,7 +294,7 @@ def start_petsc(options: list[str]) -> None:
 
 
 def launched() -> tuple[int, int]:
-    """Rank and number of ranks as the launcher tells them, without loading MPI."""
+    """Return rank and number of ranks as the launcher tells them, without loading MPI."""
     for rank, size in (
         ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
         ("PMI_RANK", "PMI_SIZE"),

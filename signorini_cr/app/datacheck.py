@@ -21,7 +21,7 @@ Weights = Mapping[str, str | None]
 
 
 def _used_on(key: str, domain: Domain, weights: Weights) -> int | None:
-    """The part of the boundary that an expression is used on, or None for the domain."""
+    """Find the part of the boundary that an expression is used on, or None for the domain."""
     if key in weights:
         return domain.parts.get(weights[key] or "")
     section, name, *_ = key.split(".", 2)
@@ -32,7 +32,7 @@ def _used_on(key: str, domain: Domain, weights: Weights) -> int | None:
 
 
 def _used_in(key: str, expressions: Collection[str], domain: Domain, weights: Weights) -> BoolArray:
-    """The local cells in which a datum that is used on no part of the boundary is used."""
+    """Find the local cells in which a datum that is used on no part of the boundary is used."""
     section, name, *_ = bare(key).split(".", 2)
     bared = {bare(each) for each in expressions}
     tdim, materials = domain.mesh.topology.dim, domain.materials
@@ -47,7 +47,7 @@ def _used_in(key: str, expressions: Collection[str], domain: Domain, weights: We
 
 
 def bare(key: str) -> str:
-    """The key of a datum that one of its entries belongs to."""
+    """Return the key of a datum that one of its entries belongs to."""
     return key.partition("[")[0]
 
 
@@ -117,7 +117,7 @@ def check_values(
 
 
 def _points(domain: Domain, dim: int, which: BoolArray | Int32Array, digits: int) -> FloatArray:
-    """Vertices and midpoints of some cells or facets, shape (n, 3).
+    """Return vertices and midpoints of some cells or facets, shape (n, 3).
 
     Rounded to so many digits after the point, because a mesh generator gets so many right: at
     1e-13 instead of 0, 1/x is finite and sqrt(-x) is not.

@@ -130,7 +130,7 @@ class _Reader:
         return self.node(tree.body, 1)
 
     def syntax(self, error: SyntaxError) -> str:
-        """Python's complaint in the words of this language."""
+        """Put Python's complaint into the words of this language."""
         message = error.msg or ""
         at = error.offset - 1 if error.offset else len(self.line)
         if "too many nested" in message:

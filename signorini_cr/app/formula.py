@@ -51,7 +51,7 @@ class Clock:
             constant.value = value
 
     def on(self, x: Any) -> Any:
-        """A number where x is an array of points, a Constant where it is a coordinate in UFL."""
+        """Return a number if x is an array of points, a Constant if it is a coordinate in UFL."""
         if isinstance(x, np.ndarray):
             return self._value
         from dolfinx import fem  # problem files are read without it
@@ -63,14 +63,14 @@ class Clock:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """``base**exponent`` in UFL, with small whole exponents as integers."""
+    """Raise to a power in UFL, ``base**exponent``, with small whole exponents as integers."""
     if isinstance(exponent, float) and exponent.is_integer() and abs(exponent) <= 64:
         exponent = int(exponent)
     return _inside(lambda b: b**exponent, base)
 
 
 def _inside(function: Callable[[Any], Any], value: Any) -> Any:
-    """``function(value)``, taken into the branches of a conditional.
+    """Take ``function(value)`` into the branches of a conditional.
 
     Differentiation then stays within a branch: the derivative of ``max(0, x)**1.5`` for x < 0 is 0
     rather than the 0 times infinity of the chain rule.
@@ -158,7 +158,7 @@ class Expression:
         return tuple(operands_first(self.root))
 
     def ufl(self, x: Any) -> Any:
-        """The expression in UFL.
+        """Build the expression in UFL.
 
         Args:
             x: The spatial coordinate, with at least two components.
@@ -169,7 +169,7 @@ class Expression:
         return self._value(_UFL, x)
 
     def numpy(self, points: npt.ArrayLike) -> npt.NDArray[Any]:
-        """The values at points; what is not finite there comes out as inf or nan.
+        """Evaluate it at points; what is not finite there comes out as inf or nan.
 
         Args:
             points: Coordinates, shape (n, 2) or wider.
@@ -211,7 +211,7 @@ def operands_first(root: Node) -> Iterator[Node]:
 
 
 def constant(value: float | bool) -> Node:
-    """The node of a number, or of true or false."""
+    """Make the node of a number, or of true or false."""
     return Node("const", (value,), isinstance(value, bool))
 
 
@@ -221,7 +221,7 @@ def is_constant(node: Node, value: float | bool) -> bool:
 
 
 def operation(op: str, *args: Node) -> Node:
-    """The node of an operation, folded where its value is known."""
+    """Make the node of an operation, folded where its value is known."""
     condition = op in ("<", "<=", ">", ">=", "==", "!=", "and", "or", "not")
     if op == "where" and args[0].op == "const":
         return args[1] if args[0].args[0] else args[2]

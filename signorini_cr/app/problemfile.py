@@ -343,7 +343,7 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
 
 
 def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The sections [boundary.NAME], each checked for its type's keys."""
+    """Read the sections [boundary.NAME], each checked for its type's keys."""
     parts = table.get("boundary", {})
     if not isinstance(parts, dict) or not all(isinstance(part, dict) for part in parts.values()):
         raise InputError(f"boundary: sections [{PART}] are needed, found {shown(parts)}")
@@ -362,7 +362,7 @@ def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The sections [material.NAME], each checked for its keys."""
+    """Read the sections [material.NAME], each checked for its keys."""
     found = table.get("material", {})
     if not isinstance(found, dict) or not all(isinstance(each, dict) for each in found.values()):
         raise InputError(f"material: sections [{MATERIAL}] are needed, found {shown(found)}")
@@ -374,7 +374,7 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def _quantities(
     table: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], materials: Collection[str]
 ) -> dict[str, Quantity]:
-    """[quantities]: each a kind and a place of a type that goes with it; yet without weights."""
+    """Read [quantities]: each a kind, a place of a type that goes with it; yet without weights."""
     types = {name: name for name in PARTS} | {name: part["type"] for name, part in parts.items()}
     found: dict[str, Quantity] = {}
     for name, value in table.items():
@@ -405,7 +405,7 @@ def _quantities(
 
 
 def _words(sections: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, str]:
-    """[units] or [names]: words by key."""
+    """Read [units] or [names]: words by key."""
     return {key: word(f"{name}.{key}", value) for key, value in sections[name].items()}
 
 
@@ -493,7 +493,7 @@ def _outline(name: str, material: Mapping[str, Any]) -> FloatArray:
 
 
 def _hole(key: str, hole: Any, names: tuple[str, ...], size: float) -> Polygon:
-    """A polygon in the domain, or a circle."""
+    """Read a polygon in the domain, or a circle."""
     if not isinstance(hole, dict):
         raise InputError(
             f"{key}: {{ vertices = [...], boundary = [...] }} or {{ center = [...], radius ="
@@ -531,7 +531,7 @@ def _polygon(
 
 
 def _arcs(key: str, arcs: list[Any]) -> dict[int, list[float]]:
-    """The points that arcs pass through, by edge."""
+    """Read the points that arcs pass through, by edge."""
     found: dict[int, list[float]] = {}
     for i, arc in enumerate(arcs):
         where = f"{key}[{i}]"
@@ -552,7 +552,7 @@ def _arcs(key: str, arcs: list[Any]) -> dict[int, list[float]]:
 
 
 def _circle(table: Mapping[str, Any], section: str, names: tuple[str, ...], size: float) -> Polygon:
-    """A round hole."""
+    """Read a round hole."""
     center = get(table, section, "center", _pair, needed="a point [x, y]")
     radius = get(table, section, "radius", positive, needed="a number above 0")
     part = get(table, section, "boundary", _label(names), needed="one label")
@@ -561,7 +561,7 @@ def _circle(table: Mapping[str, Any], section: str, names: tuple[str, ...], size
 
 
 def _label(names: tuple[str, ...]) -> Callable[[str, Any], str]:
-    """A reader of labels of edges."""
+    """Make a reader of labels of edges."""
 
     def more(found: str) -> str:
         plain = re.fullmatch(r"[A-Za-z0-9_-]+", found)
@@ -571,7 +571,7 @@ def _label(names: tuple[str, ...]) -> Callable[[str, Any], str]:
 
 
 def _points(key: str, vertices: list[Any], least: int = 3) -> FloatArray:
-    """The vertices of a polygon, shape (n, 2)."""
+    """Read the vertices of a polygon, shape (n, 2)."""
     for i, vertex in enumerate(vertices):
         _pair(f"{key}[{i}]", vertex)
     if len(vertices) < least:
@@ -636,7 +636,7 @@ def _expressions(
 
 
 def _by_entries(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with the entries of a tensor one by one, as ``data.coefficient[0][1]``."""
+    """Name the entries of a tensor one by one, as ``data.coefficient[0][1]``; keep all else."""
     found: dict[str, Any] = {}
     for key, value in given.items():
         if not (isinstance(value, list) and is_kappa(key)):
@@ -656,7 +656,7 @@ def _time(
     expressions: Mapping[str, Expression],
     clock: Clock,
 ) -> Time:
-    """[time], and what goes with it."""
+    """Read [time], and what goes with it."""
     table = sections["time"]
     if "exact.u" in expressions:
         raise InputError("exact.u: a problem in time has none")
@@ -674,7 +674,7 @@ def _time(
 
 
 def _steps(number: int) -> int:
-    """A number of steps that a folder has room for."""
+    """Insist on a number of steps that a folder has room for."""
     if number > MOST_STEPS:
         raise InputError(
             f"time.steps: {shown(number)} is too many, as each step leaves a file behind; up to"
@@ -684,7 +684,7 @@ def _steps(number: int) -> int:
 
 
 def _capacity(key: str, value: Any) -> float:
-    """A number above 0, which may be written as an expression."""
+    """Read a number above 0, which may be written as an expression."""
     found = _expression(key, value, {}, ()).constant
     if not isinstance(found, float) or found <= 0.0:
         raise InputError(f"{key}: a number above 0 is needed, found {shown(value)}")
@@ -692,14 +692,14 @@ def _capacity(key: str, value: Any) -> float:
 
 
 def _own_capacity(name: str, material: Mapping[str, Any]) -> float | None:
-    """The capacity of a material, if it has one."""
+    """Read the capacity of a material, if it has one."""
     if "capacity" not in material:
         return None
     return _capacity(f"material.{name}.capacity", material["capacity"])
 
 
 def _data(expression: Expression) -> Any:
-    """An expression as `Problem` takes it."""
+    """Return an expression as `Problem` takes it."""
     return expression.ufl if expression.constant is None else expression.constant
 
 
@@ -707,7 +707,7 @@ ENTRIES = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
 def _tensor(entries: Sequence[Expression]) -> Any:
-    """Four expressions as `Problem` takes them."""
+    """Return four expressions as `Problem` takes them."""
 
     def tensor(x: Any) -> Any:
         xx, xy, yx, yy = (entry.ufl(x) for entry in entries)
@@ -735,7 +735,7 @@ def _problem(
     materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
     def own(section: str) -> dict[str, Any]:
-        """The data of a section, by key."""
+        """Take the data of a section, by key."""
         found: dict[str, Any] = {}
         for key, expression in expressions.items():
             home, _, name = bare(key).rpartition(".")

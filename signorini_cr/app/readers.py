@@ -26,7 +26,7 @@ HUGE = 10**15
 
 
 def read_text(path: Path) -> str:
-    """The text of a file in UTF-8."""
+    """Read the text of a file in UTF-8."""
     try:
         return read_regular(path, MOST_BYTES).decode("utf-8-sig")
     except InputError:
@@ -43,7 +43,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table that a TOML text stands for."""
+    """Read the table that a TOML text stands for."""
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -76,7 +76,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _said_better(what: str, found: str, column: int) -> str:
-    """What the parser says, with the cure where it is clear.
+    """Say what the parser says, with the cure where it is clear.
 
     Args:
         what: Its words.
@@ -136,7 +136,7 @@ def get(
     default: Any = None,
     needed: str | None = None,
 ) -> Any:
-    """The value of a key, read and checked.
+    """Return the value of a key, read and checked.
 
     Args:
         table: The keys found.
@@ -238,7 +238,7 @@ def whole(key: str, value: Any) -> int:
 def one_of(
     allowed: Collection[str], more: Callable[[str], str] = lambda found: ""
 ) -> Callable[[str, Any], str]:
-    """A reader that insists on one of the given words.
+    """Make a reader that insists on one of the given words.
 
     Args:
         allowed: The words.
@@ -255,7 +255,7 @@ def one_of(
 
 
 def shown(value: Any) -> str:
-    """A TOML value in a few words."""
+    """Show a TOML value in a few words."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

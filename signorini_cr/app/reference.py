@@ -252,12 +252,12 @@ EXPRESSIONS = {f"{key.section}.{key.name}": key for key in KEYS if key.is_expres
 
 
 def allowed(section: str) -> tuple[str, ...]:
-    """The keys that may be in a section."""
+    """Return the keys that may be in a section."""
     return tuple(key.name for key in KEYS if key.section == section)
 
 
 def page() -> str:
-    """The reference of the problem file, in Markdown."""
+    """Write the reference of the problem file, in Markdown."""
     lines = [
         "# The problem file",
         "",

@@ -69,13 +69,13 @@ class Run:
 
     @property
     def time_left(self) -> float | None:
-        """What is left of --max-time."""
+        """The time left of --max-time."""
         if self.args.max_time is None:
             return None
         return float(self.args.max_time + self.args.began - time.perf_counter())
 
     def said(self) -> dict[str, Any]:
-        """All that the levels depend on, by the name the user knows it by; collective."""
+        """Say all that the levels depend on, by the name the user knows it by; collective."""
         said = {
             **self.case.said,
             "--element": self.args.element,
@@ -117,7 +117,7 @@ class Run:
         return restart, facts
 
     def report(self, levels: list[output.Record], complete: bool = False) -> output.Record:
-        """What report.json is made of; collective."""
+        """Collect what report.json is made of; collective."""
         case = self.case
         return output.make_report(case.title, self.element, self.comm, levels, complete, case.units)
 
@@ -143,7 +143,7 @@ class Run:
         )
 
     def _write_page(self, report: output.Record) -> str:
-        """The run as one page; collective."""
+        """Write the run as one page; collective."""
 
         def make() -> str:
             source = self.args.file.read_text(encoding="utf-8")
@@ -158,13 +158,13 @@ class Run:
 
 
 def stopped(failure: NotConverged, kept: list[output.Record], folder: Path) -> str:
-    """What to say of a run that stops on a level."""
+    """Say that a run stops on a level, and why."""
     level = len(kept) if failure.level is None else failure.level
     return f"stopped on level {level}: {failure.reason}\n{what_is_kept(kept, folder)}"
 
 
 def what_is_kept(kept: list[output.Record], folder: Path) -> str:
-    """What a run that has been ended leaves."""
+    """Say what a run that has been ended leaves."""
     if not kept:
         return "no level was finished, nothing was written"
     kind = _kind(kept[0])
@@ -175,7 +175,7 @@ def what_is_kept(kept: list[output.Record], folder: Path) -> str:
 
 
 def _kind(record: output.Record) -> str:
-    """What a record is of, which its number goes by, too."""
+    """Say what a record is of, which its number goes by, too."""
     return "step" if "step" in record else "level"
 
 
@@ -238,5 +238,5 @@ def above_tolerance(case: ProblemFile, bound: float, level: int) -> NotConverged
 
 
 def step_of_solver(step: int, residual: float, active: int, linear: int) -> str:
-    """What `-v` tells of a step of the active set method."""
+    """Say what `-v` tells of a step of the active set method."""
     return f"step {step:2d}  residual {residual:9.2e}  active {active:5d}  cg {linear:4d}"

@@ -51,7 +51,7 @@ def solve_case(
 
 
 def read_case(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[ProblemFile, Domain]:
-    """The checked problem file and the coarsest mesh; collective."""
+    """Read the checked problem file, and make the coarsest mesh; collective."""
     case = problemfile.load(args.file, comm)
     if getattr(args, "levels", None) is not None:
         case = replace(case, levels=args.levels)

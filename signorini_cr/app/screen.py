@@ -33,23 +33,23 @@ class Screen:
         self.passing = 0  # width of the progress line that stands on the terminal
 
     def line(self, text: str) -> None:
-        """A line of results."""
+        """Print a line of results."""
         if self.root and not self.quiet:
             self.clear()
             self._put(sys.stdout, printable(text) + "\n")
 
     def text(self, text: str) -> None:
-        """Results as a paragraph."""
+        """Print results as a paragraph."""
         self.line(wrapped(text))
 
     def items(self, head: str, *items: str) -> None:
-        """Results as a list under a head: a paragraph each, whose further lines hang."""
+        """Print results as a list under a head: a paragraph each, whose further lines hang."""
         self.text(head)
         for item in items:
             self.line(wrapped(item, "  ", " " * 4))
 
     def step(self, text: str) -> None:
-        """A step of the solver: for good with -v, else as the progress line."""
+        """Print a step of the solver: for good with -v, else as the progress line."""
         if self.verbose:
             self.line(text)
         else:
@@ -100,7 +100,7 @@ class Screen:
 
 
 def printable(text: str) -> str:
-    """The same without what would move a terminal's cursor or change its colours."""
+    """Remove what would move a terminal's cursor or change its colours."""
     return "".join(c if c.isprintable() or c in "\n\u00a0" else ascii(c)[1:-1] for c in text)
 
 

@@ -75,7 +75,7 @@ def _must_not_be_disturbed(frame: FrameType | None) -> bool:
 
 
 def status_of(asked: Sequence[int]) -> int:
-    """The exit status after a signal; from here on it is too late for another one."""
+    """Return the exit status after a signal; from here on it is too late for another one."""
     if threading.current_thread() is threading.main_thread():
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, signal.SIG_IGN)

@@ -64,7 +64,7 @@ def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
 
 
 def folded(rows: Mapping[str, str]) -> str:
-    """A statement for the screen, two lines at most for each part of it."""
+    """Fold a statement for the screen, two lines at most for each part of it."""
     return "\n".join(
         textwrap.fill(
             text,
@@ -148,7 +148,7 @@ def _facets(domain: Domain, part: str) -> str:
 
 
 def _conditions(said: Mapping[str, Any]) -> dict[str, tuple[type[Condition], dict[str, Any]]]:
-    """The kind of condition on each part, and what was written for its data, by name."""
+    """Find the kind of condition on each part, and what was written for its data, by name."""
     found = {}
     for name in ("dirichlet", "neumann", "contact"):
         (key,) = (key for key, told in EXPRESSIONS.items() if told.used_on == name)

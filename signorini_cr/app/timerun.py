@@ -172,7 +172,7 @@ class Steps:
             raise NotConverged("\n".join([*reasons, what_is_kept(run.kept, run.folder)]))
 
     def _meshes(self) -> int | list[Refined]:
-        """What the steps are solved on: so many uniform meshes, or those found; collective."""
+        """Find what the steps are solved on: so many uniform meshes, or those found; collective."""
         if self._run.case.mode == "uniform":
             return self._run.case.levels
         if self._done:
