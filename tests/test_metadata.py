@@ -1,5 +1,6 @@
 """What is told of the program in several files is the same in all of them."""
 
+import ast
 import importlib
 import json
 import re
@@ -135,6 +136,22 @@ def test_what_is_cited_is_in_the_bibliography():
     for person in ("Marini", "Dörfler"):
         assert any(person in text for text in texts.values())
         assert any(f". {person}: " in entry for entry in entries), person
+
+
+@pytest.mark.serial
+def test_docstrings_say_what_a_function_does():
+    """In the imperative; what a property is may be a noun phrase, or begin with Whether."""
+    asked = {"What", "Where", "How", "Which"}
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            words = (ast.get_docstring(node) or "").split()
+            is_property = any("property" in ast.unparse(each) for each in node.decorator_list)
+            if words and words[0] in (asked if is_property else asked | {"Whether"}):
+                found.append(f"{path.relative_to(PACKAGE)}:{node.lineno} {node.name}")
+    assert not found, found
 
 
 def loaded(path):
