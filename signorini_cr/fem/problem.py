@@ -550,7 +550,7 @@ class Forms:
 
     @property
     def _measures(self) -> tuple[ufl.Measure, Callable[[str], ufl.Measure]]:
-        """The measures that forms of one's own have: dx, of materials too, and ds by parts' names."""
+        """The measures for forms of one's own: dx, of materials too, and ds by parts' names."""
 
         def ds(name: str) -> ufl.Measure:
             if name not in self._parts:
