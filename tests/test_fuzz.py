@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import functools
 import io
 import json
 import math
@@ -339,12 +340,16 @@ def as_toml(table: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-FOLDER = tempfile.TemporaryDirectory()
-"""Gone when the program ends."""
 ONE_IN = 20
 """Of files that are read so many are solved, on few cells."""
 FEW = 400
 """Cells that are few."""
+
+
+@functools.cache
+def scratch() -> tempfile.TemporaryDirectory[str]:
+    """A folder, made when it is first needed and gone when the program ends."""
+    return tempfile.TemporaryDirectory()
 
 
 def check_file(text: str) -> None:
@@ -354,7 +359,7 @@ def check_file(text: str) -> None:
 
 def look_at_file(text: str, one_in: int) -> None:
     """It is refused with one message, or read; then `check` does the same, and some are solved."""
-    path = Path(FOLDER.name) / "case.toml"
+    path = Path(scratch().name) / "case.toml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     began, end = time.perf_counter(), "files read"
     try:
@@ -380,7 +385,7 @@ def look_at_file(text: str, one_in: int) -> None:
 
 def solve_file(path: Path) -> None:
     """The command ends as it should, with words where it has no results; nothing is drawn."""
-    out, said = Path(FOLDER.name) / "out", io.StringIO()
+    out, said = Path(scratch().name) / "out", io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(said):
         patch.setattr(plots, "can_draw", lambda comm: False)
         status = cli.main(["solve", str(path), "--levels", "1", "--out", str(out), "-q"])
@@ -535,7 +540,7 @@ def check_problem(text: str) -> None:
     The energy lies in every mesh's bracket, so that any two of them overlap. In time each step is
     a problem of its own.
     """
-    path = Path(FOLDER.name) / "case.toml"
+    path = Path(scratch().name) / "case.toml"
     path.write_text(text)
     try:
         file = problemfile.load(path, MPI.COMM_SELF)
