@@ -7,12 +7,16 @@ import re
 import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import cpp, fem
 from dolfinx.mesh import (
+    Mesh,
     compute_midpoints,
     create_rectangle,
     create_unit_cube,
@@ -22,6 +26,7 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from signorini_cr import Domain, Polygon, Problem, Solution, solve_levels
+from signorini_cr.compat import cell_nodes
 from signorini_cr.estimate.functional import Functional, Masses
 from signorini_cr.fem.cells import BoundaryFacets, Cells
 
@@ -100,6 +105,77 @@ def script(path: Path, *arguments: str | Path, **variables: str) -> tuple[int, s
 def is_picture(path: Path) -> bool:
     """Whether it is a PNG with something on it."""
     return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+
+
+def stay(comm: MPI.Comm, parts: int, kinds: Any, corners: Any) -> Any:
+    """A partitioner that leaves every triangle where it is."""
+    ranks = np.full((corners[0].size // 3, 1), comm.rank, dtype=np.int32)
+    return cpp.graph.AdjacencyList_int32(ranks)
+
+
+def rectangle(n: int, comm: MPI.Comm = MPI.COMM_WORLD, neumann: bool = False) -> Domain:
+    """(−1, 1) × (0, 1) with Γ1 below and Γ0 elsewhere, or a Neumann part on the right."""
+    mesh = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [2 * n, n])
+    mesh.topology.create_connectivity(1, 2)
+    facets = exterior_facet_indices(mesh.topology)
+    x = compute_midpoints(mesh, 1, facets)
+    values = np.where(x[:, 1] < 1e-12, 1, np.where(neumann & (x[:, 0] > 1 - 1e-12), 3, 2))
+    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, values.astype(np.int32)))
+
+
+def corners(mesh: Mesh) -> np.ndarray:
+    """Of the triangles that this rank owns, shape (cells, 3, 2)."""
+    return mesh.geometry.x[cell_nodes(mesh)[: mesh.topology.index_map(2).size_local], :2]
+
+
+def areas(mesh: Mesh) -> np.ndarray:
+    """Of the triangles that this rank owns."""
+    x = corners(mesh)
+    (a, b), (c, d) = (x[:, 1:] - x[:, :1]).T
+    return 0.5 * np.abs(a * d - b * c)
+
+
+def smallest_angle(mesh: Mesh) -> float:
+    """In degrees, over all ranks."""
+    x = corners(mesh)
+    sides = np.roll(x, -1, axis=1) - x
+    sides = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+    angles = np.degrees(np.arccos(-(sides * np.roll(sides, 1, axis=1)).sum(axis=2)))
+    return mesh.comm.allreduce(angles.min(initial=180), op=MPI.MIN)
+
+
+def integral(form: ufl.Form, comm: MPI.Comm = MPI.COMM_WORLD) -> float:
+    """What the form is, over all ranks."""
+    return comm.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+def widths_of(
+    problem: Problem,
+    interval: Callable[[Solution], tuple[float, float]],
+    inside: float | None = None,
+    levels: int = 4,
+    size: float = 0.25,
+) -> np.ndarray:
+    """Widths of intervals on meshes of the unit square, each twice as fine as the one before.
+
+    Args:
+        problem: What is solved.
+        interval: Of each solution, its lower and its upper end.
+        inside: What each must hold.
+        levels: How many meshes.
+        size: Of the first one.
+    """
+    found = []
+    for solution in solve_levels(problem, SQUARE.mesh(size, MPI.COMM_WORLD), levels):
+        lower, upper = interval(solution)
+        assert lower <= upper and (inside is None or lower <= inside <= upper)
+        found.append(upper - lower)
+    return np.array(found)
+
+
+def orders(found: np.ndarray) -> np.ndarray:
+    """Of what is found on meshes each of which is twice as fine as the one before."""
+    return np.log2(found[:-1] / found[1:])
 
 
 def slope(x: Any) -> Any:

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import ufl
-from helpers import SQUARE
-from mpi4py import MPI
+from helpers import orders, widths_of
 
-from signorini_cr import Contact, Dirichlet, Neumann, Problem, means, solve_levels
+from signorini_cr import Contact, Dirichlet, Neumann, Problem, means
 
 pytestmark = pytest.mark.slow
 
@@ -14,17 +13,10 @@ BESIDE = {"left": Neumann(), "right": Neumann()}
 
 
 def widths(problem, where=None, weight=None, inside=None, levels=4):
-    """Widths of the intervals on meshes each of which is twice as fine as the one before."""
-    found = []
-    for solution in solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), levels):
-        _, lower, upper = means.integral(solution, where, weight)
-        assert lower <= upper and (inside is None or lower <= inside <= upper)
-        found.append(upper - lower)
-    return np.array(found)
-
-
-def orders(found):
-    return np.log2(found[:-1] / found[1:])
+    """Of the integrals' intervals."""
+    return widths_of(
+        problem, lambda solution: means.integral(solution, where, weight)[1:], inside, levels
+    )
 
 
 def bent(x):

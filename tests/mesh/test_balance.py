@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dolfinx import fem
+from helpers import areas, corners
 from mpi4py import MPI
 
 from signorini_cr import Domain, Polygon, Problem, Solution, solve_adaptive
@@ -36,11 +37,6 @@ def together(table: np.ndarray) -> np.ndarray:
     return rows[np.lexsort(rows.T)]
 
 
-def corners(domain: Domain) -> np.ndarray:
-    """Of this rank's cells, shape (cells, 3, 2)."""
-    return domain.mesh.geometry.x[cell_nodes(domain.mesh), :2]
-
-
 def labelled(domain: Domain) -> np.ndarray:
     """Midpoints of tagged facets, and their values."""
     mesh = domain.mesh
@@ -52,18 +48,12 @@ def labelled(domain: Domain) -> np.ndarray:
     )
 
 
-def areas(domain: Domain) -> np.ndarray:
-    """Of this rank's cells."""
-    (a, b), (c, d) = (corners(domain)[:, 1:] - corners(domain)[:, :1]).T
-    return 0.5 * np.abs(a * d - b * c)
-
-
 def into_a_corner() -> tuple[Domain, Domain, np.ndarray]:
     """The last two meshes that grow where x and y are small, as they are shared out at first."""
     fine = SQUARE.mesh(0.5)
     for _ in range(5):
         coarse = fine
-        fine, parent = refine_marked(coarse, corners(coarse).sum(axis=2).min(axis=1) < -0.7)
+        fine, parent = refine_marked(coarse, corners(coarse.mesh).sum(axis=2).min(axis=1) < -0.7)
     return coarse, fine, parent
 
 
@@ -74,11 +64,11 @@ def test_the_same_cells_in_the_same_parents():
         assert COMM.allreduce(share.size_local, MPI.MAX) * COMM.size > 1.3 * share.size_global
     moved, place, exchange = balance(fine, parent)
     assert (exchange is None) == (COMM.size == 1)
-    number = COMM.allgather(len(corners(moved)))
+    number = COMM.allgather(len(corners(moved.mesh)))
     assert max(number) - min(number) <= COMM.size
-    cells = corners(coarse)
+    cells = corners(coarse.mesh)
     families = [
-        np.column_stack([corners(domain).reshape(-1, 6), its.reshape(-1, 6)])
+        np.column_stack([corners(domain.mesh).reshape(-1, 6), its.reshape(-1, 6)])
         for domain, its in (
             (fine, cells[parent]),
             (moved, (cells if exchange is None else exchange.fetch(cells))[place]),
@@ -97,27 +87,27 @@ def test_children_are_put_together_on_other_ranks():
     coarse, fine, parent = into_a_corner()
     moved, place, exchange = balance(fine, parent)
     parents = Parents(coarse.mesh, moved.mesh, place, exchange)
-    theirs, own = (areas(domain) for domain in (coarse, moved))
+    theirs, own = (areas(domain.mesh) for domain in (coarse, moved))
     assert parents.collected(own) == pytest.approx(theirs, rel=1e-13)
     smallest = parents.collected(own, np.minimum)
-    at_once = Parents(coarse.mesh, fine.mesh, parent).collected(areas(fine), np.minimum)
+    at_once = Parents(coarse.mesh, fine.mesh, parent).collected(areas(fine.mesh), np.minimum)
     assert smallest == pytest.approx(at_once, rel=1e-13)
 
 
 def test_what_cells_have_moves_with_them():
     """Materials, and a Function that is constant on the coarse cells."""
     coarse, fine, parent = into_a_corner()
-    left = (corners(fine)[:, :, 0].mean(axis=1) < 0).astype(np.int32)
+    left = (corners(fine.mesh)[:, :, 0].mean(axis=1) < 0).astype(np.int32)
     moved, _, _ = balance(replace(fine, materials=Materials({"left": 1}, left)), parent)
-    centres = corners(moved)[:, :, 0].mean(axis=1)
+    centres = corners(moved.mesh)[:, :, 0].mean(axis=1)
     assert np.array_equal(moved.materials.of_cells, centres < 0)
     of_cells = fem.Function(fem.functionspace(coarse.mesh, ("DG", 0)))
-    of_cells.x.array[of_cells.function_space.dofmap.list[:, 0]] = areas(coarse)
+    of_cells.x.array[of_cells.function_space.dofmap.list[:, 0]] = areas(coarse.mesh)
     tables = []
     for domain in (fine, moved):
         own = domain.own(of_cells)
         values = own.x.array[own.function_space.dofmap.list[:, 0]]
-        tables.append(together(np.column_stack([corners(domain).reshape(-1, 6), values])))
+        tables.append(together(np.column_stack([corners(domain.mesh).reshape(-1, 6), values])))
     assert np.array_equal(*tables)
 
 

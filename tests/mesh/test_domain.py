@@ -9,8 +9,7 @@ import dolfinx.mesh
 import numpy as np
 import pytest
 import ufl
-from dolfinx import cpp, fem
-from helpers import MESHES
+from helpers import MESHES, integral, smallest_angle, stay
 from mpi4py import MPI
 
 from signorini_cr import Problem, Solver, solve, solve_adaptive, solve_in_time, solve_levels
@@ -23,16 +22,6 @@ COMM = MPI.COMM_WORLD
 RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
 LABELS = ["contact", "dirichlet", "neumann", "dirichlet"]
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
-
-
-def stay(comm, parts, kinds, corners):
-    """A partitioner that leaves every triangle where it is."""
-    ranks = np.full((corners[0].size // 3, 1), comm.rank, dtype=np.int32)
-    return cpp.graph.AdjacencyList_int32(ranks)
-
-
-def integral(form: ufl.Form, comm: MPI.Comm = COMM) -> float:
-    return comm.allreduce(fem.assemble_scalar(fem.form(form)))
 
 
 def lengths(domain: Domain) -> list[float]:
@@ -248,7 +237,7 @@ def test_short_edges_get_a_facet_and_angles_stay_away_from_zero(size: float):
     labels = ["contact", "neumann", "contact", "dirichlet", "dirichlet", "dirichlet"]
     domain = Polygon(vertices, labels).mesh(size)
     assert counts(domain)[2] == 1
-    assert smallest_angle(domain) > 20
+    assert smallest_angle(domain.mesh) > 20
 
 
 def test_triangles_grow_away_from_short_edges():
@@ -259,24 +248,11 @@ def test_triangles_grow_away_from_short_edges():
     assert area(domain) == pytest.approx(100 * np.sin(np.pi / 100))
     assert counts(domain) == [100, 100, 0]
     assert domain.mesh.topology.index_map(2).size_global < 2500  # 7300 equilateral ones
-    assert smallest_angle(domain) > 20
-
-
-def smallest_angle(domain: Domain) -> float:
-    """In degrees, over all ranks."""
-    mesh = domain.mesh
-    cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
-    nodes = dolfinx.mesh.entities_to_geometry(mesh, 2, cells).reshape(-1, 3)
-    x = mesh.geometry.x[nodes]
-    sides = np.roll(x, -1, axis=1) - x
-    sides = sides / np.linalg.norm(sides, axis=2, keepdims=True)
-    cosine = -(sides * np.roll(sides, 1, axis=1)).sum(axis=2)
-    smallest = np.degrees(np.arccos(cosine)).min() if len(cells) else 180.0
-    return mesh.comm.allreduce(smallest, op=MPI.MIN)
+    assert smallest_angle(domain.mesh) > 20
 
 
 def test_triangles_are_well_shaped():
-    assert smallest_angle(Polygon(RECTANGLE, LABELS).mesh(0.1)) > 35
+    assert smallest_angle(Polygon(RECTANGLE, LABELS).mesh(0.1).mesh) > 35
 
 
 def test_the_same_polygon_gives_the_same_mesh():

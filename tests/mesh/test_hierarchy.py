@@ -5,7 +5,8 @@ import dolfinx.mesh
 import numpy as np
 import pytest
 import ufl
-from dolfinx import cpp, fem, la
+from dolfinx import fem, la
+from helpers import corners, integral, smallest_angle, stay
 from mpi4py import MPI
 
 from signorini_cr.compat import cell_nodes
@@ -61,16 +62,6 @@ def domain(request) -> Domain:
     return makers[request.param]()
 
 
-def stay(comm, parts, kinds, corners):
-    """A partitioner that leaves every triangle where it is."""
-    ranks = np.full((corners[0].size // 3, 1), comm.rank, dtype=np.int32)
-    return cpp.graph.AdjacencyList_int32(ranks)
-
-
-def integral(form: ufl.Form, comm: MPI.Comm) -> float:
-    return comm.allreduce(fem.assemble_scalar(fem.form(form)))
-
-
 def geometry(domain: Domain) -> list[float]:
     """Area, lengths of the parts, and what Gauss' theorem makes of them."""
     mesh = domain.mesh
@@ -85,21 +76,9 @@ def cells_of(mesh: dolfinx.mesh.Mesh) -> int:
     return mesh.topology.index_map(2).size_local
 
 
-def corners(mesh: dolfinx.mesh.Mesh) -> np.ndarray:
-    """Shape (cells, 3, 2)."""
-    return mesh.geometry.x[cell_nodes(mesh)[: cells_of(mesh)], :2]
-
-
 def sides(mesh: dolfinx.mesh.Mesh) -> np.ndarray:
     x = corners(mesh)
     return np.roll(x, -1, axis=1) - x
-
-
-def smallest_angle(mesh: dolfinx.mesh.Mesh) -> float:
-    u = sides(mesh)
-    u = u / np.linalg.norm(u, axis=2, keepdims=True)
-    angles = np.degrees(np.arccos(-(u * np.roll(u, 1, axis=1)).sum(axis=2)))
-    return mesh.comm.allreduce(angles.min(initial=180), op=MPI.MIN)
 
 
 def facets_by_cell(mesh: dolfinx.mesh.Mesh) -> np.ndarray:

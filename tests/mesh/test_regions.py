@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import compute_midpoints
+from helpers import areas
 from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Polygon, read_gmsh
-from signorini_cr.compat import cell_nodes
 from signorini_cr.errors import on_root
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.refinement import refine, refine_marked
@@ -18,15 +18,11 @@ DUCT = Polygon([[1.2, 0.08], [2.8, 0.08], [2.8, 0.2], [1.2, 0.2]], ["neumann"] *
 TOP = [[-1, 0.25], [5, 0.25], [5, 0.5], [-1, 0.5]]
 
 
-def areas(domain: Domain) -> dict[str, float]:
-    """Of each material; collective."""
-    mesh = domain.mesh
-    cells = np.arange(mesh.topology.index_map(2).size_local)
-    x = mesh.geometry.x[cell_nodes(mesh)[cells], :2]
-    a, b = (x[:, i] - x[:, 0] for i in (1, 2))
-    size = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+def of_materials(domain: Domain) -> dict[str, float]:
+    """The area of each; collective."""
+    size = areas(domain.mesh)
     return {
-        name: mesh.comm.allreduce(float(size[domain.materials.where(name)[cells]].sum()))
+        name: COMM.allreduce(float(size[domain.materials.where(name)[: len(size)]].sum()))
         for name in domain.materials.numbers
     }
 
@@ -42,9 +38,9 @@ def test_polygons_that_meet_in_every_way():
     domain = Polygon(DECK, SIDES, [DUCT], materials=polygons).mesh(0.1)
     # below: the trapezoid under the duct and the triangle beside it
     wanted = {"top": 0.2, "left": 0.3, "below": 0.08 * (1.6 + 1.8) / 2, "apart": 0.03}
-    assert areas(domain) == pytest.approx(wanted, rel=1e-12)
+    assert of_materials(domain) == pytest.approx(wanted, rel=1e-12)
     for fine, _ in (refine(domain), refine_marked(domain, domain.materials.where("top"))):
-        assert areas(fine) == pytest.approx(wanted, rel=1e-12)
+        assert of_materials(fine) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_cells_are_of_the_material_that_they_lie_in():
@@ -66,11 +62,11 @@ def test_physical_surfaces(version, shared_tmp_path):
     path = shared_tmp_path / "two.msh"
     on_root(COMM, _write, path, version)
     domain = read_gmsh(path, materials=["rock"])
-    assert areas(domain) == pytest.approx({"rock": 0.6}, rel=1e-12)
+    assert of_materials(domain) == pytest.approx({"rock": 0.6}, rel=1e-12)
     assert domain.materials.others == ("Sand",)
     both = read_gmsh(path, materials=["Sand", "rock"])
     assert both.materials.others == ()
-    assert areas(both) == pytest.approx({"Sand": 0.4, "rock": 0.6}, rel=1e-12)
+    assert of_materials(both) == pytest.approx({"Sand": 0.4, "rock": 0.6}, rel=1e-12)
     assert read_gmsh(path).materials.numbers == {}
     with pytest.raises(InputError, match="no physical surface with triangles is named 'soil'; the"):
         read_gmsh(path, materials=["soil"])

@@ -8,7 +8,7 @@ import pytest
 import ufl
 from dolfinx import fem, io
 from dolfinx.mesh import compute_midpoints
-from helpers import on_a_slope, slope
+from helpers import integral, on_a_slope, slope
 from mpi4py import MPI
 
 pytestmark = pytest.mark.ranks
@@ -19,10 +19,6 @@ WORLD = MPI.COMM_WORLD
 @pytest.fixture(scope="module", params=[2, 3])
 def solution(request):
     return on_a_slope(request.param)
-
-
-def integral(form) -> float:
-    return float(WORLD.allreduce(fem.assemble_scalar(fem.form(form))))
 
 
 def test_u_is_the_affine_function_with_the_cr_dofs_at_the_facets_midpoints(solution):

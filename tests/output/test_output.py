@@ -9,15 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ufl
-from dolfinx.mesh import (
-    compute_midpoints,
-    create_rectangle,
-    exterior_facet_indices,
-    meshtags,
-)
+from helpers import rectangle
 from mpi4py import MPI
 
-from signorini_cr import Domain, InputError, Problem, solve, solve_levels
+from signorini_cr import InputError, Problem, solve, solve_levels
 from signorini_cr.estimate.certificate import SHARES, Certificate
 from signorini_cr.output import report as output
 from signorini_cr.output.files import check_writable, write_files
@@ -32,15 +27,6 @@ LEVEL = {
     "bound_energy_norm", "quantities", "bound_reason", "bound_parts", "energy_bounds",
 }  # fmt: skip
 CONTACT_HEADER = ["part", "arc_length", "x", "y", "length", "obstacle", "u", "pressure", "active"]
-
-
-def rectangle(n, comm=WORLD):
-    """(−1, 1) × (0, 1) with Γ1 below and Γ0 elsewhere."""
-    mesh = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [2 * n, n])
-    mesh.topology.create_connectivity(1, 2)
-    facets = exterior_facet_indices(mesh.topology)
-    below = compute_midpoints(mesh, 1, facets)[:, 1] < 1e-12
-    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, np.where(below, 1, 2).astype(np.int32)))
 
 
 # Contact on x < 0

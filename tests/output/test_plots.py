@@ -11,6 +11,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
+from helpers import rectangle
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -33,15 +34,6 @@ pytestmark = pytest.mark.slow
 
 image = pytest.importorskip("matplotlib.image")
 WORLD = MPI.COMM_WORLD
-
-
-def rectangle(n, neumann=False):
-    mesh = create_rectangle(WORLD, [[-1.0, 0.0], [1.0, 1.0]], [2 * n, n])
-    mesh.topology.create_connectivity(1, 2)
-    facets = exterior_facet_indices(mesh.topology)
-    x = compute_midpoints(mesh, 1, facets)
-    values = np.where(x[:, 1] < 1e-12, 1, np.where(neumann & (x[:, 0] > 1 - 1e-12), 3, 2))
-    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, values.astype(np.int32)), neumann=3)
 
 
 def holed():
@@ -80,7 +72,7 @@ def test_the_mesh_shows_its_materials(shared_tmp_path):
 def test_the_mesh_shows_each_boundary_part_in_its_colour(shared_tmp_path):
     path = shared_tmp_path / "mesh.png"
     for neumann in (False, True):
-        plots.plot_mesh(rectangle(4, neumann), path, "price in $, 5 % off")
+        plots.plot_mesh(rectangle(4, neumann=neumann), path, "price in $, 5 % off")
         assert on_rank_0(share(path, canvas.RED)) > 0.5
         assert on_rank_0(share(path, canvas.BLUE)) > 0.3
         assert (on_rank_0(share(path, canvas.YELLOW)) > 0.1) == neumann
