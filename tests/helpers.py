@@ -36,6 +36,9 @@ MESHES = ROOT / "meshes"
 SIDES = ("floor", "right", "top", "left")
 SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
 """The unit square, each side a part of its own."""
+HELD_ABOVE = Polygon(SQUARE.vertices, ("contact", "neumann", "dirichlet", "neumann"))
+HELD_ALL_ROUND = Polygon(SQUARE.vertices, ("contact", "dirichlet", "dirichlet", "dirichlet"))
+"""The unit square with contact below: held above, or on all other sides."""
 
 
 def clean_environment(**more: str) -> dict[str, str]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import ufl
+from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -37,9 +38,7 @@ def centres(domain: Domain) -> np.ndarray:
 
 def test_meshes_of_a_symmetric_problem():
     """Marking ends between two cells that are twins: both are refined, on any number of ranks."""
-    square = Polygon(
-        [[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "dirichlet", "dirichlet", "contact"]
-    )
+    square = Polygon(SQUARE.vertices, ["contact", "dirichlet", "dirichlet", "contact"])
     problem = Problem(f=-3.0, obstacle=-0.2)
     one, all_ranks = (
         [

@@ -101,10 +101,9 @@ def steps_by_hand():
     import ufl
     from dolfinx import fem
 
-    from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, solve_in_time
+    from signorini_cr import Contact, Dirichlet, Neumann, Problem, solve_in_time
 
-    edges = ["contact", "neumann", "dirichlet", "neumann"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges).mesh(0.4)
+    domain = helpers.HELD_ABOVE.mesh(0.4)
     t = fem.Constant(domain.mesh, 0.0)
     problem = Problem(
         f=lambda x: -20 * ufl.sin(4 * t) * x[0],

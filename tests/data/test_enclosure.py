@@ -6,6 +6,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import create_unit_square
+from helpers import HELD_ABOVE, HELD_ALL_ROUND, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, exact, solve
@@ -154,8 +155,7 @@ def test_means_over_triangles_and_slabs():
 
 def test_slanted_cells_are_enclosed_in_their_own_coordinates():
     """R is no less than what the best quadratic leaves at random points, and not much more."""
-    sides = ("contact", "dirichlet", "dirichlet", "dirichlet")
-    domain = structured(Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides), 8, WORLD)
+    domain = structured(HELD_ALL_ROUND, 8, WORLD)
     mesh = domain.mesh
     mesh.geometry.x[:, 0] += 50 * mesh.geometry.x[:, 1]
     cells = Cells(domain, fem.functionspace(mesh, ("CR", 1)))
@@ -209,7 +209,7 @@ def weighted_error(solution, normal, breaks, slope, kappa):
 
 
 def square(kind, sides=("contact", "neumann", "dirichlet", "neumann")):
-    polygon = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], list(sides))
+    polygon = Polygon(SQUARE.vertices, sides)
     return structured(polygon, 8) if kind == "squares" else polygon.mesh(0.13)
 
 
@@ -361,7 +361,7 @@ def test_flux_data_with_a_jump_inside_a_facet():
     problem = Problem(
         g=lambda x: ufl.conditional(x[0] < 0.47, -2.0, 0.0), obstacle=-9.0, quadrature_degree=0
     )
-    polygon = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], list(sides))
+    polygon = Polygon(SQUARE.vertices, sides)
     brackets = [solve(problem, structured(polygon, n)).certificate.energy for n in (4, 8, 64)]
     for low, high in brackets[:2]:
         assert low <= brackets[2][0] and brackets[2][1] <= high
@@ -405,9 +405,6 @@ def test_a_jump_along_cell_sides_costs_nothing():
 
 
 def test_same_figures_on_any_number_of_ranks():
-    polygon = Polygon(
-        [[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"]
-    )
     problem = Problem(
         f=lambda x: ufl.conditional(x[0] + 2 * x[1] < 1.1, 3.0, -2.0),
         g=lambda x: ufl.conditional(x[1] < 0.43, 1.0, 0.0),
@@ -415,7 +412,8 @@ def test_same_figures_on_any_number_of_ranks():
         obstacle=lambda x: -0.05 * abs(x[0] - 0.4),
     )
     here, alone = (
-        solve(problem, structured(polygon, 8, comm)).certificate for comm in (WORLD, MPI.COMM_SELF)
+        solve(problem, structured(HELD_ABOVE, 8, comm)).certificate
+        for comm in (WORLD, MPI.COMM_SELF)
     )
     assert np.isclose(here.bound_h1, alone.bound_h1, rtol=1e-5)
     assert np.allclose(here.energy, alone.energy, rtol=1e-5)

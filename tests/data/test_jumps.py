@@ -11,6 +11,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
+from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Domain, Polygon, Problem, solve
@@ -21,7 +22,6 @@ from signorini_cr.data.loads import Certain
 
 pytestmark = pytest.mark.slow
 
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 SIZE = 0.02
 """Of a bound, to which what is missed should be small."""
 
@@ -54,7 +54,7 @@ def in_disc(corners, centre, radius):
 
 def enclosed(f, size=0.13):
     """Moments of f on a mesh of the unit square, and what they miss; also the cells' corners."""
-    solution = solve(Problem(f=f, obstacle=-9.0), SQUARE.mesh(size, MPI.COMM_SELF))
+    solution = solve(Problem(f=f, obstacle=-9.0), HELD_ABOVE.mesh(size, MPI.COMM_SELF))
     data = diffusion(solution.level.data)
     cells = data.cells
     found = Certain.of(data.compiled.f, data.of_f, cells, np.array(1.0), SIZE)
@@ -136,7 +136,7 @@ CURVES = {
 def test_slices_hold_what_is_left_out(name):
     """Where a condition is decided up to a slice, few points of a triangle see the other branch."""
     symbolic, numeric = CURVES[name]
-    mesh = SQUARE.mesh(0.5, MPI.COMM_SELF).mesh
+    mesh = HELD_ABOVE.mesh(0.5, MPI.COMM_SELF).mesh
     g = symbolic(ufl.SpatialCoordinate(mesh))
     expression = lowered(ufl.conditional(ufl.gt(g, 0.0), 1.0, 0.0))
     rng = np.random.default_rng(5)
@@ -179,7 +179,7 @@ def test_data_that_differ_on_a_null_set(datum):
     }[datum]
     sides = ["contact", "neumann", "dirichlet", "dirichlet"]
     mesh = create_unit_square(MPI.COMM_SELF, 8, 8, diagonal=DiagonalType.left)
-    polygon = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides)
+    polygon = Polygon(SQUARE.vertices, sides)
     mesh.topology.create_connectivity(1, 2)
     facets = exterior_facet_indices(mesh.topology)
     x, y = compute_midpoints(mesh, 1, facets)[:, :2].T

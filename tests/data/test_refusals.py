@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from helpers import HELD_ABOVE
 from mpi4py import MPI
 
 from signorini_cr import exact
@@ -271,7 +272,7 @@ def test_a_tensor_that_is_skew_where_the_coarsest_mesh_does_not_look():
     """A finer mesh does, and is refused; the coarsest has no certificate."""
     levels = solve_levels(
         Problem(f=-1.0, obstacle=-0.1, coefficient=skew_in_a_disc),
-        Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ABOVE).mesh(1.0),
+        HELD_ABOVE.mesh(1.0),
         5,
     )
     coarsest = next(levels)

@@ -15,6 +15,7 @@ from dolfinx.mesh import (
     locate_entities_boundary,
     meshtags,
 )
+from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -556,7 +557,6 @@ def test_held_by_contact_alone_the_force_is_what_f_and_g_bring():
 @pytest.mark.parametrize("b, c", [(1e-4, 0.0), (1e-8, 0.0), (0.0, 1e-6), (0.0, 1e-8)])
 def test_what_holds_weakly_beside_contact_costs_nothing(b, c):
     """u = 0.1 sin 3x cos 2y, pressed onto the floor by 2 everywhere."""
-    sides = ("floor", "right", "top", "left")
 
     def u(x):
         return 0.1 * ufl.sin(3 * x[0]) * ufl.cos(2 * x[1])
@@ -575,8 +575,7 @@ def test_what_holds_weakly_beside_contact_costs_nothing(b, c):
         "top": top,
     }
     problem = Problem(f=lambda x: (13 + c) * u(x), reaction=c, conditions=conditions)
-    unit = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides, names=sides)
-    for solution in solve_levels(problem, unit.mesh(0.25, WORLD), 2):
+    for solution in solve_levels(problem, SQUARE.mesh(0.25, WORLD), 2):
         x = ufl.SpatialCoordinate(solution.domain.mesh)
         off = ufl.grad(u(x)) - ufl.grad(solution.u)
         error = np.sqrt(integral(ufl.inner(off, off), solution.domain.mesh))
@@ -592,9 +591,7 @@ def test_a_step_of_the_obstacle_at_a_vertex(element):
         def alpha(x, less=less, high=high, low=low):
             return ufl.conditional(less(x[0], 0.5), high, low)
 
-        corners = [[0, 0], [1, 0], [1, 1], [0, 1]]
-        unit = Polygon(corners, ("contact", "neumann", "dirichlet", "neumann"))
-        domain = structured(unit, 8, WORLD)
+        domain = structured(HELD_ABOVE, 8, WORLD)
         solution = solve(Problem(f=-4.0, obstacle=alpha), domain, element)
         found.append((solution.contact.force, solution.certificate.bound_h1))
     (force, bound), *others = found

@@ -5,7 +5,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import create_rectangle, exterior_facet_indices, meshtags
-from helpers import of_gradients
+from helpers import HELD_ALL_ROUND, of_gradients
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -21,7 +21,6 @@ from signorini_cr.mesh.families import structured
 pytestmark = pytest.mark.ranks
 
 WORLD = MPI.COMM_WORLD
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", *["dirichlet"] * 3])
 CORNERS = Polygon(
     [[0, 0], [3, -0.4], [3.6, 1.1], [1.2, 1.4], [0.2, 2.0]],
     ["contact", "contact", "dirichlet", "neumann", "dirichlet"],
@@ -33,7 +32,7 @@ PUSHED = Problem(
 
 
 def cells_of(n, stretched=False, comm=WORLD):
-    domain = structured(SQUARE, n, comm, jitter=0.2)
+    domain = structured(HELD_ALL_ROUND, n, comm, jitter=0.2)
     V = fem.functionspace(domain.mesh, ("CR", 1))
     cells = Cells(domain, V)
     if stretched:

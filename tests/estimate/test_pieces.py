@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import of_gradients
+from helpers import SQUARE, of_gradients
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
@@ -43,7 +43,6 @@ from signorini_cr.mesh.domain import DIRICHLET, NEUMANN
 from signorini_cr.mesh.families import structured
 
 WORLD = MPI.COMM_WORLD
-SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
 
 
 def gauss(n):
@@ -52,7 +51,7 @@ def gauss(n):
 
 
 def square(n, sides=("contact", "dirichlet", "dirichlet", "dirichlet"), comm=WORLD, jitter=0.2):
-    return structured(Polygon(SQUARE, sides), n, comm, jitter=jitter)
+    return structured(Polygon(SQUARE.vertices, sides), n, comm, jitter=jitter)
 
 
 # ---- liftings

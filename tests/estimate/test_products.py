@@ -9,6 +9,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import compute_midpoints, create_box, exterior_facet_indices, meshtags
+from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Polygon, Problem, solve
@@ -31,13 +32,11 @@ from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
 
-SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
-SIDES = ("contact", "neumann", "dirichlet", "neumann")
 DIRICHLET = 2
 
 
 def square(n=2):
-    return structured(Polygon(SQUARE, SIDES), n, MPI.COMM_SELF, jitter=0.2)
+    return structured(HELD_ABOVE, n, MPI.COMM_SELF, jitter=0.2)
 
 
 class Points:
@@ -572,7 +571,7 @@ def test_signs_that_are_certain():
     u is affine, so that u_h is u and only rounding is left, but for the weight's liftings.
     """
     sides = ("dirichlet", "contact", "dirichlet", "contact")
-    domain = structured(Polygon(SQUARE, sides), 3, jitter=0.2)
+    domain = structured(Polygon(SQUARE.vertices, sides), 3, jitter=0.2)
     solution = solve(Problem(dirichlet=lambda x: 3 * x[1], obstacle=-9.0), domain)
     forms = diffusion(solution.level.data).forms
     bounded, fixed = list(forms.bounded), list(forms.fixed)

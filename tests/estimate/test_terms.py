@@ -16,7 +16,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
-from helpers import SQUARE
+from helpers import HELD_ALL_ROUND, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -283,9 +283,7 @@ def left_by_numpy(x):
 
 
 def square(n=4, jitter=0.2, comm=WORLD):
-    polygon = Polygon(
-        [[0, 0], [1, 0], [1, 1], [0, 1]], ("contact", "neumann", "dirichlet", "dirichlet")
-    )
+    polygon = Polygon(SQUARE.vertices, ("contact", "neumann", "dirichlet", "dirichlet"))
     return structured(polygon, n, comm, jitter=jitter)
 
 
@@ -392,8 +390,7 @@ def test_data_that_are_not_affine_on_thin_cells(monkeypatch):
 def test_a_cubic_solution_on_thin_cells(monkeypatch):
     """Its values on the boundary need no lifting."""
     monkeypatch.setattr(cusps, "HOLDS", np.inf)
-    polygon = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ("contact", *["dirichlet"] * 3))
-    domain = structured(polygon, 8)
+    domain = structured(HELD_ALL_ROUND, 8)
     domain.mesh.geometry.x[:, 0] += 50 * domain.mesh.geometry.x[:, 1]
     f = lambda x: -6 * x[0] / 51**3 - 2 + 6 * x[1]  # noqa: E731
     u_D = lambda x: (x[0] / 51) ** 3 + x[1] ** 2 - x[1] ** 3  # noqa: E731

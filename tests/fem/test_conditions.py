@@ -13,6 +13,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
+from helpers import SIDES, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -39,7 +40,6 @@ from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.transfer import inclusion
 from signorini_cr.vi.level import Level
 
-SQUARE = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
 PARTS = ("contact", "neumann", "dirichlet", "dirichlet")
 
 
@@ -72,7 +72,7 @@ SPRUNG = Problem(
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
 def test_another_kind_is_solved_right(element):
-    domain = Polygon(SQUARE, PARTS).mesh(0.25)
+    domain = Polygon(SQUARE.vertices, PARTS).mesh(0.25)
     *_, coarse, fine = solve_levels(SPRUNG, domain, 4, element)
     assert coarse.errors and fine.errors
     h1, l2 = np.log2(np.array(coarse.errors) / np.array(fine.errors))
@@ -83,7 +83,7 @@ def test_another_kind_is_solved_right(element):
 
 
 def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows():
-    domain = Polygon(SQUARE, PARTS).mesh(0.3)
+    domain = Polygon(SQUARE.vertices, PARTS).mesh(0.3)
     mesh = NestedMesh(Diffusion(SPRUNG, domain.mesh), domain)
     level, (operator, p1, dirichlet) = Level((mesh,)), conforming(mesh)
     product = level.system.A.ptap(inclusion(p1, Layout.of_space(level.V)).matrix())
@@ -110,7 +110,7 @@ def waves(x):
 
 def on_the_square(conditions, size=0.25, **data):
     """A problem with each edge a part of its own, and its domain."""
-    domain = Polygon(SQUARE, NAMES, names=NAMES).mesh(size)
+    domain = Polygon(SQUARE.vertices, NAMES, names=NAMES).mesh(size)
     return Problem(conditions=dict(zip(NAMES, conditions, strict=True)), **data), domain
 
 
@@ -175,8 +175,7 @@ def test_a_stiff_spring_is_a_dirichlet_condition():
 @pytest.mark.parametrize("levels", [1, 3])
 def test_numbers_may_be_constants_and_functions_of_degree_0(levels):
     """Losses of two walls, and a reaction: each way to give them has the same certificate."""
-    edges = ["floor", "right", "roof", "left"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=edges).mesh(0.3)
+    domain = SQUARE.mesh(0.3)
     zero = fem.functionspace(domain.mesh, ("DG", 0))
     of_walls, everywhere = fem.Function(zero), fem.Function(zero)
     of_walls.interpolate(lambda x: np.where(x[0] < 0.5, 2.0, 5.0))
@@ -191,11 +190,11 @@ def test_numbers_may_be_constants_and_functions_of_degree_0(levels):
         conditions = {
             "floor": Contact(-0.1, coefficient=half if right is of_walls else 0.5),
             "right": Robin(1.0, coefficient=right),
-            "roof": Neumann(),
+            "top": Neumann(),
             "left": Robin(coefficient=left, external=-0.2),
         }
         *_, last = solve_levels(Problem(f=-3.0, reaction=c, conditions=conditions), domain, levels)
-        inflow = mean(last, "roof")
+        inflow = mean(last, "top")
         bound = last.certificate.bound_energy_norm
         found.append([bound, *last.certificate.energy, inflow.lower, inflow.upper])
         assert inflow.lower < inflow.upper < inflow.lower + 0.1
@@ -286,9 +285,8 @@ def test_boundary_data_are_sampled_once_a_mesh(monkeypatch):
 @pytest.mark.parametrize("element", ["CR", "P1"])
 def test_one_form_is_compiled_for_all_numbers(element):
     """The bilinear form of other numbers is the same library, and each matrix has its own."""
-    edges = ["floor", "right", "top", "left"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=edges).mesh(0.5)
-    walls = {name: Dirichlet(0.0) for name in edges[:-1]}
+    domain = SQUARE.mesh(0.5)
+    walls = {name: Dirichlet(0.0) for name in SIDES[:-1]}
     walls["floor"] = Contact(0.0)
     found, norms = set(), []
     for factor in (1.0, 3.0):

@@ -16,6 +16,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
+from helpers import SQUARE
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -532,7 +533,7 @@ def test_a_constant_added_to_the_data_changes_nothing():
             obstacle=lambda x: c + 0.2 * x[1] * (1 - x[1]),
             dirichlet=c,
         )
-        square = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact"] * 3 + ["dirichlet"])
+        square = Polygon(SQUARE.vertices, ["contact"] * 3 + ["dirichlet"])
         return last(problem, square.mesh(0.3), 4)
 
     plain, lifted = shifted(0.0), shifted(1e3)

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers import SQUARE
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import Contact, Dirichlet, Neumann, Polygon, Problem, Solver
+from signorini_cr import Contact, Dirichlet, Neumann, Problem, Solver
 from signorini_cr.multigrid.constrained import ConstrainedMatrix
 from signorini_cr.multigrid.whole import Whole
 
@@ -39,15 +40,13 @@ def test_any_active_set():
 
 @pytest.mark.serial
 def test_a_linear_system_of_a_solver_takes_one_step():
-    edges = ["floor", "right", "top", "left"]
-    square = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=edges)
     problem = Problem(
         f=lambda x: 10.0 * (0.4 - x[0]),
         coefficient=lambda x: 1.0 + x[1],
         conditions={"right": Neumann(), "left": Neumann()}
         | {"floor": Contact(-0.05), "top": Dirichlet(0.0)},
     )
-    with Solver(problem, square.mesh(0.1)) as solver:
+    with Solver(problem, SQUARE.mesh(0.1)) as solver:
         solution = solver.solve()
         assert 0 < solution.contact.number_active < solution.contact.number
         assert solution.iterations.linear == solution.iterations.newton

@@ -11,7 +11,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
-from helpers import rectangle
+from helpers import SQUARE, rectangle
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -80,7 +80,7 @@ def test_the_mesh_shows_each_boundary_part_in_its_colour(shared_tmp_path):
 
 def test_the_mesh_tells_what_holds_on_parts_of_other_names():
     sides = ["floor", "air", "top in $", "wall"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides, names=sides).mesh(0.5, WORLD)
+    domain = Polygon(SQUARE.vertices, sides, names=sides).mesh(0.5, WORLD)
     held = {"floor": Contact(0.0), "air": Robin(0.0), "top in $": Dirichlet(0.0), "wall": Neumann()}
     figure = plots.plot_mesh(domain, problem=Problem(conditions=held))
     bare = plots.plot_mesh(domain)

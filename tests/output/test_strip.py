@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers import HELD_ABOVE
 from mpi4py import MPI
 
-from signorini_cr import InputError, Polygon, Problem, solve
+from signorini_cr import InputError, Problem, solve
 from signorini_cr.output import canvas
 from signorini_cr.output.plots import drawn
 from signorini_cr.output.strip import MOST, chosen, moment, plot_strip
@@ -26,8 +27,7 @@ def test_first_and_last_are_among_the_steps_chosen(steps):
 
 def test_a_strip_shows_what_touches_when(shared_tmp_path):
     """All of Γ1 first, pressed down by the load, and nothing of it then: u = 2 (1 − y²)."""
-    sides = ["contact", "neumann", "dirichlet", "neumann"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides).mesh(0.3)
+    domain = HELD_ABOVE.mesh(0.3)
     moments = [
         moment(time, solve(Problem(f=load, obstacle=-0.1, dirichlet=0.0), domain))
         for time, load in ((1.0, -4.0), (2.0, 4.0))
@@ -55,8 +55,7 @@ def test_a_strip_shows_what_touches_when(shared_tmp_path):
 @pytest.mark.parametrize("number", [1, 4, 5, 6])
 def test_a_strip_of_any_number_of_moments(number, shared_tmp_path):
     """Places in the last row may be left over."""
-    sides = ["contact", "neumann", "dirichlet", "neumann"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], sides).mesh(0.5)
+    domain = HELD_ABOVE.mesh(0.5)
     solution = solve(Problem(f=-4.0, obstacle=-0.1), domain)
     moments = [moment(float(k), solution) for k in range(number)]
     figure = drawn(COMM, lambda: plot_strip(moments, shared_tmp_path / f"{number}.png"))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from helpers import HELD_ALL_ROUND, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Contact, Dirichlet, Polygon, Problem, plots, solve
@@ -17,7 +18,6 @@ from signorini_cr.output.touching import contact_lines
 pytest.importorskip("matplotlib")
 WORLD = MPI.COMM_WORLD
 LONG = "A membrane over a floor of gentle waves, pulled down in the middle by 5 $ of weight"
-SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
 THIN = [[0, 0], [1, 0], [1, 30], [0, 30]]
 
 
@@ -35,7 +35,7 @@ def overhang(figure):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("vertices", "size"), [(SQUARE, 0.25), (THIN, 1.0)])
+@pytest.mark.parametrize(("vertices", "size"), [(SQUARE.vertices, 0.25), (THIN, 1.0)])
 def test_nothing_is_cut_off(vertices, size):
     solution = solved(vertices, {0, 2}, size)
     rows = [{"h": h, "dofs": 1 / h, "error_h1": h, "error_l2": 0.9 * h, "bound_h1": 1.1 * h,
@@ -53,7 +53,7 @@ def test_nothing_is_cut_off(vertices, size):
 @pytest.mark.parametrize("edge", [0, 2])
 def test_contact_runs_from_the_left_to_the_right_on_any_edge(edge):
     """In the arc length of contact.csv, which decreases on an upper edge, as Ω is to the left."""
-    solution = solved(SQUARE, {edge}, 0.1)
+    solution = solved(SQUARE.vertices, {edge}, 0.1)
     figure = plots.plot_contact(solution)
     table, transitions = solution.contact.table(), solution.contact.transitions
     if figure is None:
@@ -79,7 +79,7 @@ def test_contact_runs_from_the_left_to_the_right_on_any_edge(edge):
 def test_the_screen_tells_places_in_the_order_of_arc_length(edge):
     bump = Problem(f=lambda x: 300 * ufl.cos(6 * np.pi * x[0]))
     sides = ["contact" if i == edge else "dirichlet" for i in range(4)]
-    solution = solve(bump, Polygon(SQUARE, sides).mesh(0.05))
+    solution = solve(bump, Polygon(SQUARE.vertices, sides).mesh(0.05))
     table, points = solution.contact.table(), solution.contact.transitions[:, 0]
     assert len(points) > 2
     if table is not None:
@@ -107,8 +107,7 @@ def test_bounds_have_their_names(bounds, names, signs):
         "dirichlet": Dirichlet(0.0),
     }  # fmt: skip
     problem = Problem(f=lambda x: 8 * ufl.sin(6 * x[0]), conditions=conditions)
-    sides = ["contact", "dirichlet", "dirichlet", "dirichlet"]
-    figure = plots.plot_contact(solve(problem, Polygon(SQUARE, sides).mesh(0.2)))
+    figure = plots.plot_contact(solve(problem, HELD_ALL_ROUND.mesh(0.2)))
     if figure is None:
         return
     axes = figure.axes[0]
@@ -118,7 +117,7 @@ def test_bounds_have_their_names(bounds, names, signs):
 
 
 def test_the_mark_sits_where_the_bar_ends():
-    solution = solved(SQUARE, {2}, 0.1)
+    solution = solved(SQUARE.vertices, {2}, 0.1)
     touching, free = contact_lines(solution.contact)
     point = solution.contact.transitions[0, :2]
     if WORLD.rank > 0:
@@ -134,7 +133,7 @@ def test_the_mark_sits_where_the_bar_ends():
 
 def test_means_at_vertices_are_those_of_the_cells_around():
     """Exact for a continuous function, and the mean of both sides for one that jumps."""
-    domain = Polygon(SQUARE, ["contact", "dirichlet", "dirichlet", "dirichlet"]).mesh(0.3)
+    domain = HELD_ALL_ROUND.mesh(0.3)
     u = fem.Function(function_space(domain.mesh, "CR"))
     u.interpolate(lambda x: 2 * x[0] - 3 * x[1])
     u.x.scatter_forward()

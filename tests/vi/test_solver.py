@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx.fem import Function
+from helpers import HELD_ABOVE
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -28,12 +29,11 @@ from signorini_cr.vi.stopping import WINDOWS
 
 pytestmark = pytest.mark.ranks
 
-SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 PROBLEM = Problem(f=lambda x: 2 * np.pi * ufl.sin(2 * np.pi * x[0]))
 
 
 def test_bounds_on_contact_facets_only():
-    solution = solve(PROBLEM, SQUARE.mesh(0.1))
+    solution = solve(PROBLEM, HELD_ABOVE.mesh(0.1))
     lower = solution.level.system.lower
     V = solution.u.function_space
     bounded = np.flatnonzero(lower > PETSc.NINFINITY)
@@ -46,7 +46,7 @@ def test_bounds_on_contact_facets_only():
 def test_failure_names_the_reason(options):
     options("snes_max_it", 1)
     with pytest.raises(NotConverged, match="DIVERGED_MAX_IT") as caught:
-        solve(PROBLEM, SQUARE.mesh(0.05))
+        solve(PROBLEM, HELD_ABOVE.mesh(0.05))
     assert caught.value.level == 0
 
 
@@ -56,14 +56,14 @@ def test_linear_failure_is_named(options):
     options("pc_type", "none")
     said = r"DIVERGED_LINEAR_SOLVE \(KSP DIVERGED_(MAX_IT|ITS)\) after 0 .* and 1 linear"
     with pytest.raises(NotConverged, match=said):
-        solve(PROBLEM, SQUARE.mesh(0.05))
+        solve(PROBLEM, HELD_ABOVE.mesh(0.05))
 
 
 @pytest.mark.parametrize("name", ["ksp_type", "pc_type", "snes_type"])
 def test_unknown_types_are_the_users_mistake(options, name):
     options(name, "nonsense")
     with pytest.raises(InputError, match=r"begins with -signorini_: Unable to find .* nonsense"):
-        solve(PROBLEM, SQUARE.mesh(0.25))
+        solve(PROBLEM, HELD_ABOVE.mesh(0.25))
 
 
 @pytest.mark.parametrize(
@@ -78,19 +78,19 @@ def test_solvers_that_do_not_suit_are_the_users_mistake(options, name, value, wo
     options(name, value)
     said = f"PETSc can't solve with -signorini_{name} {value}: .*{words}"
     with pytest.raises(InputError, match=said):
-        solve(PROBLEM, SQUARE.mesh(0.25))
+        solve(PROBLEM, HELD_ABOVE.mesh(0.25))
 
 
 def test_a_petsc_of_other_numbers(monkeypatch):
     monkeypatch.setattr(PETSc, "ScalarType", np.complex128)
     with pytest.raises(InputError, match="PETSc's numbers are complex128; float64 is needed"):
-        solve(PROBLEM, SQUARE.mesh(0.5))
+        solve(PROBLEM, HELD_ABOVE.mesh(0.5))
 
 
 def test_one_rank_alone_may_monitor():
     seen = []
     monitor = (lambda *facts: seen.append(facts)) if MPI.COMM_WORLD.rank == 0 else None
-    solution = solve(PROBLEM, SQUARE.mesh(0.1), monitor=monitor)
+    solution = solve(PROBLEM, HELD_ABOVE.mesh(0.1), monitor=monitor)
     steps = solution.iterations.newton + 1
     assert len(seen) == (steps if MPI.COMM_WORLD.rank == 0 else 0)
 
@@ -103,7 +103,7 @@ def test_what_a_monitor_raises_reaches_the_caller():
         raise Enough("of that")
 
     with pytest.raises(Enough, match=r"^of that$"):
-        solve(PROBLEM, SQUARE.mesh(0.25), monitor=monitor)
+        solve(PROBLEM, HELD_ABOVE.mesh(0.25), monitor=monitor)
 
 
 @pytest.mark.parametrize("height", [0.0, 1.0, -0.3])
@@ -127,7 +127,7 @@ def test_garbage_may_pile_up_when_a_monitor_raises():
         gc.set_threshold(1)
         raise KeyError("ours")
 
-    mesh = SQUARE.mesh(0.25)
+    mesh = HELD_ABOVE.mesh(0.25)
     try:
         with pytest.raises(KeyError, match="ours"):
             solve(PROBLEM, mesh, monitor=monitor)
@@ -149,9 +149,9 @@ def test_what_petsc_loses_on_the_way_reaches_the_caller():
 
 
 def test_the_bottom_solver_is_named(options):
-    named = [solve(PROBLEM, SQUARE.mesh(0.25)).iterations.preconditioner]
+    named = [solve(PROBLEM, HELD_ABOVE.mesh(0.25)).iterations.preconditioner]
     options("bottom_pc_type", "jacobi")
-    named.append(solve(PROBLEM, SQUARE.mesh(0.25)).iterations.preconditioner)
+    named.append(solve(PROBLEM, HELD_ABOVE.mesh(0.25)).iterations.preconditioner)
     assert "a direct solver" in named[0]
     assert "jacobi (option -signorini_bottom_pc_type)" in named[1]
 
@@ -162,10 +162,10 @@ def test_coordinates_whose_squares_overflow_are_refused():
 
 
 def test_options_choose_another_solver(options):
-    reference = solve(PROBLEM, SQUARE.mesh(0.1))
+    reference = solve(PROBLEM, HELD_ABOVE.mesh(0.1))
     options("ksp_type", "minres")
     options("pc_type", "jacobi")
-    other = solve(PROBLEM, SQUARE.mesh(0.1))
+    other = solve(PROBLEM, HELD_ABOVE.mesh(0.1))
     assert other.iterations.preconditioner.startswith("jacobi")
     assert other.iterations.linear > reference.iterations.linear
     assert np.allclose(other.u.x.array, reference.u.x.array, atol=1e-7)
@@ -174,7 +174,7 @@ def test_options_choose_another_solver(options):
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("key", ["f", "obstacle", "coefficient"])
 def test_a_function_of_one_mesh_is_not_taken_to_another(key, element):
-    domain = SQUARE.mesh(0.25)
+    domain = HELD_ABOVE.mesh(0.25)
     function = Function(function_space(domain.mesh, "P1"))
     function.x.array[:] = 1.0
     data = {"f": -1.0, "dirichlet": 2.0} | {key: function}
@@ -197,7 +197,7 @@ def test_coefficients_of_any_magnitude(scale, shift, levels):
             dirichlet=lambda x: shift + 1.0 + x[0],
             coefficient=scale,
         )
-        *_, solution = solve_levels(problem, SQUARE.mesh(0.02 if levels == 1 else 0.2), levels)
+        *_, solution = solve_levels(problem, HELD_ABOVE.mesh(0.02 if levels == 1 else 0.2), levels)
         return solution
 
     one, scaled = last(1.0, shift), last(scale, shift)
@@ -211,7 +211,7 @@ def test_coefficients_of_any_magnitude(scale, shift, levels):
 @pytest.mark.parametrize("value", [-1.0, 0.0, lambda x: x[0] - 0.5, lambda x: 1 / (x[0] - x[0])])
 def test_a_coefficient_that_is_not_positive_is_refused(value):
     with pytest.raises(InputError, match="coefficient"):
-        solve(Problem(f=-1.0, coefficient=value), SQUARE.mesh(0.2))
+        solve(Problem(f=-1.0, coefficient=value), HELD_ABOVE.mesh(0.2))
 
 
 @pytest.mark.parametrize(
@@ -236,15 +236,15 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
 )
 def test_data_that_are_no_numbers_are_refused(data, said):
     with pytest.raises(InputError, match=said):
-        solve(Problem(**data), SQUARE.mesh(0.2))
+        solve(Problem(**data), HELD_ABOVE.mesh(0.2))
 
 
 @pytest.mark.parametrize("key", ["f", "coefficient", "obstacle"])
 def test_data_on_another_mesh_are_refused(key):
-    other = Function(function_space(SQUARE.mesh(0.2).mesh, "P1"))
+    other = Function(function_space(HELD_ABOVE.mesh(0.2).mesh, "P1"))
     other.x.array[:] = 1.0
     with pytest.raises(InputError, match=f"{key} is given on another mesh"):
-        solve(Problem(**{key: other}), SQUARE.mesh(0.2))
+        solve(Problem(**{key: other}), HELD_ABOVE.mesh(0.2))
 
 
 @pytest.mark.parametrize("name", ["quadrature_degree", "error_degree"])
@@ -279,7 +279,7 @@ def test_an_obstacle_that_is_no_number_at_one_vertex_is_refused_on_any_number_of
 )
 def test_data_that_are_too_large_are_refused(data, element):
     with pytest.raises(InputError, match=r"squares overflow|obstacle is not finite"):
-        solve(Problem(**data), SQUARE.mesh(0.25), element)
+        solve(Problem(**data), HELD_ABOVE.mesh(0.25), element)
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
@@ -301,19 +301,19 @@ def test_ranks_without_cells(element, f):
 def test_a_tolerance_that_is_none_is_the_users_mistake(options, value, said):
     options("snes_atol", value)
     with pytest.raises(InputError, match=said):
-        solve(PROBLEM, SQUARE.mesh(0.25))
+        solve(PROBLEM, HELD_ABOVE.mesh(0.25))
 
 
 def test_a_tolerance_of_zero_ends_in_rounding(options):
     options("snes_atol", 0)
-    *_, solution = solve_levels(PROBLEM, SQUARE.mesh(0.2), 3)
+    *_, solution = solve_levels(PROBLEM, HELD_ABOVE.mesh(0.2), 3)
     assert solution.contact.kkt.residual < 1e-12
 
 
 def test_a_smaller_tolerance_costs_no_newton_steps(options):
-    usual = solve(PROBLEM, SQUARE.mesh(0.05))
+    usual = solve(PROBLEM, HELD_ABOVE.mesh(0.05))
     options("snes_atol", 1e-12 * usual.level.system.residual_scale)
-    exact = solve(PROBLEM, SQUARE.mesh(0.05))
+    exact = solve(PROBLEM, HELD_ABOVE.mesh(0.05))
     assert exact.contact.kkt.residual <= 1e-12
     assert exact.iterations.newton == usual.iterations.newton
     assert exact.iterations.linear > usual.iterations.linear
@@ -321,13 +321,13 @@ def test_a_smaller_tolerance_costs_no_newton_steps(options):
 
 def test_no_option_is_left_behind():
     before = PETSc.Options().getAll()
-    solve(PROBLEM, SQUARE.mesh(0.2))
+    solve(PROBLEM, HELD_ABOVE.mesh(0.2))
     assert PETSc.Options().getAll() == before
 
 
 def test_monitor_sees_every_step():
     seen = []
-    solution = solve(PROBLEM, SQUARE.mesh(0.05), monitor=lambda *facts: seen.append(facts))
+    solution = solve(PROBLEM, HELD_ABOVE.mesh(0.05), monitor=lambda *facts: seen.append(facts))
     steps = [fact[1] for fact in seen]
     assert steps == list(range(solution.iterations.newton + 1))
     assert seen[-1][2] <= 1e-8 * solution.level.system.residual_scale
@@ -339,9 +339,9 @@ def test_monitor_sees_every_step():
 @pytest.mark.parametrize("scale", [1e-35, 1e-8, 1.0, 1e8])
 def test_data_of_any_magnitude(scale):
     """u is linear in the data while the obstacle is 0: nothing in the solver is absolute."""
-    one = solve(PROBLEM, SQUARE.mesh(0.1))
+    one = solve(PROBLEM, HELD_ABOVE.mesh(0.1))
     scaled = solve(
-        Problem(f=lambda x: scale * 2 * np.pi * ufl.sin(2 * np.pi * x[0])), SQUARE.mesh(0.1)
+        Problem(f=lambda x: scale * 2 * np.pi * ufl.sin(2 * np.pi * x[0])), HELD_ABOVE.mesh(0.1)
     )
     assert np.allclose(scaled.u.x.array / scale, one.u.x.array, atol=1e-7)
     assert scaled.contact.number_active == one.contact.number_active
@@ -349,14 +349,14 @@ def test_data_of_any_magnitude(scale):
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
 def test_zero_data_give_zero(element):
-    solution = solve(Problem(), SQUARE.mesh(0.25), element)
+    solution = solve(Problem(), HELD_ABOVE.mesh(0.25), element)
     assert np.all(solution.u.x.array == 0.0)
     assert solution.energy == 0.0
 
 
 def test_levels_start_where_the_one_below_ended():
     """Each mesh has four times the cells, and energies of CR approach J from below (numerics E)."""
-    solutions = list(solve_levels(PROBLEM, SQUARE.mesh(0.25), 4))
+    solutions = list(solve_levels(PROBLEM, HELD_ABOVE.mesh(0.25), 4))
     cells = [solution.cells for solution in solutions]
     assert cells == [cells[0] * 4**k for k in range(4)]
     energies = np.array([solution.energy for solution in solutions])
@@ -385,7 +385,7 @@ def test_what_python_shows_is_a_line() -> None:
 def test_windows_are_where_the_dofs_are(element):
     """Squares along Γ1 by coordinates that DOLFINx gives, whichever rank has a dof's facets."""
     size = 0.05
-    solution = solve(PROBLEM, SQUARE.mesh(size), element=element)
+    solution = solve(PROBLEM, HELD_ABOVE.mesh(size), element=element)
     system, V = solution.level.system, solution.u.function_space
     x = V.tabulate_dof_coordinates()[system.bounded, 0]
     everywhere = np.concatenate(MPI.COMM_WORLD.allgather(x))

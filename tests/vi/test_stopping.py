@@ -394,7 +394,7 @@ def test_a_piece_that_nothing_holds_is_named(f):
 def test_a_net_force_that_quadrature_makes_is_none(element):
     """That of sin 2πx, and of a flux against it; what is there is seen behind what oscillates."""
     edges = ["floor", "neumann", "neumann", "neumann"]
-    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], edges, names=("floor",)).mesh(0.3)
+    domain = Polygon(SQUARE.vertices, edges, names=("floor",)).mesh(0.3)
     floor = {"floor": Contact(0.0)}
     wave = lambda x: 3.0 * ufl.sin(2.0 * np.pi * x[0])  # noqa: E731
     for data in ({"f": wave}, {"f": lambda x: -ufl.exp(x[0]), "g": (np.e - 1.0) / 3.0}):
