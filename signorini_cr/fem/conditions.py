@@ -261,7 +261,7 @@ class Robin(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Contact(Condition):
-    """α ≤ u ≤ β: λ = κ∂ₙu + b (u − u_ext) − g is not below 0 where u > α, nor above 0 where u < β.
+    """α ≤ u ≤ β: λ = κ∂ₙu + b (u − u_ext) − g is not below 0 where u < β, nor above 0 where u > α.
 
     So λ = 0 between the bounds; with α alone it is the condition u ≥ α, λ ≥ 0, λ (u − α) = 0.
 
