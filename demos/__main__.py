@@ -45,7 +45,7 @@ in {minutes:.1f} minutes of processor time of each rank; the finest meshes have
 {dofs:,} degrees of freedom. Every demo ends in assertions, so that the page is there only if they
 hold. The examples (S1, A, B, C 7/2, C 11/2, D, E, I, L) are those of `signorini_cr.exact`, where C
 and C2 stand for C 7/2 and C 11/2; h is the largest diameter of a triangle, and rates are those
-between a level and the one before it.
+between a level and the one before it. [The method](method.md) has the formulas up to (2.2).
 
 | statement | seen in |
 |---|---|

@@ -23,7 +23,8 @@ exclude_patterns = ["_build"]
 html_theme = "furo"
 # Formulas are drawn by a file of the site's own: it is to be read without a network.
 mathjax = Path(find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
-html_static_path = [str(mathjax / "tex-svg.js")]
+html_static_path = [str(mathjax / "tex-svg.js"), "site.css"]
+html_css_files = ["site.css"]
 mathjax_path = "tex-svg.js"
 html_title = "signorini_cr"
 # Debian's Sphinx and pip's spell some things differently; words in code are left as they are.

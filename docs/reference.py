@@ -124,7 +124,8 @@ is `scr.__version__`. All functions are collective: every rank calls them. Lengt
 of the mesh, u in those of the data.
 
 There is a line for each name. `help(signorini_cr.solve_adaptive)` says the same, with what it
-takes, returns and raises, and so for the others. The site that `make docs` makes has that below
+takes, returns and raises, and so for the others; numbers such as (1.6) are those of formulas in
+[the method](method.md). The site that `make docs` makes has that below
 each table, where the repository has a list of names.
 
 | type | what it is |

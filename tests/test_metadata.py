@@ -90,16 +90,18 @@ def test_the_long_description_does_without_the_folder():
 
 
 @pytest.mark.serial
-def test_formulas_lead_to_functions():
-    """Those that the certificate's page names exist, and another page tells of each."""
+@pytest.mark.parametrize(("page", "least"), [("method", 30), ("certificate", 30)])
+def test_formulas_lead_to_functions(page, least):
+    """Those that the page names exist, and another page tells of each, or of its module."""
     docs = ROOT / "docs"
-    names = re.findall(
-        r"\{py:\w+\}`(?:[^`<]*<)?([\w.]+)>?`", (docs / "certificate.md").read_text(encoding="utf-8")
-    )
-    assert len(names) > 30
+    text = (docs / f"{page}.md").read_text(encoding="utf-8")
+    names = re.findall(r"\{py:\w+\}`(?:[^`<]*<)?([\w.]+)>?`", text)
+    assert len(names) > least
     told = "".join((docs / page).read_text(encoding="utf-8") for page in ("inside.md", "python.md"))
+    modules = re.findall(r"automodule:: ([\w.]+)$", told, re.MULTILINE)
     for name in names:
-        assert re.search(rf":: {re.escape(name)}$", told, re.MULTILINE), name
+        of_module = name.rpartition(".")[0] in modules
+        assert of_module or re.search(rf":: {re.escape(name)}$", told, re.MULTILINE), name
         thing = signorini_cr
         for part in name.split(".")[1:]:
             module = f"{thing.__name__}.{part}"
@@ -117,6 +119,23 @@ def test_formulas_keep_their_numbers():
     ]  # fmt: skip
     assert set(re.findall(r"\{eq\}`([\w-]+)`", text)) <= set(labels)
     assert len(labels) == len(set(labels))
+
+
+@pytest.mark.serial
+def test_numbers_of_the_paper_have_formulas():
+    """The method's page has a formula for each that a docstring cites, and refers to its own."""
+    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    formulas = re.findall(r"^\$\$\n(.*?)^\$\$(?: \(([\w-]+)\))?$", text, re.MULTILINE | re.DOTALL)
+    tags = re.findall(r"\\tag\{([\d.]+)\}", text)
+    assert len(formulas) > 15 and all(("\\tag{" in tex) != bool(label) for tex, label in formulas)
+    # Sphinx makes lines of what has any, and MathJax has no tags in there
+    assert not any("\\tag{" in tex and "\\\\" in tex for tex, _ in formulas)
+    assert set(re.findall(r"\{eq\}`([\w-]+)`", text)) <= {label for _, label in formulas}
+    modules = (ROOT / "signorini_cr").rglob("*.py")
+    code = "".join(module.read_text(encoding="utf-8") for module in modules)
+    cited = set(re.findall(r"(?<![\w)\]}])\(([12]\.\d+)\)", code))
+    assert {"1.6", "1.7", "1.8", "2.2"} <= set(tags) and cited <= set(tags), cited ^ set(tags)
+    assert len(tags) == len(set(tags))
 
 
 @pytest.mark.serial
