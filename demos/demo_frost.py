@@ -18,7 +18,7 @@
 #     mpirun -n 2 python3 demos/demo_frost.py [FOLDER]
 
 # %%
-from math import ceil, floor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,6 @@ from signorini_cr import (
     plots,
     solve,
     solve_in_time,
-    solve_levels,
 )
 from signorini_cr.app.problemfile import load
 from signorini_cr.output.strip import chosen, moment, plot_strip
@@ -54,12 +53,13 @@ CAPACITY = 583.3  # W h/(m³ K)
 # %% [markdown]
 # ## A cold day
 # Air of −5 °C above and below, warm air in two ducts; the interval holds the heat itself, not only
-# that of a mesh.
+# that of a mesh. The meshes are those that the problem file asks for.
 
 # %%
 case = load(MESHES / "deck.toml")
+case = replace(case, levels=levels_wanted(case.levels))
 found = []
-for solution in solve_levels(case.problem, case.mesh(), levels_wanted(6)):
+for solution in case.solutions(case.mesh()):
     found.append((solution.cells, *force.flux(solution, "surface")))
 cells, values, lower, upper = map(np.array, zip(*found, strict=True))
 lower, upper = study.intervals(
@@ -74,23 +74,24 @@ def draw(field, below, table):
     """The heat along the surface."""
     field.set_xlabel("")
     order = np.argsort(table["x"])
-    x, heat = (np.asarray(table[name])[order] for name in ("x", "pressure"))
-    below.fill_between(x, heat, color=canvas.RED, alpha=0.35, step="mid")
-    below.step(x, heat, color=canvas.RED, where="mid")
+    length, heat = (np.asarray(table[name])[order] for name in ("length", "pressure"))
+    ends = np.append(0.0, np.cumsum(length))
+    below.stairs(heat, ends, color=canvas.RED, alpha=0.35, fill=True)
+    below.stairs(heat, ends, color=canvas.RED, linewidth=1.8)
     below.set_xlabel("$x$ in m", fontsize=13)
     below.set_ylabel("heat needed in W/m²", fontsize=13)
     below.set_ylim(0.0)
     below.grid(alpha=0.3)
 
 
+least, most = interval(lower[-1], upper[-1]).strip("[]").split(", ")
 study.field(
     "frost.png",
     "Temperature, and the heat that the surface needs: none above the ducts.",
     solution,
     draw,
     units=case.units,
-    title=f"Free of frost with {floor(lower[-1])} to {ceil(upper[-1])} W a metre, "
-    "none above the ducts",
+    title=f"Free of frost with {least} to {most} W a metre, none above the ducts",
     size=(11.0, 7.0),
     words={"contact": "heated", "no contact": "not heated", ENDS: "heating begins or ends"},
     nrows=2,
