@@ -289,11 +289,12 @@ assert abs(seeps - exact.seeping) < 0.01 * exact.seeping
 # %%
 def draw(field, beside, table):
     """The closed form on the head, and the surfaces on the way."""
-    dots = curve[::8]
+    places = np.linspace(0.0, LENGTH, 8, endpoint=False)  # none on the exit point
+    dots = np.stack([places, np.interp(places, *curve.T)], axis=1)
     field.plot(*dots.T, "o", color=canvas.RED, markersize=6, zorder=5, clip_on=False)
     field.annotate(
-        "Polubarinova-\nKochina", dots[5], xytext=(8, 8), textcoords="offset points",
-        color=canvas.RED, fontsize=13,
+        "closed form\n(Polubarinova-\nKochina)", dots[5], xytext=(6, 10),
+        textcoords="offset points", color=canvas.RED, fontsize=13,
     )  # fmt: skip
     for k, trial in enumerate(trials):
         beside.plot(x, trial, color=canvas.BLUE, alpha=0.35 if k < len(trials) - 1 else 1.0)
@@ -301,9 +302,10 @@ def draw(field, beside, table):
             beside.annotate(f"{k}", (x[-1], trial[-1]), xytext=(4, -4), textcoords="offset points")
     beside.plot(*curve.T, "--", color=canvas.RED)
     beside.set_xlim(0.0, LENGTH)
-    beside.set_xlabel("x in m", fontsize=13)
-    beside.set_ylabel("y in m", fontsize=13)
+    beside.set_xlabel("$x$ in m", fontsize=13)
+    beside.set_ylabel("$y$ in m", fontsize=13)
     beside.set_title("Trial surfaces 0, 1, 2, …; dashed: the closed form", fontsize=13)
+    beside.figure.get_layout_engine().set(wspace=0.06)  # from the bar of colours
     beside.grid(alpha=0.3)
 
 
@@ -315,7 +317,7 @@ study.field(
     units=Units(x="m", u="m", names={"u": "head"}),
     title=f"The dam seeps up to {y[-1]:.1f} m; the lower water ends at {LOW:g} m",
     size=(12.0, 6.0),
-    words={"contact": "seeps", "no contact": "does not", ENDS: "exit point"},
+    words={"contact": "seeps", "no contact": "", ENDS: "exit point"},
     ncols=2,
 )
 study.finish()

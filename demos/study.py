@@ -348,7 +348,8 @@ class Study:
             units: What u and the axes are called and measured in.
             title: The heading.
             size: Inches of the whole.
-            words: What stands in the legend for contact, no contact, and where it ends.
+            words: What stands in the legend for contact, no contact, and where it ends; what has
+                an empty one is left out.
             grid: Of the two axes, as `subplots` takes it.
         """
         figure, panels = None, (None, None)
@@ -359,9 +360,13 @@ class Study:
         table = solution.contact.table()
         if figure is not None:
             upper = panels[0]
-            handles, labels = upper.get_legend_handles_labels()
+            entries = {
+                words.get(label, label): handle
+                for handle, label in zip(*upper.get_legend_handles_labels(), strict=True)
+            }
+            entries.pop("", None)
             upper.get_legend().remove()
-            canvas.legend(figure, handles, [words.get(each, each) for each in labels], ncols=3)
+            canvas.legend(figure, [*entries.values()], [*entries], ncols=3)
             upper.set_title("")
             upper.set_aspect("auto")
             figure.suptitle(title, fontsize=16)
