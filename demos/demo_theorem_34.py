@@ -116,19 +116,22 @@ def draw_contact(upper, lower):
     fade = (1 - x**2) * np.sin(np.pi / x) ** 3
     near = table["x"] > 0
     middle = table["x"][near]
-    for axes, sign, name, what, colour, label in (
-        (upper, 1, "u", "gap", canvas.BLUE, "$u/x^6$"),
-        (lower, -1, "pressure", "pressure", canvas.RED, r"$\lambda/x^6$"),
+    for axes, sign, name, what, colour, label, peak in (
+        (upper, 1, "u", "gap", canvas.BLUE, "u", 0.4),
+        (lower, -1, "pressure", "pressure", canvas.RED, r"\lambda", 0.66),
     ):
-        axes.plot(x, np.maximum(0, sign * fade), color="black", linewidth=0.8, label=label)
+        axes.plot(x, np.maximum(0, sign * fade), color="black", linewidth=0.8)
         seen = middle > 0.06
         values = table[name][near][seen] / middle[seen] ** 6
         inside = values <= TOP
-        axes.plot(middle[seen][inside], values[inside], "o", color=colour, markersize=4,
-                  label=label.replace("u/", "u_h/").replace("lambda/", "lambda_h/"))  # fmt: skip
+        axes.plot(middle[seen][inside], values[inside], "o", color=colour, markersize=4)
+        axes.text(peak, 1.2, f"dots: ${label}_h/x^6$", color=colour, fontsize=13, ha="center")
+        axes.text(peak, 1.0, f"line: ${label}/x^6$", fontsize=13, ha="center")
         if not inside.all():
             axes.plot(middle[seen][~inside], np.full((~inside).sum(), TOP), "^", color=colour,
-                      markersize=6, label=f"above {TOP:g}")  # fmt: skip
+                      markersize=6)  # fmt: skip
+            axes.annotate(f"above {TOP:g}", (middle[seen][~inside][-1], TOP), (8, 0), va="center",
+                          textcoords="offset points", color=colour, fontsize=13)  # fmt: skip
         axes.set_xlim(0.06, 1)
         axes.set_ylim(-0.15, TOP + 0.15)
         axes.set_ylabel(f"{what} over $x^6$", fontsize=13)
@@ -137,10 +140,9 @@ def draw_contact(upper, lower):
         axes.set_xticks(ticks, ["1", *(f"1/{round(1 / tick)}" for tick in ticks[1:])])
         axes.set_xticks([], minor=True)
         axes.set_xlabel("$x$", fontsize=14)
-        axes.legend(fontsize=12, loc="upper right")
         axes.grid(alpha=0.3)
-    upper.set_title("I: the gap is found wherever a facet fits into it", fontsize=14)
-    lower.set_title("and the pressure between the gaps", fontsize=14)
+    upper.set_title("Example I: the gap is found wherever a few facets fit into it", fontsize=14)
+    lower.set_title("Example I: the pressure between the gaps needs more facets", fontsize=14)
 
 
 study.picture(
