@@ -2,11 +2,12 @@
 
 import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
-from helpers import ROOT
+from helpers import ROOT, start
 
 import signorini_cr
 
@@ -46,6 +47,26 @@ def test_results_are_published_on_demand_only(monkeypatch):
     assert vars(parser.parse_args([])) == {
         "cases": ["a", "b"], "dofs": 1e5, "repeats": 3, "out": Path("benchmark-out"),
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"), [("one_solve", "ranks-1.csv"), ("two_ranks", "two_ranks.json")]
+)
+def test_pictures_are_drawn_anew_without_measurements(name, kept, tmp_path):
+    """From what is kept; the table, which has the day of the measurements, stays as it is."""
+    shutil.copy(ROOT / "benchmarks" / "results" / kept, tmp_path)
+    done = start(ROOT / "benchmarks" / f"{name}.py", "--out", tmp_path, "--cases")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {kept, f"{name}.png"}
+
+
+def test_every_case_of_one_solve_is_in_its_picture(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    names = load("benchmarks/one_solve.py")
+    drawn = [name for alike in names["ALIKE"].values() for name in alike]
+    assert sorted(drawn) == sorted(names["cases"]())
+    for name in ("harness", "cases"):
+        sys.modules.pop(name)
 
 
 def test_turns_and_medians():
