@@ -240,6 +240,9 @@ def test_images_are_made_of_files_that_exist():
     image = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     for name, value in settings.items():
         assert f"{name}={value}" in image and f"export {name}={value}" in parts["environment"]
+    # Unlike the others this image is built and tested by root
+    for name in ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM"):
+        assert f"    export {name}=1\n" in parts["environment"]
 
 
 @pytest.mark.serial
