@@ -266,10 +266,15 @@ def test_workflows_call_what_exists():
         lines.append(hook["entry"])
         tool = re.search(r"container/tool (\w+)", hook["entry"])[1]
         assert f"{tool}==" in tools
+    called = set()
     for line in lines:
         for goals in re.findall(r"^make ((?:[\w-]+ ?)+)$", line):
             assert set(goals.split()) <= make, line
+            called |= set(goals.split())
         assert all((ROOT / file).is_file() for file in re.findall(r"container/[\w.-]+", line)), line
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    stages = set(re.findall(r"SUITE=\w+ make ([\w-]+)", script))
+    assert "docs" in stages and stages - {"test-alone", "test-pair"} <= called  # `test` is both
     for template in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"):
         form = loaded(template.relative_to(ROOT))
         assert form["name"] and form["description"] and form["body"]
