@@ -120,8 +120,8 @@ ABOUT_PYTHON = """\
 
 Everything here is in `import signorini_cr as scr`, as `scr.solve` or `scr.plots.plot_mesh`, but for
 what has a path of its own, as in `from signorini_cr.output.vtu import write_solution`; the version
-is `scr.__version__`. All functions are collective: every rank calls them. Lengths are in the units
-of the mesh, u in those of the data.
+is `scr.__version__`. All functions are collective, every rank calls them, unless they say
+otherwise. Lengths are in the units of the mesh, u in those of the data.
 
 There is a line for each name. `help(signorini_cr.solve_adaptive)` says the same, with what it
 takes, returns and raises, and so for the others; numbers such as (1.6) are those of formulas in
@@ -148,12 +148,13 @@ NAMES = {
         mesh.families""",
     "Solving": "solve solve_levels solve_adaptive solve_in_time adapt_to_run Solver",
     "Results": """\
-        Solution vi.contact.Contact vi.contact.Kkt Certificate
+        Solution vi.contact.Contact vi.contact.Kkt vi.solver.Iterations Certificate adaptive.Tried
         force.force_bounds force.flux means.mean means.integral force.Interval""",
     "Errors": "InputError NotConverged",
     "Known solutions and rates": "verification.exact verification.norms verification.theory",
     "Pictures and files": """\
-        output.plots output.notebook output.vtu.write_solution output.vtu.write_vtu""",
+        output.plots plots.Units output.notebook output.strip.moment output.strip.plot_strip
+        output.vtu.write_solution output.vtu.write_vtu""",
 }
 """What is on the page of Python names, in `signorini_cr`."""
 HANDED_OUT = ("Results", "Errors")

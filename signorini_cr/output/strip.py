@@ -108,9 +108,9 @@ def plot_strip(
     title: str = "",
     units: Units = PLAIN,
 ) -> Figure:
-    """Draw u_h at some moments, and where it is in contact then.
+    """Draw u_h at some moments, and where it is in contact then; on rank 0 alone.
 
-    To be called on rank 0 alone; domains that are wide are drawn below one another.
+    Domains that are wide are drawn below one another.
 
     Args:
         moments: One at least, of one domain, from `moment`.

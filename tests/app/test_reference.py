@@ -151,6 +151,18 @@ def test_every_public_name_is_in_the_reference() -> None:
 
 
 @pytest.mark.serial
+def test_every_name_that_the_documents_use_is_in_the_reference() -> None:
+    files = [ROOT / "README.md", ROOT / "demos" / "slope.ipynb", *DOCS.glob("*.md")]
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    used = set(re.findall(r"\bscr\.(\w+(?:\.\w+)*)", text))
+    for module, names in re.findall(r"from signorini_cr(\S*) import ([\w, ]+)", text):
+        used |= {f"{module}.{name}".removeprefix(".") for name in names.split(", ")}
+    assert {"plots.Units", "output.strip.moment"} <= used
+    told = (DOCS / "python.md").read_text(encoding="utf-8")
+    assert [name for name in used if not re.search(rf"`(?:scr\.)?{name}[(`]", told)] == []
+
+
+@pytest.mark.serial
 @pytest.mark.parametrize("key", KEYS, ids=lambda key: f"{key.section}.{key.name}")
 def test_examples_are_read(key, tmp_path: Path) -> None:
     """Each in the place of its key in a file that is in order."""
