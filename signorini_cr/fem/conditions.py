@@ -8,6 +8,7 @@ condition for what it adds, and none for its kind; so one more kind is one more 
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Self, TypeAlias
@@ -23,6 +24,22 @@ from ..mesh.domain import Domain
 
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
+
+
+def in_short(data: Any) -> str:
+    """Write a dataclass with what differs from its defaults, functions by their names.
+
+    Of what it has by name there are the names.
+    """
+    given = []
+    for each in fields(data):
+        value = getattr(data, each.name)
+        if isinstance(value, Mapping):
+            value = list(value) or each.default
+        if each.repr and value is not each.default and value != each.default:
+            told = getattr(value, "__name__", None) or reprlib.repr(value)
+            given.append(f"{each.name}={told}")
+    return f"{type(data).__name__}({', '.join(given)})"
 
 
 def as_number(expression: Expr) -> float | None:
@@ -81,11 +98,15 @@ class Condition:
         uncertified: Why no certificate covers it; None where one does.
     """
 
-    part: str = ""
-    number: int = 0
-    label: str = ""
-    source: str = ""
+    part: str = field(default="", repr=False)
+    number: int = field(default=0, repr=False)
+    label: str = field(default="", repr=False)
+    source: str = field(default="", repr=False)
     uncertified: ClassVar[str | None] = None
+
+    def __repr__(self) -> str:
+        """Tell its data, as far as they are given."""
+        return in_short(self)
 
     def made(self, given: Given, part: str, number: int, label: str) -> Self:
         """Make it from expressions, for a part of the boundary.
@@ -175,7 +196,7 @@ class Condition:
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dirichlet(Condition):
     """u = u_D.
 
@@ -199,7 +220,7 @@ class Dirichlet(Condition):
         return self.value
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Neumann(Condition):
     """κ∂ₙu = g.
 
@@ -223,7 +244,7 @@ class Neumann(Condition):
         return self.g
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Robin(Condition):
     """κ∂ₙu + b (u − u_ext) = g.
 
@@ -259,7 +280,7 @@ class Robin(Condition):
         return self.coefficient
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Contact(Condition):
     """α ≤ u ≤ β: λ = κ∂ₙu + b (u − u_ext) − g is not below 0 where u < β, nor above 0 where u > α.
 

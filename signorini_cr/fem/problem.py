@@ -10,9 +10,8 @@ have conditions of their own (see `conditions`).
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -32,7 +31,17 @@ from ..errors import InputError, meant
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials
-from .conditions import Condition, Contact, Data, Dirichlet, Given, Neumann, as_number, is_by_cells
+from .conditions import (
+    Condition,
+    Contact,
+    Data,
+    Dirichlet,
+    Given,
+    Neumann,
+    as_number,
+    in_short,
+    is_by_cells,
+)
 from .simplified import simplified
 from .snapshot import Snapshot
 from .space import facet_entities, ufl_element
@@ -54,6 +63,10 @@ class Material:
     reaction: Data | None = None
     capacity: float | None = None
 
+    def __repr__(self) -> str:
+        """Tell what is given."""
+        return in_short(self)
+
 
 @dataclass(frozen=True)
 class Form:
@@ -74,6 +87,10 @@ class Form:
 
     a: Callable[[Expr, Expr, ufl.Measure, Callable[[str], ufl.Measure]], ufl.Form]
     load: Callable[[Expr, ufl.Measure, Callable[[str], ufl.Measure]], ufl.Form] | None = None
+
+    def __repr__(self) -> str:
+        """Tell what is given."""
+        return in_short(self)
 
 
 @dataclass(frozen=True)
@@ -117,17 +134,8 @@ class Problem:
     error_degree: int = 6
 
     def __repr__(self) -> str:
-        """Tell what differs from nothing, functions by their names."""
-        given = []
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if each.name in ("conditions", "materials"):
-                value = list(value) or each.default
-            if value is not each.default and value != each.default:
-                given.append(
-                    f"{each.name}={getattr(value, '__name__', None) or reprlib.repr(value)}"
-                )
-        return f"Problem({', '.join(given)})"
+        """Tell what differs from nothing."""
+        return in_short(self)
 
     def __post_init__(self) -> None:
         """Refuse degrees that Basix would stop the process for."""

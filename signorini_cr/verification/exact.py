@@ -62,6 +62,10 @@ class Example:
     critical: tuple[tuple[float, float], ...] | None = None
     rates: tuple[float, float] = (1.0, 2.0)
 
+    def __repr__(self) -> str:
+        """A line."""
+        return f"<Example: {self.name}, {self.problem!r}>"
+
     def mesh(self, size: float, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Make an unstructured mesh with facets of about the length ``size``; collective."""
         return self.polygon.mesh(size, comm)

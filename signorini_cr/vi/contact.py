@@ -180,7 +180,7 @@ def contact_facts(
             min_gap=float(min_gap),
             min_pressure=float(min_pressure) + 0.0,  # no -0
             complementarity=float(complementarity),
-            residual=max(of_load, iterations.imbalance),
+            residual=float(max(of_load, iterations.imbalance)),
             force_error=iterations.force_error,
         ),
         _table=table,

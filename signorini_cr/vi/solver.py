@@ -180,8 +180,8 @@ def solve_vi(
             snes.getIterationNumber(),
             linear.iterations,
             linear.describe(),
-            test.force_error,
-            test.imbalance,
+            float(test.force_error),
+            float(test.imbalance),
             extended,
         )
     finally:

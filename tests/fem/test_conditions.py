@@ -20,7 +20,9 @@ from signorini_cr import (
     Contact,
     Dirichlet,
     Domain,
+    Form,
     InputError,
+    Material,
     Neumann,
     Polygon,
     Problem,
@@ -80,6 +82,19 @@ def test_another_kind_is_solved_right(element):
     assert fine.iterations.linear <= 14
     certificate = solve(SPRUNG, domain).certificate
     assert certificate.bound_h1 is None and certificate.reason == "there is a spring"
+
+
+def test_python_shows_what_was_given():
+    for made, shown in (
+        (Robin(coefficient=1), "Robin(coefficient=1)"),
+        (Contact(u, upper=2.0), "Contact(obstacle=u, upper=2.0)"),
+        (Neumann(), "Neumann()"),
+        (Spring(1.0), "Spring(g=1.0)"),
+        (Material(f=u), "Material(f=u)"),
+        (Form(u), "Form(a=u)"),
+        (Problem(conditions={"air": Robin()}), "Problem(conditions=['air'])"),
+    ):
+        assert repr(made) == shown
 
 
 def test_terms_without_gradients_are_in_p1_and_in_the_sums_of_rows():

@@ -375,6 +375,8 @@ def test_what_python_shows_is_a_line() -> None:
     assert shown[1].startswith("<Contact: 8 of 16 facets, length 1, force ")
     assert shown[2].startswith("<Domain: 256 cells; facets")
     assert shown[3] == "Problem(f=_s1_load, dirichlet=0.0, exact=<lambda>)"
+    assert repr(example) == f"<Example: S1, {shown[3]}>"
+    assert "np." not in repr(solution.contact.kkt) + repr(solution.iterations)
     certificate = solution.certificate
     assert repr(solution).endswith(f", error at most {at_most(certificate.bound_h1)}>")
     assert repr(certificate).startswith("<Certificate: error at most ")
