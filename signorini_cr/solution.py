@@ -19,7 +19,7 @@ from .fem import fields
 from .fem.conditions import Data
 from .fem.problem import Problem
 from .mesh.domain import Domain
-from .rounding import at_most, counted
+from .rounding import at_most, counted, known
 from .shown import HTML
 from .vi.contact import Contact
 from .vi.level import Level
@@ -51,12 +51,12 @@ class Solution:
 
     def __repr__(self) -> str:
         """Describe it in a line; the certificate only if it is made, as making it is collective."""
-        contact, known = self.contact, self.__dict__.get("certificate")
+        contact, certificate = self.contact, self.__dict__.get("certificate")
         line = (
             f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
-            f"{counted(contact.number, 'facet')} in contact, force {contact.force:.6g}"
+            f"{counted(contact.number, 'facet')} in contact, force {known(contact.force, None, 4)}"
         )
-        bound = known and known.bound_h1
+        bound = certificate and certificate.bound_h1
         return line + (">" if bound is None else f", error at most {at_most(bound)}>")
 
     def _repr_html_(self) -> str:

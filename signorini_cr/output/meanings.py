@@ -164,6 +164,7 @@ STEP = {
     "energy": "J(u_h) of the step's own problem, in which the steps before are data.",
     "bound_h1": "Of that problem: ‖∇_h(u − u_h)‖ is not above it.",
     "bound_energy_norm": "The same of the energy norm.",
+    "energy_bounds": "J(u) of that problem is between these. Columns as energy_bounds_lower.",
     "quantities": "What [quantities] asks for, of the step's own problem: by name, what it is in "
     "a level. Columns as quantities_heat_lower.",
     "seconds": "Wall time, bounds included.",

@@ -6,7 +6,7 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
-from ..rounding import at_most, interval
+from ..rounding import at_most, interval, known
 from . import plots
 from .canvas import as_png, grouped
 
@@ -22,17 +22,21 @@ def as_html(solution: Solution) -> str:
     domains in space, nor without Matplotlib.
     """
     contact, iterations = solution.contact, solution.iterations
+    certificate = solution.__dict__.get("certificate")
+    bracket = certificate and certificate.energy
+    wide = bracket and bracket[1] - bracket[0]
+    facet = contact.length / contact.number_active if contact.number_active else None
+    size = "length" if solution.domain.mesh.topology.dim == 2 else "area"
     rows = {
         "element": solution.element,
         "cells": grouped(solution.cells),
         "degrees of freedom": grouped(solution.dofs),
-        "energy J(u_h)": f"{solution.energy:.9g}",
+        "energy J(u_h)": known(solution.energy, wide, 4 if wide is None else 7),
         "facets in contact": f"{grouped(contact.number_active)} of {grouped(contact.number)}",
-        "length in contact": f"{contact.length:.6g}",
-        "contact force": f"{contact.force:.6g}",
+        f"{size} in contact": known(contact.length, facet),
+        "contact force": known(contact.force, None, 4),
         "Newton steps, linear iterations": f"{iterations.newton}, {iterations.linear}",
     }
-    certificate = solution.__dict__.get("certificate")
     if certificate is None:
         rows["error bound"] = "not asked for: solution.certificate"
     elif certificate.bound_h1 is None or certificate.energy is None:

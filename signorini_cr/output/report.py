@@ -126,12 +126,15 @@ def level_record(
             "effectivity": bound / h1 if bound is not None and h1 else None,
             "bound_reason": certificate.reason,
             "bound_parts": {name: certificate.parts.get(name) for name in SHARES},
-            "energy_bounds": dict(
-                zip(("lower", "upper"), certificate.energy or (None, None), strict=True)
-            ),
+            "energy_bounds": energy_bounds(solution),
             "seconds": {phase: solution.seconds.get(phase, 0.0) for phase in PHASES},
         }
     )
+
+
+def energy_bounds(solution: Solution) -> Record:
+    """Find what J(u) is between, as it stands in report.json; collective."""
+    return dict(zip(("lower", "upper"), solution.certificate.energy or (None, None), strict=True))
 
 
 def bounded(solution: Solution, quantities: Mapping[str, Quantity]) -> dict[str, Record]:

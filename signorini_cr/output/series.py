@@ -15,9 +15,9 @@ from ..rounding import at_most, counted, interval, known
 from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
-from .report import FILES, bounded, plain, report_json
+from .report import FILES, bounded, energy_bounds, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
-from .tables import Column, explained, levels_csv, rows_of, unit_of
+from .tables import Column, energy, explained, levels_csv, rows_of, unit_of
 from .units import GLUE, PLAIN, Units
 from .vtu import write_solution
 
@@ -35,7 +35,7 @@ COLUMNS: tuple[Column, ...] = (
     ("active", 6, lambda r: str(r["active"])),
     ("contact", 8, lambda r: f"{r['length']:.3g}"),
     ("force", 12, lambda r: known(r["force"], None, 4)),
-    ("energy", 12, lambda r: known(r["energy"], None, 6)),
+    ("energy", 12, lambda r: energy(r, 4)),
     ("bound", 9, lambda r: "none" if r["bound_h1"] is None else at_most(r["bound_h1"])),
 )
 """The printed table."""
@@ -81,6 +81,7 @@ def step_record(
                 "energy": solution.energy,
                 "bound_h1": certificate.bound_h1,
                 "bound_energy_norm": certificate.bound_energy_norm,
+                "energy_bounds": energy_bounds(solution),
                 "quantities": asked,
                 "seconds": sum(solution.seconds.values()),
             }

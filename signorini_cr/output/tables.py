@@ -209,7 +209,8 @@ def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
                 yield key, value
 
     rows = [dict(cells(record)) for record in records]
-    return _csv(rows[0] if rows else (), (row.values() for row in rows))
+    names = list(rows[0]) if rows else []  # later rows may be a newer version's, and have more
+    return _csv(names, (map(row.get, names) for row in rows))
 
 
 def contact_csv(table: Mapping[str, npt.NDArray]) -> str:
@@ -251,7 +252,7 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
         ]
     else:
         columns += [
-            ("energy", 12, _energy),
+            ("energy", 12, energy),
             ("contact", 8, lambda r: _short(r["contact"]["length"])),
         ]
     if bound:
@@ -263,12 +264,19 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
     return columns
 
 
-def _energy(record: Mapping[str, Any]) -> str:
-    """Format J(u_h) with the digits that J(u) has for certain."""
+def energy(record: Mapping[str, Any], otherwise: int = 7) -> str:
+    """Format J(u_h) with the digits that J(u) has for certain.
+
+    Args:
+        record: A level's, or a step's.
+        otherwise: How many digits it has where nothing is certain.
+    """
     if record["energy"] is None:
         return "-"
-    low, high = (record["energy_bounds"][end] for end in ("lower", "upper"))
-    return known(record["energy"], None if low is None or high is None else high - low, 7)
+    ends = record.get("energy_bounds", {})  # steps that an older version has left have none
+    low, high = ends.get("lower"), ends.get("upper")
+    wide = None if low is None or high is None else high - low
+    return known(record["energy"], wide, otherwise if wide is None else 7)
 
 
 def _short(value: float | None) -> str:

@@ -20,7 +20,7 @@ from ..fem.physics import OnMesh
 from ..fem.space import ghosted_vector
 from ..garbage import release
 from ..multigrid.parents import Layout
-from ..rounding import counted
+from ..rounding import counted, known
 from .active import ActiveSet
 from .solver import Iterations
 from .stopping import NOISE
@@ -102,9 +102,10 @@ class Contact:
 
     def __repr__(self) -> str:
         """Describe the contact in a line."""
+        length = known(self.length, self.length / max(self.number_active, 1))  # to within a facet
         return (
             f"<Contact: {self.number_active} of {counted(self.number, 'facet')}, "
-            f"length {self.length:.6g}, force {self.force:.6g}>"
+            f"length {length}, force {known(self.force, None, 4)}>"
         )
 
     @property

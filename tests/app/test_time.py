@@ -149,7 +149,9 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         for key in ("kind", "weighted", "value", "lower", "upper", "reason")
     ]
     assert list(report["times"][0]) == list(STEP)
-    columns = [asked if name == "quantities" else [name] for name in STEP]
+    ends = ["energy_bounds_lower", "energy_bounds_upper"]
+    several = {"quantities": asked, "energy_bounds": ends}
+    columns = [several.get(name, [name]) for name in STEP]
     assert list(rows[0]) == [name for names in columns for name in names]
     assert len(rows) == len(report["times"]) == len(expected) == 6
     for step, (row, record, (time, force, active)) in enumerate(
@@ -161,6 +163,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         assert float(row["force"]) == record["force"]
         assert record["active"] == active
         assert record["bound_h1"] > 0.0
+        assert record["energy_bounds"]["lower"] <= record["energy_bounds"]["upper"]
     assert {record["active"] > 0 for record in report["times"]} == {True, False}
     series = ET.parse(out / "series.pvd").getroot()
     named = [(each.get("timestep"), each.get("file")) for each in series.iter("DataSet")]

@@ -10,6 +10,7 @@ from signorini_cr.output.tables import (
     certified,
     facts,
     legend,
+    levels_csv,
     markdown_table,
     table_header,
     table_row,
@@ -162,6 +163,16 @@ def test_energies_have_the_digits_that_are_known():
     assert table_row(record).split()[7] == "-2.68547"
     unknown = {"lower": None, "upper": None}
     assert table_row(record | {"energy_bounds": unknown}).split()[7] == "-2.685465"
+    step = {"step": 1, "time": 0.5, "active": 2, "length": 1.0, "force": 1.234567}
+    assert series.row(record | step, record | step).split()[6:8] == ["1.235", "-2.68547"]
+    del record["energy_bounds"]  # as an older version has left it
+    assert series.row(record | step, record | step).split()[7] == "-2.685"
+
+
+def test_a_table_has_the_columns_that_its_first_row_has():
+    """Later rows of a run that is resumed may come from a newer version and have more."""
+    text = levels_csv([{"step": 1, "seconds": 2.0}, {"step": 2, "energy": -1.0, "seconds": 3.0}])
+    assert text == "step,seconds\n1,2.0\n2,3.0\n"
 
 
 def test_nothing_breaks_between_a_number_and_its_unit():
