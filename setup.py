@@ -5,12 +5,17 @@ from pathlib import Path
 
 
 def without_its_folder(text: str) -> str:
-    """Drop pictures and what is said below them, and links that are no addresses.
+    """Drop pictures with what is said below them, sentences that begin with a link, and links.
 
-    An index of packages has no such files.
+    An index of packages has none of the files that these lead to; links to addresses stay.
     """
-    text = re.sub(r"!\[[^]]*\]\((?!https?:)[^)]*\)\n+(\*[^*]+\*\n+)?", "", text)
-    return re.sub(r"\[([^]]+)\]\((?!https?:)[^)]*\)", r"\1", text)
+    link = r"\[([^]]+)\]\((?!https?:)[^)]*\)"
+    text = re.sub(rf"!{link}\n+(\*[^*]+\*\n+)?", "", text)
+    sentence = rf"{link}.*?(?:\.(?=\s)|(?=\n\n)|\Z)"
+    text = re.sub(rf"(?<=\.)\s{sentence}", "", text, flags=re.DOTALL)
+    text = re.sub(rf"(?<=\n\n){sentence}\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r"(?<=\n)## [^\n]+\n+(?=## |\Z)", "", text)  # of which nothing is left
+    return re.sub(link, r"\1", text)
 
 
 if __name__ == "__main__":

@@ -87,6 +87,12 @@ def test_the_long_description_does_without_the_folder():
     assert "a b c" == without("a [b](docs/b.md#x) c")
     assert "**a**\n" == without("![p](p.png)\n\n*of [b](b.md)*\n\n**a**\n")
     assert "**a**\n" == without("![p](p.png)\n\n**a**\n")
+    assert "a.\n\nb: c.\n" == without(
+        "a.\n[B](b.md) is,\nas [d](d.md).\n\nb: [c](c.md). [D](d.md).\n"
+    )
+    assert "a\n\nb\n" == without("a\n\n[C](c.md) is. b\n")
+    assert "# a\n\nb\n\n" == without("# a\n\nb\n\n## More\n\n[C](c.md) · [D](d.md)\n")
+    assert "picture above" not in text and "next to it" not in text
 
 
 @pytest.mark.serial
