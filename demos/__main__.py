@@ -87,7 +87,7 @@ environment makes a quick run on fewer meshes.
 def main() -> None:
     """Run all demos on all ranks and put their pages together."""
     comm = MPI.COMM_WORLD
-    target = Path(sys.argv[1] if len(sys.argv) > 1 else "docs")
+    target = study.wanted_folder("docs")
     folder = target / "studies"
     sys.argv[1:] = [str(folder)]
     here = Path(__file__).parent

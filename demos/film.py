@@ -8,12 +8,11 @@ writes FOLDER/adaptive.gif (FOLDER is demo-output without an argument).
 from __future__ import annotations
 
 import io
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from study import comm, levels_wanted
+from study import comm, levels_wanted, wanted_folder
 
 from signorini_cr import Solution, exact, plots, solve_adaptive, solve_levels
 from signorini_cr.errors import on_root
@@ -95,6 +94,6 @@ def as_frame(figure: Figure) -> Image:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
+    folder = wanted_folder("demo-output")
     folder.mkdir(parents=True, exist_ok=True)
     film(folder / "adaptive.gif", MAX_DOFS // 4 ** (8 - levels_wanted(8)))

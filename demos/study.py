@@ -88,6 +88,16 @@ class Row:
     judgement: theory.Judgement | None
 
 
+def wanted_folder(usual: str) -> Path:
+    """Take the folder for the results from the command line; what looks like an option ends it."""
+    given = sys.argv[1] if len(sys.argv) > 1 else usual
+    if given.startswith("-"):
+        if comm.rank == 0:
+            print(f"usage: python3 {sys.argv[0]} [FOLDER]\n\nFOLDER is {usual} without an argument")
+        sys.exit(0 if given in ("-h", "--help") else 2)
+    return Path(given)
+
+
 def levels_wanted(default: int) -> int:
     """The number of meshes, limited by SIGNORINI_DEMO_LEVELS; three for a rate at least."""
     return min(default, max(3, int(os.environ.get("SIGNORINI_DEMO_LEVELS", default))))
@@ -206,7 +216,7 @@ class Study:
         """Take the folder from the command line and make it; collective."""
         self.name = name
         self.title = title
-        self.folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo-output")
+        self.folder = wanted_folder("demo-output")
         self.parts: list[str] = []
         self.pictures: list[str] = []
         on_root(comm, lambda: self.folder.mkdir(parents=True, exist_ok=True))

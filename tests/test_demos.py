@@ -74,6 +74,15 @@ def test_demos_on_their_own(demo, pictures, shared_tmp_path):
     assert {path.stem for path in shared_tmp_path.glob("*.png") if is_picture(path)} >= pictures
 
 
+@pytest.mark.parametrize("demo", ["", "film.py", "demo_s1.py"])
+@pytest.mark.parametrize(("option", "status"), [("--help", 0), ("--levels=2", 2)])
+def test_an_option_is_no_folder(demo, option, status, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ended, printed = script(DEMOS / demo, option)
+    assert ended == status and not list(tmp_path.iterdir())
+    assert printed.startswith("usage: ") is (COMM.rank == 0)
+
+
 def test_the_film_has_a_frame_a_mesh(shared_tmp_path):
     image = pytest.importorskip("PIL.Image")
     assert script(DEMOS / "film.py", shared_tmp_path, SIGNORINI_DEMO_LEVELS="6")[0] == 0
