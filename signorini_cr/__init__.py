@@ -113,4 +113,4 @@ HTML["Solution"] = _as_html
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_MODULES])

@@ -148,6 +148,7 @@ def test_every_public_name_is_in_the_reference() -> None:
         if not re.search(rf":: signorini_cr\.({place}|{name})\b", text)
     ]
     assert modules == []
+    assert {*signorini_cr.__all__, *signorini_cr._MODULES} <= set(dir(signorini_cr))
 
 
 @pytest.mark.serial
