@@ -307,7 +307,7 @@ def _clear_mesh(solution: Solution, path: Path, title: str) -> tuple[Domain, Pat
     level = max((i for i, size in enumerate(sizes) if size <= MOST_CELLS), default=0)
     if level == solution.level.number:
         return domains[level], path, title
-    return domains[level], path, f"{title} – level {level} of 0 to {solution.level.number}"
+    return domains[level], path, f"{title}, level {level} of 0 to {solution.level.number}"
 
 
 def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
