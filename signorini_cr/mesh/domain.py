@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -440,6 +441,15 @@ class Polygon:
     names: tuple[str, ...] = ()
     materials: Mapping[str, FloatArray] = field(default_factory=dict)
     edges: tuple[int, ...] = ()
+
+    def __repr__(self) -> str:
+        """Describe the polygon in a line."""
+        loops = [self, *self.holes]
+        parts = Counter(part for loop in loops for part in loop.boundary)
+        words = [f"{number} {part}" for part, number in parts.items()]
+        if self.holes:
+            words.append(counted(len(self.holes), "hole"))
+        return f"<Polygon: {counted(parts.total(), 'edge')}: {', '.join(words)}>"
 
     @classmethod
     def with_arcs(

@@ -376,6 +376,11 @@ def test_what_python_shows_is_a_line() -> None:
     assert shown[2].startswith("<Domain: 256 cells; facets")
     assert shown[3] == "Problem(f=_s1_load, dirichlet=0.0, exact=<lambda>)"
     assert repr(example) == f"<Example: S1, {shown[3]}>"
+    assert repr(Polygon.circle([0, 0], 1, "neumann", 0.05)) == "<Polygon: 126 edges: 126 neumann>"
+    hole = Polygon(0.5 + 0.1 * HELD_ABOVE.vertices, ["neumann"] * 4)
+    assert repr(Polygon(HELD_ABOVE.vertices, HELD_ABOVE.boundary, holes=[hole])) == (
+        "<Polygon: 8 edges: 1 contact, 6 neumann, 1 dirichlet, 1 hole>"
+    )
     assert "np." not in repr(solution.contact.kkt) + repr(solution.iterations)
     certificate = solution.certificate
     assert repr(solution).endswith(f", error at most {at_most(certificate.bound_h1)}>")
