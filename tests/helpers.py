@@ -7,7 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,16 @@ from dolfinx.mesh import (
 )
 from mpi4py import MPI
 
-from signorini_cr import Domain, Polygon, Problem, Solution, solve_levels
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Domain,
+    Neumann,
+    Polygon,
+    Problem,
+    Solution,
+    solve_levels,
+)
 from signorini_cr.compat import cell_nodes
 from signorini_cr.estimate.functional import Functional, Masses
 from signorini_cr.fem.cells import BoundaryFacets, Cells
@@ -39,6 +48,8 @@ SQUARE = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], SIDES, names=SIDES)
 HELD_ABOVE = Polygon(SQUARE.vertices, ("contact", "neumann", "dirichlet", "neumann"))
 HELD_ALL_ROUND = Polygon(SQUARE.vertices, ("contact", "dirichlet", "dirichlet", "dirichlet"))
 """The unit square with contact below: held above, or on all other sides."""
+STRIP = [[0, 0], [2, 0], [2, 1], [0, 1]]
+"""Corners of (0, 2) × (0, 1), whose edges are `SIDES`."""
 
 
 def clean_environment(**more: str) -> dict[str, str]:
@@ -103,6 +114,30 @@ def script(path: Path, *arguments: str | Path, **variables: str) -> tuple[int, s
             status = end.code if isinstance(end.code, int) else 1 if end.code else 0
     MPI.COMM_WORLD.Barrier()  # whoever writes has written
     return status, printed.getvalue()
+
+
+def bar(materials: Mapping[str, Any]) -> tuple[Domain, Problem]:
+    """Make the bar on (0, 2) × (0, 1) that u varies along y in, and what holds there.
+
+    2 u'' = 3 u, u = 0 above, and below a loss of heat and a pressure that hold u at 1:
+    u = sinh k(1 − y)/sinh k with k = √1.5.
+
+    Args:
+        materials: What parts of it consist of, as for `Polygon`.
+    """
+    sides = [Contact(1.0, coefficient=5.0, external=-4.0), Neumann(), Dirichlet(0.0), Neumann()]
+    conditions = dict(zip(SIDES, sides, strict=True))
+    domain = Polygon(STRIP, SIDES, names=SIDES, materials=materials).mesh(0.4)
+    return domain, Problem(coefficient=2.0, reaction=3.0, conditions=conditions)
+
+
+def strip(
+    conditions: Sequence[Any], levels: int, size: float = 0.2, **data: Any
+) -> Iterator[Solution]:
+    """Solve on the levels of (0, 2) × (0, 1) with a condition for each edge."""
+    domain = Polygon(STRIP, SIDES, names=SIDES).mesh(size)
+    named = dict(zip(SIDES, conditions, strict=True))
+    return solve_levels(Problem(conditions=named, **data), domain, levels)
 
 
 def is_picture(path: Path) -> bool:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx.mesh import compute_midpoints, create_unit_cube, exterior_facet_indices, meshtags
+from helpers import SIDES, STRIP, bar, strip
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -25,18 +26,8 @@ from signorini_cr.quantities import Quantity
 
 pytestmark = pytest.mark.slow
 
-STRIP = [[0, 0], [2, 0], [2, 1], [0, 1]]
-STRIP_EDGES = ["floor", "right", "top", "left"]
 
-
-def strip(conditions, size=0.2, **data):
-    """u on the levels of (0, 2) × (0, 1) with a condition for each edge."""
-    named = dict(zip(STRIP_EDGES, conditions, strict=True))
-    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES).mesh(size)
-    return solve_levels(Problem(conditions=named, **data), domain, 2)
-
-
-def bar(x):
+def of_bar(x):
     """u of the bar that is held at 1 below and at 0 above."""
     k = np.sqrt(1.5)
     return np.sinh(k * (1.0 - x)) / np.sinh(k)
@@ -45,10 +36,7 @@ def bar(x):
 def test_weighted_integrals_are_bracketed_in_one_dimension():
     """Weights of either sign, on all of the domain, in a material and on sides, by Gauss's rule."""
     half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
-    sides = [Contact(1.0, coefficient=5.0, external=-4.0), Neumann(), Dirichlet(0.0), Neumann()]
-    conditions = dict(zip(STRIP_EDGES, sides, strict=True))
-    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
-    problem = Problem(coefficient=2.0, reaction=3.0, conditions=conditions)
+    domain, problem = bar(half)
     t, w = np.polynomial.legendre.leggauss(30)
     y, w = (t + 1) / 2, w / 2
     x, ends = 2 * y, {"left": (0.0 * y, y, w), "floor": (2 * y, 0.0 * y, 2 * w)}
@@ -58,9 +46,9 @@ def test_weighted_integrals_are_bracketed_in_one_dimension():
         return sin(3 * x[0] + 1) * exp(x[1]) - 0.2
 
     exact_values = {
-        where: size * (w @ (psi((a, b), np.sin, np.exp) * bar(b)) @ w)
+        where: size * (w @ (psi((a, b), np.sin, np.exp) * of_bar(b)) @ w)
         for where, (size, a, b) in grid.items()
-    } | {where: c @ (psi((a, b), np.sin, np.exp) * bar(b)) for where, (a, b, c) in ends.items()}
+    } | {where: c @ (psi((a, b), np.sin, np.exp) * of_bar(b)) for where, (a, b, c) in ends.items()}
     weights = {
         where: size * (w @ psi((a, b), np.sin, np.exp) @ w) for where, (size, a, b) in grid.items()
     } | {where: c @ psi((a, b), np.sin, np.exp) for where, (a, b, c) in ends.items()}
@@ -88,9 +76,9 @@ def test_weighted_integrals_are_bracketed_in_one_dimension():
 def test_a_weight_is_what_is_needed_where_contact_meets_dirichlet():
     """u = (1 − x²)(1 − y) lies on the floor, where λ = 1 − x²; the other sides are Dirichlet's."""
     floor = Contact(lambda x: 1.0 - x[0] ** 2)
-    sides = dict.fromkeys(STRIP_EDGES, Dirichlet(0.0)) | {"floor": floor}
+    sides = dict.fromkeys(SIDES, Dirichlet(0.0)) | {"floor": floor}
     problem = Problem(f=lambda x: 2.0 * (1.0 - x[1]), conditions=sides)
-    polygon = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], STRIP_EDGES, names=STRIP_EDGES)
+    polygon = Polygon([[-1, 0], [1, 0], [1, 1], [-1, 1]], SIDES, names=SIDES)
     asked = [
         ("floor", lambda x: 1.0 - x[0] ** 2, 16 / 15),
         ("floor", lambda x: 1.0 - abs(x[0]), 5 / 6),
@@ -118,7 +106,7 @@ def test_a_weight_is_what_is_needed_where_contact_meets_dirichlet():
 
 def test_a_solution_knows_its_quantities():
     """As the functions say them; what they take is booked as the certificate's is."""
-    (solution, *_) = strip([Contact(0.1), Neumann(), Dirichlet(0.0), Neumann()], f=-3.0)
+    (solution, *_) = strip([Contact(0.1), Neumann(), Dirichlet(0.0), Neumann()], 2, f=-3.0)
     weight = {"weight": lambda x: x[0]}
     before = (solution.certificate, dict(solution.seconds))[1]
     assert solution.flux("floor", **weight) == flux(solution, "floor", **weight)
@@ -137,7 +125,7 @@ def test_a_solution_knows_its_quantities():
 def test_all_of_the_domain_has_a_name_unless_something_else_has_it():
     """u = y on the strip, above the obstacle: 1/2 in the mean, and 1/4 where y < 1/2."""
     sides = [Contact(-9.0, g=-1.0), Neumann(), Dirichlet(1.0), Neumann()]
-    (solution, *_) = strip(sides)
+    (solution, *_) = strip(sides, 2)
     assert solution.mean("domain") == mean(solution, "domain") == solution.mean()
     assert solution.integral("domain", lambda x: x[0]) == solution.integral(None, lambda x: x[0])
     for kind, expected in {"mean": 0.5, "integral": 1.0}.items():
@@ -148,8 +136,8 @@ def test_all_of_the_domain_has_a_name_unless_something_else_has_it():
     with pytest.raises(InputError, match=there):
         solution.mean("domian")
     below = {"domain": [[0, 0], [2, 0], [2, 0.5], [0, 0.5]]}
-    polygon = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=below)
-    problem = Problem(conditions=dict(zip(STRIP_EDGES, sides, strict=True)))
+    polygon = Polygon(STRIP, SIDES, names=SIDES, materials=below)
+    problem = Problem(conditions=dict(zip(SIDES, sides, strict=True)))
     (solution,) = solve_levels(problem, polygon.mesh(0.2), 1)
     assert solution.mean("domain").value == pytest.approx(0.25)
     assert solution.mean().value == pytest.approx(0.5)
@@ -157,7 +145,7 @@ def test_all_of_the_domain_has_a_name_unless_something_else_has_it():
 
 def test_weighted_forces_have_the_sign_that_is_certain():
     """Of a force off one bound and a weight that is not below 0, in places with no force at all."""
-    (solution, *_) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Neumann()], f=-1.0)
+    (solution, *_) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Neumann()], 2, f=-1.0)
     assert solution.contact.force == 0.0
     assert solution.flux("floor", weight=lambda x: x[0] ** 2).lower == 0.0
     assert solution.flux("floor", weight=lambda x: x[0] - 1.0).lower < 0.0
@@ -183,7 +171,7 @@ def test_a_weight_that_vanishes_at_the_ends_of_one_facet():
 def test_two_parts_with_one_weight():
     """It goes on from one to the other; what each gets alone it must not have where they meet."""
     sides = [Contact(1.0), Contact(1.0), Neumann(), Neumann()]
-    (solution, *_) = strip(sides, f=-1.0, reaction=1.0)
+    (solution, *_) = strip(sides, 2, f=-1.0, reaction=1.0)
     whole = solution.flux("floor", "right", weight=lambda x: x[0] + x[1])
     assert whole.lower < whole.value < whole.upper
     with pytest.raises(InputError, match=r"the weight is 2 at \(2, 0\)"):
@@ -214,9 +202,9 @@ def test_integrals_over_tetrahedra():
 
 def test_a_part_and_a_material_of_the_same_name_are_not_told_apart():
     below = {"right": [[0, 0], [2, 0], [2, 0.5], [0, 0.5]]}
-    polygon = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=below)
+    polygon = Polygon(STRIP, SIDES, names=SIDES, materials=below)
     sides = [Contact(-9.0, g=-1.0), Neumann(), Dirichlet(1.0), Neumann()]
-    problem = Problem(conditions=dict(zip(STRIP_EDGES, sides, strict=True)))
+    problem = Problem(conditions=dict(zip(SIDES, sides, strict=True)))
     solution = solve(problem, polygon.mesh(0.5))
     with pytest.raises(InputError, match="'right' is a part and a material"):
         solution.mean("right")
@@ -225,7 +213,7 @@ def test_a_part_and_a_material_of_the_same_name_are_not_told_apart():
 def test_where_contact_alone_holds_u_a_mean_is_refused_and_a_force_is_not():
     """A weak loss of heat, which says how high u is, is enough for both."""
     for loss, held in ((0.0, False), (0.5, True)):
-        solution = list(strip([Contact(coefficient=loss), *[Neumann()] * 3], f=-1.0))[-1]
+        solution = list(strip([Contact(coefficient=loss), *[Neumann()] * 3], 2, f=-1.0))[-1]
         _, low, high = solution.flux("floor")
         assert low <= 2.0 <= high
         for ask in (solution.mean, solution.integral):

@@ -87,15 +87,9 @@ class _Products:
 class _Gap:
     """The gap between y and v, which is added up range by range of cells.
 
+    Attributes but for the last are the arguments of `integrate`.
+
     Attributes:
-        cells: The mesh.
-        kappa: The coefficient.
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        load: Moments of f − c u_h.
-        flux: y.
-        v: v.
-        reaction: c, or a lower bound of it, shape (cells,) or ().
-        most: The same object, or an upper bound.
         sums: What is added to.
     """
 

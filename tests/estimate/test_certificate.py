@@ -15,7 +15,7 @@ from dolfinx.mesh import (
     locate_entities_boundary,
     meshtags,
 )
-from helpers import HELD_ABOVE, SQUARE
+from helpers import HELD_ABOVE, SIDES, SQUARE, STRIP, bar, strip
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -455,17 +455,6 @@ def test_force_is_bracketed():
     assert np.all(np.log2(np.array(widths[:-1]) / widths[1:]) > 0.9)
 
 
-STRIP = [[0, 0], [2, 0], [2, 1], [0, 1]]
-STRIP_EDGES = ["floor", "right", "top", "left"]
-
-
-def strip(conditions, size=0.2, **data):
-    """u on the levels of (0, 2) × (0, 1) with a condition for each edge."""
-    named = dict(zip(STRIP_EDGES, conditions, strict=True))
-    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES).mesh(size)
-    return solve_levels(Problem(conditions=named, **data), domain, 4)
-
-
 def test_what_flows_through_is_bracketed_in_one_dimension():
     """κu'' = c u between u = 0 on top and b (u − u_ext) + pressure below, which holds u at 1."""
     kappa, c, b, external = 2.0, 3.0, 5.0, -4.0
@@ -476,6 +465,7 @@ def test_what_flows_through_is_bracketed_in_one_dimension():
     widths = []
     for solution in strip(
         [Contact(1.0, coefficient=b, external=external), Neumann(), Dirichlet(0.0), Neumann()],
+        4,
         coefficient=kappa,
         reaction=c,
     ):
@@ -497,10 +487,7 @@ def test_means_are_bracketed_in_one_dimension():
     over, widths = np.tanh(k / 2) / k, []  # ∫ sinh k(1 − y)/sinh k
     exact_means = {None: over, "half": over, "left": over, "floor": 1.0}
     half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
-    sides = [Contact(1.0, coefficient=5.0, external=-4.0), Neumann(), Dirichlet(0.0), Neumann()]
-    conditions = dict(zip(STRIP_EDGES, sides, strict=True))
-    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
-    problem = Problem(coefficient=2.0, reaction=3.0, conditions=conditions)
+    domain, problem = bar(half)
     for solution in solve_levels(problem, domain, 3):
         found = {where: mean(solution, where) for where in exact_means}
         for where, (value, lower, upper) in found.items():
@@ -535,8 +522,8 @@ def test_means_where_data_are_curved(pressure):
         Neumann(),
     ]
     half = {"half": [[0, 0], [1, 0], [1, 1], [0, 1]]}
-    domain = Polygon(STRIP, STRIP_EDGES, names=STRIP_EDGES, materials=half).mesh(0.4)
-    problem = Problem(conditions=dict(zip(STRIP_EDGES, sides, strict=True)))
+    domain = Polygon(STRIP, SIDES, names=SIDES, materials=half).mesh(0.4)
+    problem = Problem(conditions=dict(zip(SIDES, sides, strict=True)))
     off = []
     for solution in solve_levels(problem, domain, 3):
         found = {where: mean(solution, where) for where in exact_means}
@@ -548,7 +535,7 @@ def test_means_where_data_are_curved(pressure):
 
 def test_held_by_contact_alone_the_force_is_what_f_and_g_bring():
     """Nothing but the obstacle takes it."""
-    (*_, solution) = strip([Contact(0.0), Neumann(0.5), Neumann(), Neumann()], f=-3.0)
+    (*_, solution) = strip([Contact(0.0), Neumann(0.5), Neumann(), Neumann()], 4, f=-3.0)
     _, lower, upper = flux(solution, "floor")
     assert lower <= 5.5 <= upper and upper - lower < 1e-6
     assert solution.contact.force == pytest.approx(5.5, rel=1e-7)
@@ -603,7 +590,7 @@ def test_a_step_of_the_obstacle_at_a_vertex(element):
 def test_forces_of_two_parts_add_up_and_have_their_signs():
     """One part pushes up, one down; all that b does not take goes through them."""
     lower, upper = Contact(0.2), Contact(upper=-0.1)
-    for solution in strip([lower, Robin(coefficient=2.0), upper, Robin(coefficient=2.0)]):
+    for solution in strip([lower, Robin(coefficient=2.0), upper, Robin(coefficient=2.0)], 4):
         floor, top = flux(solution, "floor"), flux(solution, "top")
         both = flux(solution, "floor", "top")
         assert floor.lower >= 0.0 >= top.upper
@@ -614,7 +601,7 @@ def test_forces_of_two_parts_add_up_and_have_their_signs():
 
 
 def test_what_has_no_flux_is_said():
-    (*_, solution) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Dirichlet(0.0)])
+    (*_, solution) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Dirichlet(0.0)], 4)
     with pytest.raises(InputError, match="'right' is no Dirichlet or contact part"):
         flux(solution, "right")
     with pytest.raises(InputError, match=r"did you mean floor\? There are "):
