@@ -33,7 +33,7 @@ EXIT_NOTE = (
 
 KEYS_OF = {
     **dict.fromkeys(("mode", "tolerance", "max_dofs", "fraction"), "refine"),
-    **dict.fromkeys(("end", "steps", "scheme"), "time"),
+    **dict.fromkeys(("end", "steps", "scheme", "initial", "capacity"), "time"),
     **dict.fromkeys(("size", "mesh"), "domain"),
 }
 """Keys of problem files that are no options, and their sections."""

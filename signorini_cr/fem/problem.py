@@ -706,8 +706,7 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
         own[name] = condition
         if not isinstance(condition, Condition):
             raise InputError(
-                f"conditions: {name!r} is {condition!r}; Dirichlet, Neumann, Robin or Contact is"
-                " needed"
+                f"conditions: {name!r} is {condition!r}; a Condition is needed, such as Contact(0)"
             )
     made = []
     for name, value in parts.items():

@@ -171,6 +171,8 @@ class ReducedSolver:
         self._stiffness.sort(self._x, self._b)
         inactive, first = self._snes.getVIInactiveSet().array, self.matrix.getOwnershipRange()[0]
         self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, first)
+        kept = np.ones(self._step.local_size, dtype=bool)  # by SNES, whatever is held from here on
+        kept[self.active.dofs] = False
         careful = self._snes.getIterationNumber() >= CAREFUL
         if careful:
             self._hold()
@@ -191,7 +193,7 @@ class ReducedSolver:
                 self.reached = max(test.reached, rounding)
         if careful:
             self._shorten()
-        reduced.array[:] = self._step.array_r[inactive - first]
+        reduced.array[:] = self._step.array_r[kept]
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 

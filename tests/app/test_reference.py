@@ -204,7 +204,14 @@ def test_every_expression_of_the_table_is_used() -> None:
 
 def test_what_is_no_option_is_a_key() -> None:
     known = {(key.section, key.name) for key in KEYS}
-    assert {(section, key) for key, section in KEYS_OF.items()} <= known
+    told = {(section, key) for key, section in KEYS_OF.items()}
+    assert told <= known
+    parser, commands = _parser()
+    actions = (each._option_string_actions for each in (parser, *commands.values()))
+    options = {name.lstrip("-").replace("-", "_") for names in actions for name in names}
+    for section in ("refine", "time"):
+        keys = {name for where, name in known if where == section}
+        assert keys <= {name for where, name in told if where == section} | options, section
 
 
 @pytest.mark.serial

@@ -223,7 +223,7 @@ def test_parts_and_conditions_must_match():
         solve(replace(problem, conditions=dict(list(problem.conditions.items())[:3])), domain)
     with pytest.raises(InputError, match="no part of the boundary is called 'ground'"):
         solve(replace(problem, conditions={**problem.conditions, "ground": Neumann()}), domain)
-    with pytest.raises(InputError, match="'wall' is 3; Dirichlet, Neumann, Robin or Contact"):
+    with pytest.raises(InputError, match="'wall' is 3; a Condition is needed, such as Contact"):
         solve(replace(problem, conditions={**problem.conditions, "wall": 3}), domain)
     for key, wrong in (("reaction", {"reaction": -1.0}), ("'air'", {})):
         conditions = problem.conditions | ({} if wrong else {"air": Robin(coefficient=-2.0)})

@@ -282,7 +282,7 @@ def test_only_our_own_leftovers_are_removed(finished, shared_tmp_path):
     names = output.write_output(shared_tmp_path, report, solution, pictures=False)
     WORLD.barrier()
     there = {path.name for path in shared_tmp_path.iterdir()}
-    assert there == {*names, "notes.txt"}
+    assert there == {*names, "notes.txt"} and set(names) <= set(output.FILES)
     assert "convergence.png" not in there
     assert (shared_tmp_path / "notes.txt").read_text() == "old"
     assert json.loads((shared_tmp_path / "report.json").read_text())["title"] == "A"

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from signorini_cr.app.cli import main
 from signorini_cr.output.meanings import OF_STEPS
+from signorini_cr.output.report import FILES
 
 pytestmark = pytest.mark.slow
 
@@ -85,7 +86,9 @@ def read(path):
 
 
 def test_the_page_holds_everything_and_points_nowhere(page):
-    reader = read(page(FILE, "--levels", "2"))
+    path = page(FILE, "--levels", "2")
+    assert {each.name for each in path.parent.iterdir()} <= set(FILES)
+    reader = read(path)
     assert len(reader.links) == 4 and {"ul", "li"} <= reader.tags
     assert "Bounds of the levels" in reader.text
     assert "The mesh, the finest whose cells can be told apart, and" in reader.text
