@@ -28,7 +28,9 @@ from signorini_cr.rounding import at_most, interval
 
 study = Study("demo_certificate", "Certified against true error")
 levels = levels_wanted(7)
-NAMES = ("S1", "A", "B", "C", "I", "D")
+NAMES = ["S1", "A", "B", "C", "I", "D"]
+if levels <= 3:  # the kinks of I, which have no end, take as long on few cells as on many
+    NAMES.remove("I")
 
 # %% [markdown]
 # ## Uniform and adaptive meshes

@@ -13,7 +13,7 @@ from .fem.space import ghosted_vector
 from .garbage import release
 from .mesh.domain import Domain
 from .multigrid.hierarchy import NestedMesh
-from .options import ESTIMATE_PREFIX, LINEAR, solve_once
+from .options import DUAL, ESTIMATE_PREFIX, solve_once
 from .vi.level import Level
 
 
@@ -57,7 +57,7 @@ def solved(dual: Problem, level: Level) -> Dual:
     system = level.system
     u = system.start()
     load, found = (ghosted_vector(level.V, each) for each in (system.b, u.x.array))
-    solve_once(system.A, load, found, LINEAR, ESTIMATE_PREFIX)
+    solve_once(system.A, load, found, DUAL, ESTIMATE_PREFIX)
     u.x.scatter_forward()
     u.x.array[:] += system.offset
     release(load, found)

@@ -47,7 +47,7 @@ class Scheme(NamedTuple):
 
     Attributes:
         factor: Of the rate.
-        weights: Of the solutions before in w, the last one first.
+        weights: Of the one or two solutions before in w, the last one first; no others are kept.
     """
 
     factor: float
@@ -352,7 +352,8 @@ def solve_in_time(
                 else:
                     start, then, before = _gone_on(solver, restart, initial, step, time)
             source = fem.Function(solver.V)
-            for weight, former_u in zip(method.weights, (then, before), strict=False):
+            kept = (then, before)[: len(method.weights)]
+            for weight, former_u in zip(method.weights, kept, strict=True):
                 source.x.array[:] += weight * former_u
             solution = solver.solve(source, start, rates, monitor)
             before, then = then, solution.u.x.array

@@ -25,7 +25,7 @@ from .estimate.force import (
     unsure,
 )
 from .estimate.settled import Settled, in_p1, left_by
-from .estimate.weights import Beyond, Weight, ranges, scalar
+from .estimate.weights import Weighed, Weight, ranges, scalar
 from .fem.cells import measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin
 from .fem.problem import Forms, Problem
@@ -119,7 +119,7 @@ def _corrected(
             return None
         assert dual.bound_companion is not None
         at, flows = of_phi.vertices[cells.vertices], of_phi.through(cells)
-        apart, beyond = 0.0, Beyond(force=sum(through(made, cells, c) for c in known))
+        apart, weighed = 0.0, Weighed(force=sum(through(made, cells, c) for c in known))
         if weight is not None:
             given, own = Weight.of(made, cells, known, weight, settled.free), at
             at = given.put_into(own)
@@ -129,7 +129,7 @@ def _corrected(
                 )
             )
             apart = float(sum(off_companion))
-            beyond = given.beyond(made, cells, float(size))
+            weighed = given.weighed(made, cells, float(size))
         product = bound * (dual.bound_companion + apart)
         if settled.held:
             product += bound * left_by(of_phi, made)
@@ -137,11 +137,11 @@ def _corrected(
                 return None
         work, missed, slack = against(made, cells, at)
         force, work, energy, lifted, more = cells.total(
-            beyond.force,
+            weighed.force,
             work,
             square(made, cells, at),
-            beyond.square,
-            missed + unsure(made, at, slack, beyond) + beyond.unsure,
+            weighed.square,
+            missed + unsure(made, at, slack, weighed) + weighed.unsure,
         )
         middle, reach = force + work, made.loose * np.sqrt(energy) + more + product
         reach += 2.0 * made.reach * np.sqrt(lifted)

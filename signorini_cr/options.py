@@ -100,7 +100,7 @@ COMPANION: dict[str, object] = {
 }
 """The best companion, where it is solved for."""
 
-LINEAR: dict[str, object] = {
+DUAL: dict[str, object] = {
     "ksp_type": PETSc.KSP.Type.CG,
     # in the residual's norm as much as a thousand times more may be left
     "ksp_norm_type": "natural",

@@ -63,6 +63,7 @@ def test_the_first_demo_prints_a_row_a_level(studies):
             "demo_adaptive.py",
             {"adaptive-l-shape-error", "adaptive-hole-mesh", "adaptive-convergence"},
         ),
+        ("demo_certificate.py", {"certificate"}),
         ("demo_frost.py", {"frost", "frost-night"}),
         ("demo_dam.py", {"dam"}),
         ("demo_seepage.py", {"seepage", "seepage-heads"}),
@@ -72,6 +73,16 @@ def test_the_first_demo_prints_a_row_a_level(studies):
 def test_demos_on_their_own(demo, pictures, shared_tmp_path):
     assert script(DEMOS / demo, shared_tmp_path, SIGNORINI_DEMO_LEVELS="3")[0] == 0
     assert {path.stem for path in shared_tmp_path.glob("*.png") if is_picture(path)} >= pictures
+
+
+@pytest.mark.serial
+def test_no_demo_is_left_out():
+    """Each is made with the studies, or runs on its own."""
+    text = (DEMOS / "__main__.py").read_text(encoding="utf-8")
+    made = re.findall(r'"(\w+)"', re.search(r"^DEMOS = \((.*?)\)", text, re.M | re.S)[1])
+    (alone,) = (mark.args[1] for mark in test_demos_on_their_own.pytestmark)
+    tried = sorted([*made, *(Path(demo).stem for demo, _ in alone)])
+    assert tried == sorted(path.stem for path in DEMOS.glob("demo_*.py"))
 
 
 @pytest.mark.parametrize("demo", ["", "film.py", "demo_s1.py"])

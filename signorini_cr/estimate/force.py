@@ -20,13 +20,13 @@ from ..fem.conditions import Condition, Data, facets_of
 from ..fem.space import function_space, ghosted_vector, shared_sum
 from ..garbage import release
 from ..jit import compiled
-from ..options import ESTIMATE_PREFIX, LINEAR, solve_once
+from ..options import DUAL, ESTIMATE_PREFIX, solve_once
 from ..vi.solved import Solved
 from .certificate import Certificate, Made
 from .companion import bend_squares
 from .duality import apart
 from .heights import distance
-from .weights import Beyond, Weight
+from .weights import Weighed, Weight
 
 NO_BOUNDS = "what flows through the part has no bounds"
 TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
@@ -90,24 +90,24 @@ def interval(
     work, off, slack = against(made, cells, at)
     (energy,) = cells.total(square(made, cells, at))
     if given is None:
-        beyond = Beyond(force=sum(through(made, cells, condition) for condition in conditions))
+        weighed = Weighed(force=sum(through(made, cells, condition) for condition in conditions))
     else:
-        beyond = given.beyond(made, cells, float(np.sqrt(energy)))
+        weighed = given.weighed(made, cells, float(np.sqrt(energy)))
     at_fixed = any(condition.fixed is not None for condition in conditions)
     # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
     exits = at_fixed or made.on_contact_alone
-    more = unsure(made, at, slack, beyond) if exits else 0.0
+    more = unsure(made, at, slack, weighed) if exits else 0.0
     value, middle, lifted, more = cells.total(
-        beyond.force,
-        beyond.force + 0.5 * work,
-        beyond.square,
-        beyond.unsure + 0.5 * off + more,
+        weighed.force,
+        weighed.force + 0.5 * work,
+        weighed.square,
+        weighed.unsure + 0.5 * off + more,
     )
     # ℓ meets all of A(u − v), of which one half is known to be at most the radius
     reach = made.reach * (np.sqrt(energy) + 2.0 * np.sqrt(lifted)) + more
     # a force off one bound only has its sign
     signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
-    if min(cells.comm.allgather(beyond.least)) < 0.0:
+    if min(cells.comm.allgather(weighed.least)) < 0.0:
         signs = set()
     lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
     lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
@@ -123,7 +123,7 @@ def through(made: Made, cells: Cells, condition: Condition) -> float:
 
 
 def unsure(
-    made: Made, at: FloatArray, slack: FloatArray, beyond: Beyond = Beyond(force=0.0)
+    made: Made, at: FloatArray, slack: FloatArray, weighed: Weighed = Weighed(force=0.0)
 ) -> float:
     """Bound what is left of −div y = f times φ + ℓ where it does not vanish on Γ0; rank's share.
 
@@ -131,10 +131,10 @@ def unsure(
         made: What is left.
         at: φ of P1 at the cells' vertices, shape (3, cells).
         slack: From `against`.
-        beyond: ℓ.
+        weighed: What ℓ adds.
     """
-    largest = np.abs(at).max(initial=0.0) + beyond.mean
-    return float(np.sum(slack) + beyond.left + made.missed.sum() * largest)
+    largest = np.abs(at).max(initial=0.0) + weighed.mean
+    return float(np.sum(slack) + weighed.left + made.missed.sum() * largest)
 
 
 def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, float, FloatArray]:
@@ -286,7 +286,7 @@ def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Functio
     b.x.scatter_reverse(InsertMode.add)
     b.x.array[known] = values.x.array[known]
     load, found = (ghosted_vector(V, function.x.array) for function in (b, phi))
-    solve_once(A, load, found, LINEAR, ESTIMATE_PREFIX)
+    solve_once(A, load, found, DUAL, ESTIMATE_PREFIX)
     release(A, load, found)
     # Exactly so, whatever the solver did
     phi.x.array[known] = values.x.array[known]

@@ -32,7 +32,7 @@ SHARE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
-class Beyond:
+class Weighed:
     """What a weight is against y, and what it has beyond P1; this rank's shares.
 
     Attributes:
@@ -124,7 +124,7 @@ class Weight:
         dofs = self.values.function_space.dofmap.list[: at.shape[1]].T
         return np.where(np.isin(dofs, self.known), self.values.x.array[dofs], at)
 
-    def beyond(self, made: Made, cells: Cells, size: float) -> Beyond:
+    def weighed(self, made: Made, cells: Cells, size: float) -> Weighed:
         """Integrate it against y, and bound what it has beyond P1; collective.
 
         Args:
@@ -157,7 +157,7 @@ class Weight:
         left = np.abs(made.left[side.cells])
         if made.taken_up is not None:
             left = np.where(made.taken_up[side.cells], 0.0, left)
-        return Beyond(
+        return Weighed(
             float(pressure @ (length * (ends.mean(axis=0) + 2.0 / 3.0 * height))),
             unsure,
             _square(made, cells, side, coarse),

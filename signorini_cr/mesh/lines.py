@@ -15,7 +15,7 @@ NEAR = 1e-12
 """How close, in parts of the extent, points are the same, and points are on a line."""
 
 
-class Layout(NamedTuple):
+class Outline(NamedTuple):
     """An outline, and lines inside it that meet it and one another in their ends only.
 
     Attributes:
@@ -32,7 +32,7 @@ class Layout(NamedTuple):
 
 def arranged(
     loops: Sequence[FloatArray], labels: Int32Array, polygons: Sequence[FloatArray]
-) -> Layout:
+) -> Outline:
     """Cut an outline and the edges of polygons where they meet.
 
     Args:
@@ -41,7 +41,7 @@ def arranged(
         polygons: May reach beyond the outline, and share edges, or parts of edges.
     """
     if not polygons:
-        return Layout(loops, labels, np.empty((0, 2, 2)))
+        return Outline(loops, labels, np.empty((0, 2, 2)))
     near = NEAR * np.ptp(loops[0], axis=0).max()
     rings = [*loops, *polygons]
     points: list[FloatArray] = []
@@ -82,7 +82,7 @@ def arranged(
     within = inside(middle, loops[0])
     for hole in loops[1:]:
         within &= ~inside(middle, hole)
-    return Layout(new_loops, np.concatenate(new_labels), ends[within])
+    return Outline(new_loops, np.concatenate(new_labels), ends[within])
 
 
 def _crossings(edge: FloatArray, others: FloatArray) -> FloatArray:

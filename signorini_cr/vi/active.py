@@ -2,8 +2,10 @@
 
 While it solves SNES decides, and `ActiveSet.without` takes that over. `ActiveSet.of` is the same
 criterion for an iterate as it is, `ReducedSystem.indicator` for one as CG sees it coming: the three
-must agree. Who knows a solution only by its gaps and forces goes by `touching`. From dofs to
-facets leads `contact_facts`.
+must agree. Two go on from such a set by other rules: `ReducedSolver`, where the primal-dual method
+goes round in circles, holds what is on its bound; `Extended` moves single dofs to the other side
+where double precision does not tell. Who knows a solution only by its gaps and forces goes by
+`touching`. From dofs to facets leads `contact_facts`.
 """
 
 from __future__ import annotations

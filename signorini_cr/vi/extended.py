@@ -50,7 +50,7 @@ DataRounding = Callable[[int], tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class Outcome:
     """What is known of forces in the end.
 
     Attributes:
@@ -102,7 +102,7 @@ class Extended:
         stiffness.exact = True
         stiffness.sort(vectors.x, vectors.b)
 
-    def settle(self, rounding: DataRounding, loads: FloatArray, slack: float) -> Settled:
+    def settle(self, rounding: DataRounding, loads: FloatArray, slack: float) -> Outcome:
         """Find active set and forces, and how well they are known; collective.
 
         On return x and the residual are those that contact is read from.
@@ -137,7 +137,7 @@ class Extended:
         given = open_by_data / np.maximum(np.maximum(sizes, total), 1e-300)
         self._write(none)
         by_data = float(given.sum())
-        return Settled(float(solved.max()) + by_data, by_data > float(solved.max()))
+        return Outcome(float(solved.max()) + by_data, by_data > float(solved.max()))
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free what is here alone."""

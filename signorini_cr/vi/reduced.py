@@ -23,7 +23,7 @@ from petsc4py import PETSc
 from ..arrays import FloatArray, summed
 from ..garbage import release
 from ..multigrid.cycle import SLOW, Grid, Multigrid
-from ..options import PREFIX, REDUCED, defaults, read
+from ..options import PREFIX, REDUCED, defaults, read, read_word
 from .active import ActiveSet
 from .bounds import Bounds
 from .stopping import FORCES, LOST, NOISE, Stiffness
@@ -144,6 +144,7 @@ class ReducedSolver:
             read(ksp)
         self._is_cg = ksp.getType() == PETSc.KSP.Type.CG
         if self._is_cg:
+            read_word("ksp_norm_type", ("unpreconditioned",))  # `LinearTest` decides by no other
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         elif ksp.getTolerances()[1] == atol:  # preconditioned norms may be much smaller
             ksp.setTolerances(atol=SETTLING_LIMIT * atol)

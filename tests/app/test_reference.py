@@ -5,18 +5,20 @@ import json
 import re
 import runpy
 from dataclasses import fields
+from inspect import signature
 from pathlib import Path
 
 import pytest
-from helpers import ROOT
+from helpers import HELD_ABOVE, ROOT
 from mpi4py import MPI
 
 import signorini_cr
-from signorini_cr import options
+from signorini_cr import Contact, options, solve
+from signorini_cr.adaptive import adapt_to_run
 from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import KEYS_OF, _parser
 from signorini_cr.app.problemfile import load
-from signorini_cr.app.reference import ABOUT, KEYS, MATERIAL, PART, QUANTITY, TYPES
+from signorini_cr.app.reference import ABOUT, ADAPTIVE, KEYS, MATERIAL, PART, QUANTITY, TYPES
 from signorini_cr.fem.problem import Material, Problem
 
 BASE = {
@@ -59,7 +61,7 @@ def test_every_prefix_of_petsc_options_is_in_the_reference() -> None:
             assert f"| `-{prefix}` |" in text, name
     code = "".join(p.read_text(encoding="utf-8") for p in PACKAGE.rglob("*.py"))
     own = set(re.findall(r"\bread_(?:word|number)\(\"(\w+)\"", code))
-    assert own == {"smoother", "snes_atol"}
+    assert own == {"smoother", "snes_atol", "ksp_norm_type"}
     assert f"`-{options.PREFIX}smoother " in text
 
 
@@ -200,6 +202,23 @@ def test_every_expression_of_the_table_is_used() -> None:
         assert any(key.section == section and key.is_expression for key in KEYS)
     keys = {key.name for key in KEYS if key.section == PART} - {"type"}
     assert keys == {name for names in TYPES.values() for name in names}
+
+
+@pytest.mark.serial
+def test_every_field_is_in_both_tables() -> None:
+    text = (DOCS / "howto.md").read_text(encoding="utf-8")
+    tables = [
+        text.partition(head)[2].partition("\n\n")[0] for head in ("| field |", "| function |")
+    ]
+    problem = Problem(conditions={"contact": Contact(-1.0, upper=1.0)})
+    for name in solve(problem, HELD_ABOVE.mesh(0.5)).functions():
+        assert all(f"`{name}`" in table for table in tables), name
+
+
+def test_runs_in_time_seek_their_mesh_by_the_same_keys() -> None:
+    in_time = signature(adapt_to_run).parameters
+    for name, (_, default) in ADAPTIVE.items():
+        assert name in in_time and in_time[name].default == default, name
 
 
 def test_what_is_no_option_is_a_key() -> None:

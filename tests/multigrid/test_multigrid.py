@@ -35,6 +35,7 @@ from signorini_cr.multigrid.transfer import Ancestor, inclusion, prolongate, pro
 from signorini_cr.options import AMG
 from signorini_cr.vi.level import Level
 from signorini_cr.vi.nested import nested_start
+from signorini_cr.vi.reduced import ReducedSolver
 from signorini_cr.vi.solver import solve_vi
 
 pytestmark = [pytest.mark.slow, pytest.mark.ranks]
@@ -403,6 +404,30 @@ def test_after_a_failure_on_one_rank_in_a_solve_all_matrices_are_whole(lone):
             solve_vi(cycle, vectors, scale, monitor=monitor)
         assert len(seen) == 2 and len(matrices) == 3
         assert all(same(*pair) for pair in matrices)
+
+
+@pytest.mark.parametrize("lone", [0, MPI.COMM_WORLD.size - 1])
+def test_after_a_failure_on_one_rank_amid_constrained_matrices_all_are_whole(monkeypatch, lone):
+    """One rank leaves the block by an error, which tells the others nothing."""
+    run, solve_reduced = ReducedSolver._run, ReducedSolver.solve
+    with watched() as (cycle, vectors, scale, matrices):
+
+        def fail_there(self, forces):
+            test = run(self, forces)
+            assert not any([same(*pair) for pair in matrices])
+            if MPI.COMM_WORLD.rank == lone:
+                raise ArithmeticError("alone")
+            return test
+
+        def end_here(*args):
+            solve_reduced(*args)
+            raise RuntimeError("out of the block")
+
+        monkeypatch.setattr(ReducedSolver, "_run", fail_there)
+        monkeypatch.setattr(ReducedSolver, "solve", end_here)
+        with pytest.raises(ArithmeticError if MPI.COMM_WORLD.rank == lone else RuntimeError):
+            solve_vi(cycle, vectors, scale)
+        assert len(matrices) == 3 and all([same(*pair) for pair in matrices])
 
 
 def test_after_an_error_inside_the_cycle_all_matrices_are_whole(monkeypatch):

@@ -81,6 +81,14 @@ def test_solvers_that_do_not_suit_are_the_users_mistake(options, name, value, wo
         solve(PROBLEM, HELD_ABOVE.mesh(0.25))
 
 
+def test_a_norm_that_cg_cannot_end_by_is_the_users_mistake(options):
+    options("ksp_norm_type", "natural")
+    with pytest.raises(InputError, match="-signorini_ksp_norm_type is 'natural'; allowed are unp"):
+        solve(PROBLEM, HELD_ABOVE.mesh(0.25))
+    options("ksp_norm_type", "unpreconditioned")
+    assert solve(PROBLEM, HELD_ABOVE.mesh(0.25)).iterations.linear > 0
+
+
 def test_a_petsc_of_other_numbers(monkeypatch):
     monkeypatch.setattr(PETSc, "ScalarType", np.complex128)
     with pytest.raises(InputError, match="PETSc's numbers are complex128; float64 is needed"):
