@@ -1,6 +1,7 @@
 """The page of a run: complete, on its own, and fit for a narrow screen."""
 
 import html
+import os
 import re
 import shutil
 import subprocess
@@ -90,6 +91,7 @@ def test_the_page_holds_everything_and_points_nowhere(page):
     assert {each.name for each in path.parent.iterdir()} <= set(FILES)
     reader = read(path)
     assert len(reader.links) == 4 and {"ul", "li"} <= reader.tags
+    assert ("./container/run " in reader.text) is ("SIGNORINI_CR_SUITE" in os.environ)
     assert "Bounds of the levels" in reader.text
     assert "The mesh, the finest whose cells can be told apart, and" in reader.text
     for part in (
