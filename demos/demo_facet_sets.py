@@ -76,14 +76,16 @@ def draw(left, right):
         for (name, family), rows in judged.items():
             share = tuple(what(j) / (j.bound + j.mixed + j.free) for _, j in rows)
             alike.setdefault(share, []).append((name, family))
-        curves = {}
-        for k, (share, keys) in enumerate(alike.items()):
+        curves, colours = {}, []
+        for share, keys in alike.items():
+            k = cases.index(keys[0])  # above and below the same
             h = [h for h, _ in judged[keys[0]]]
             label = ";\n".join(
                 f"{', '.join(called(name) for name, each in keys if each == family)}, {family}"
                 for family in dict.fromkeys(family for _, family in keys)
             )
             curves[label] = h, share
+            colours.append(COLOURS[k])
             style = "--" if {family for _, family in keys} == {"mapped"} else "-"
             axes.plot(h, share, style, color=COLOURS[k], marker=MARKERS[k], linewidth=1.8)
         axes.set_xscale("log")
@@ -93,13 +95,13 @@ def draw(left, right):
         axes.set_xlabel("$h$", fontsize=14)
         axes.set_ylabel("share of the facets on $\\Gamma_1$", fontsize=13)
         axes.grid(alpha=0.3)
-        name_curves(axes, curves)
+        name_curves(axes, curves, colours)
 
 
 study.picture(
     "facet-sets.png",
     "Shares of the contact facets that are misjudged (above) and that hold critical points; where "
-    "several examples have the same, one line stands for all of them.",
+    "several examples have the same, one line stands for all of them, in the colour of the first.",
     draw,
     panels=2,
 )

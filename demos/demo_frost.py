@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import ufl
-from study import ENDS, Study, canvas, comm, levels_wanted
+from study import ENDS, Study, canvas, levels_wanted
 
 # isort: split
 from dolfinx import fem  # behind study, which finds MPI for the wheels
@@ -36,12 +36,11 @@ from signorini_cr import (
     Problem,
     Robin,
     force,
-    plots,
     solve,
     solve_in_time,
 )
 from signorini_cr.app.problemfile import load
-from signorini_cr.output.strip import chosen, moment, plot_strip
+from signorini_cr.output.strip import chosen, moment
 from signorini_cr.rounding import interval
 
 study = Study("demo_frost", "A bridge deck kept free of frost")
@@ -110,10 +109,18 @@ for time, solution in night.steps(night.mesh(), levels_wanted(3)):
     steps.append((time, solution.contact.force, solution.contact.length))
     if len(steps) in chosen(night.time.steps):
         moments.append(moment(time, solution))
-plots.drawn(
-    comm, lambda: plot_strip(moments, study.folder / "frost-night.png", night.title, night.units)
+study.strip(
+    "frost-night.png",
+    "Through a night: where heat is needed, and when.",
+    moments,
+    units=night.units,
+    title="Above the ducts heating begins last and ends first",
+    words={
+        r"of $\Gamma_1$ in contact": "of the surface heated",
+        "no contact": "not heated",
+        "contact": "heated",
+    },
 )
-study.show("frost-night.png", "Through a night: where heat is needed, and when.")
 times, heats, lengths = map(np.array, zip(*steps, strict=True))
 energy = np.trapezoid(heats, times) / 1000
 study.tell(

@@ -34,12 +34,11 @@ from signorini_cr import (
     Polygon,
     Problem,
     force,
-    plots,
     solve_in_time,
     solve_levels,
 )
 from signorini_cr.app.problemfile import load
-from signorini_cr.output.strip import chosen, moment, plot_strip
+from signorini_cr.output.strip import chosen, moment
 from signorini_cr.rounding import interval
 
 study = Study("demo_wall", "A wall that lets the tide in, not out")
@@ -88,10 +87,18 @@ for time, solution in case.steps(case.mesh(), levels):
     if len(rows) in chosen(case.time.steps):
         moments.append(moment(time, solution))
 times, inflow, volume, leak = np.array(rows).T
-plots.drawn(
-    comm, lambda: plot_strip(moments, study.folder / "wall-strip.png", case.title, case.units)
+study.strip(
+    "wall-strip.png",
+    "The level in the ground, and where the wall is open.",
+    moments,
+    units=case.units,
+    title="Where the ground fills sooner, on the left, the wall shuts first",
+    words={
+        r"of $\Gamma_1$ in contact": "of the wall open",
+        "no contact": "wall shut",
+        "contact": "wall open",
+    },
 )
-study.show("wall-strip.png", "The level in the ground; the wall is open where it is in contact.")
 
 
 def draw(levels_of, flows):

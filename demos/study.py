@@ -28,6 +28,7 @@ from dolfinx.mesh import Mesh, entities_to_geometry
 from signorini_cr import exact, norms, plots, solve, solve_levels, theory
 from signorini_cr.errors import on_root
 from signorini_cr.output import canvas
+from signorini_cr.output.strip import Moment, plot_strip
 from signorini_cr.output.units import Units
 from signorini_cr.solution import Solution
 from signorini_cr.verification.exact import Example
@@ -292,6 +293,39 @@ class Study:
         """Keep a reference to a picture that is there."""
         self.parts.append(f"![{caption}]({file})\n\n*{caption}*")
         self.pictures.append(file)
+
+    def strip(
+        self,
+        file: str,
+        caption: str,
+        moments: Sequence[Moment],
+        *,
+        units: Units,
+        title: str,
+        words: Mapping[str, str],
+    ) -> None:
+        """Draw u_h at some moments on rank 0.
+
+        Args:
+            file: Name of the PNG.
+            caption: What it shows.
+            moments: From `strip.moment`.
+            units: What u, the axes and time are called and measured in.
+            title: The heading.
+            words: What stands in the legend and above the moments in the place of what
+                `plot_strip` writes there; one after the other.
+        """
+
+        def paint() -> None:
+            figure = plot_strip(moments, units=units)
+            texts = [axes.title for axes in figure.axes] + figure.legends[0].get_texts()
+            for text, (usual, own) in itertools.product(texts, words.items()):
+                text.set_text(text.get_text().replace(usual, own))
+            figure.suptitle(title, fontsize=14)
+            canvas.save(figure, self.folder / file)
+
+        on_root(comm, paint)
+        self.show(file, caption)
 
     def finish(self) -> None:
         """Write what was kept."""

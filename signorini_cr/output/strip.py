@@ -130,8 +130,9 @@ def plot_strip(
     wide = np.divide(*(box[1] - box[0]))
     columns = min(len(moments), 1 if wide > 2.5 else 2 if wide > 1.4 else 3)
     rows = -(-len(moments) // columns)
-    width = 9.0 if columns == 1 else 11.0 / columns
-    figure = new_figure(width * columns + 1.3, rows * (max((width - 1.0) / wide, 0.9) + 0.75) + 1.2)
+    width = 8.0 / columns  # and a bar beside them: more inches make letters small on a page
+    gap, above = ("\n", 1.15) if columns == 3 else (" ", 0.75)
+    figure = new_figure(9.3, rows * (max((width - 1.0) / wide, 0.9) + above) + 1.2)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     marks: dict[str, Line2D] = {}
     time = units.after("time").replace("$", r"\$")
@@ -154,18 +155,19 @@ def plot_strip(
         draw_contours(axes, each.smooth, box, contour_heights((low, high)))
         draw_lines(axes, chains(each.boundary), color="black", linewidth=1.0, joinstyle="round")
         for lines, color in ((each.free, "white"), (each.touching, RED)):
-            outlined = [Stroke(linewidth=4.5, foreground="black"), Normal()]
-            style: dict[str, Any] = {"color": color, "linewidth": 3.0, "path_effects": outlined}
+            outlined = [Stroke(linewidth=7.5, foreground="black"), Normal()]
+            style: dict[str, Any] = {"color": color, "linewidth": 5.5, "path_effects": outlined}
             draw_lines(axes, chains(lines), zorder=3, **style)
             marks["contact" if color == RED else "no contact"] = Line2D([], [], **style)
-        axes.set_title(f"$t$ = {each.time:.4g}{time}: {each.words}", fontsize=12)
-    figure.supylabel(panels[0, 0].get_ylabel(), fontsize=12)  # on low panels they would overlap
+        axes.set_title(f"$t$ = {each.time:.4g}{time}:{gap}{each.words}", fontsize=12)
+    figure.supylabel(panels[0, 0].get_ylabel(), fontsize=13)  # on low panels they would overlap
     for axes in panels.flat:
         axes.set_ylabel("")
     for axes in panels.flat[len(moments) :]:
         axes.remove()
     bar = figure.colorbar(shown, ax=list(panels.flat[: len(moments)]), aspect=30)
     label_bar(bar, units)
+    bar.ax.tick_params(labelsize=11)
     bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
     legend(figure, list(marks.values()), list(marks), ncols=2)
     figure.suptitle(headline(title, "$u_h$ in time"), fontsize=14)
