@@ -415,10 +415,10 @@ def test_the_residual_against_affine_functions(reaction, lossy, varies):
     assert np.allclose(left, slack)
     assert np.isclose(force.square(made, cells, phi), size)
     made.missed = np.array([0.125, 0.125])
-    beyond = weights.Beyond(force=0.0, left=0.125, mean=0.5)
+    weighed = weights.Weighed(force=0.0, left=0.125, mean=0.5)
     assert np.isclose(force.unsure(made, phi, left), slack.sum() + 0.25 * np.abs(phi).max())
     expected = slack.sum() + 0.125 + 0.25 * (np.abs(phi).max() + 0.5)
-    assert np.isclose(force.unsure(made, phi, left, beyond), expected)
+    assert np.isclose(force.unsure(made, phi, left, weighed), expected)
     if varies:
         return
     # The function with given values that has the least ‖Aφ‖, by solving for it densely
@@ -535,7 +535,7 @@ def test_a_weight_against_the_flux(monkeypatch):
 
     monkeypatch.setattr(weights, "lift", lift)
     made = replace(made, left=rng.normal(size=cells.number), taken_up=None)
-    result = found.beyond(made, cells, 3.0)
+    result = found.weighed(made, cells, 3.0)
     assert len(goals) == 2 and np.allclose(goals, 0.03 / 2)  # κ^{1/2} = 2
     pressure = made.through(cells)[side.local, side.cells] / on.length
     cubes = on.integral(on.x[..., 0] ** 3 - 0.5)  # Simpson's rule is exact
@@ -550,7 +550,7 @@ def test_a_weight_against_the_flux(monkeypatch):
     taken = np.arange(cells.number) == side.cells[1]
     heights = rng.normal(size=len(cells.exterior))
     made = replace(made, taken_up=taken, beyond=Beyond(heights, None))
-    result = found.beyond(made, cells, 3.0)
+    result = found.weighed(made, cells, 3.0)
     assert np.isclose(result.left, np.delete(np.abs(made.left[side.cells]) * over, 1).sum())
     own = heights[side.dofs, None] * 4 * (1 - 2 * on.s) / on.length[:, None]
     ends = found.values.x.array[V.dofmap.list[side.cells[:, None], on.ends]]
@@ -562,7 +562,7 @@ def test_a_weight_against_the_flux(monkeypatch):
     # with a reason there is none, and a corner's cell has the sum of two
     lifts[1] = replace(lifts[1], reason="u_D jumps on a boundary facet")
     with pytest.raises(InputError, match="the weight jumps on a boundary facet"):
-        found.beyond(made, cells, 3.0)
+        found.weighed(made, cells, 3.0)
 
 
 def test_signs_that_are_certain():
