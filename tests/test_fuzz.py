@@ -406,6 +406,7 @@ def test_problem_files_are_solved_or_refused(text: str) -> None:
     look_at_file(text, 1)
 
 
+@pytest.mark.slow
 @few
 @given(damaged(st.sampled_from(SOURCES), WORDS))
 def test_damaged_problem_files_are_read_or_refused(text: str) -> None:

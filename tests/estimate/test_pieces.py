@@ -1466,6 +1466,7 @@ def test_a_small_loss_is_no_way_out():
         assert limits[0] * without <= found(b) <= limits[1] * without * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_no_round_leaves_v_below_the_obstacle(monkeypatch):
     """A bump that one round holds there is raised where the next lowers its facet's ends."""

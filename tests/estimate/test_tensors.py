@@ -263,6 +263,7 @@ def test_every_way_to_give_a_tensor():
     assert bounds[-1] is None and "computable" in solution.certificate.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kappa", "wanted"),
     [

@@ -60,6 +60,7 @@ def mirrored(sign, **terms):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", [{}, {"coefficient": 5.0, "external": 0.25, "g": 0.5}])
 def test_contact_from_above_is_contact_from_below_upside_down(terms):
     """Whatever is computed, to the last digits that the order of operations leaves."""
@@ -203,6 +204,7 @@ def test_bounds_that_touch_have_a_certificate():
         assert certificate.bound_h1 is not None, certificate.reason
 
 
+@pytest.mark.slow
 def test_rates_between_two_obstacles():
     """u smooth, on α for x < −0.3, on β for x > 0.3: H1 like h, L2 like h², bounds hold."""
 
