@@ -143,10 +143,15 @@ def take(words: Sequence[str]) -> None:
         for word, after in pairwise([*words, "-none"])
         if word.startswith(f"-{PREFIX}")
     }
-    database = PETSc.Options()
+    database, known = PETSc.Options(), _in_database()
     for word, value in given.items():
-        if not database.hasName(word):
+        if word.lower() not in known:
             database.setValue(word, value)
+
+
+def _in_database() -> set[str]:
+    """List PETSc's options without using any: those that are asked for by name count as used."""
+    return {f"-{name}".lower() for name in PETSc.Options().getAll()}
 
 
 def unheard(words: Sequence[str]) -> list[str]:
@@ -160,9 +165,9 @@ def unheard(words: Sequence[str]) -> list[str]:
     Returns:
         Up to two warnings.
     """
-    database = PETSc.Options()
+    there = _in_database()
     lost = [word for word in dict.fromkeys(words) if OF_SOLVERS.match(word) or word in OF_PETSC]
-    lost = [word for word in lost if not database.hasName(word)]
+    lost = [word for word in lost if word.lower() not in there]
     solver = [word for word in lost if OF_SOLVERS.match(word)]
     own = [word for word in lost if word in OF_PETSC]
     warnings = []

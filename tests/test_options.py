@@ -4,7 +4,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from helpers import start
+from helpers import ROOT, command, start
 from petsc4py import PETSc
 
 from signorini_cr.options import PREFIX, take
@@ -85,6 +85,16 @@ def test_options_that_petsc_has_are_no_alarm(tmp_path, monkeypatch):
     assert "signorini_cr: warning" not in start(tmp_path / "later.py", "-ksp_view").stderr
     monkeypatch.setenv("PETSC_OPTIONS", f"-log_view :{tmp_path / 'y.txt'}")
     assert run(tmp_path, "-log_view").stderr == "" and (tmp_path / "y.txt").exists()
+
+
+@pytest.mark.serial
+def test_a_misspelt_option_of_the_command_is_told(tmp_path):
+    """By PETSc, once nobody has asked for it: to look for its name would count as use."""
+    words = "solve", ROOT / "meshes" / "s1.toml", "--levels", "1", "--out", tmp_path, "--quiet"
+    done = command(*map(str, words), "-signorini_smother", "jacobi", cwd=tmp_path)
+    assert done.returncode == 0 and "name:-signorini_smother" in done.stdout + done.stderr
+    done = command(*map(str, words), "-signorini_smoother", "jacobi", cwd=tmp_path)
+    assert done.returncode == 0 and "WARNING" not in done.stdout + done.stderr
 
 
 @pytest.mark.serial

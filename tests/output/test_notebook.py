@@ -54,7 +54,6 @@ NOTEBOOK = DEMOS / "slope.ipynb"
 
 
 @pytest.mark.serial
-@pytest.mark.serial
 def test_the_notebook_begins_with_us():
     """DOLFINx from pip finds its MPI no sooner."""
     cells = json.loads((DEMOS / "slope.ipynb").read_text(encoding="utf-8"))["cells"]
@@ -62,6 +61,7 @@ def test_the_notebook_begins_with_us():
     assert first.startswith("import signorini_cr")
 
 
+@pytest.mark.serial
 def test_the_cells_of_the_notebook_run():
     """As plain Python, where there is no Jupyter; they end in assertions of their own."""
     pytest.importorskip("matplotlib")
