@@ -91,9 +91,9 @@ def test_options_that_petsc_has_are_no_alarm(tmp_path, monkeypatch):
 def test_a_misspelt_option_of_the_command_is_told(tmp_path):
     """By PETSc, once nobody has asked for it: to look for its name would count as use."""
     words = "solve", ROOT / "meshes" / "s1.toml", "--levels", "1", "--out", tmp_path, "--quiet"
-    done = command(*map(str, words), "-signorini_smother", "jacobi", cwd=tmp_path)
+    done = command(*words, "-signorini_smother", "jacobi", cwd=tmp_path)
     assert done.returncode == 0 and "name:-signorini_smother" in done.stdout + done.stderr
-    done = command(*map(str, words), "-signorini_smoother", "jacobi", cwd=tmp_path)
+    done = command(*words, "-signorini_smoother", "jacobi", cwd=tmp_path)
     assert done.returncode == 0 and "WARNING" not in done.stdout + done.stderr
 
 

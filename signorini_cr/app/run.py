@@ -227,7 +227,7 @@ def above_tolerance(case: ProblemFile, bound: float, level: int) -> NotConverged
     limits = [
         f"{key} = {value}"
         for key, value in case.adaptive.items()
-        if f"refine.{key}" in ENDS and key != "tolerance" and value is not None
+        if f"refine.{key}" in ENDS and key != "tolerance"
     ]
     limit = f"levels = {case.levels}" if level + 1 >= case.levels else " or ".join(limits)
     return NotConverged(

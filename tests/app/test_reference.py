@@ -227,10 +227,10 @@ def test_what_is_no_option_is_a_key() -> None:
     assert told <= known
     parser, commands = _parser()
     actions = (each._option_string_actions for each in (parser, *commands.values()))
-    options = {name.lstrip("-").replace("-", "_") for names in actions for name in names}
+    taken = {name.lstrip("-").replace("-", "_") for names in actions for name in names}
     for section in ("refine", "time"):
         keys = {name for where, name in known if where == section}
-        assert keys <= {name for where, name in told if where == section} | options, section
+        assert keys <= {name for where, name in told if where == section} | taken, section
 
 
 @pytest.mark.serial

@@ -56,7 +56,7 @@ NOTEBOOK = DEMOS / "slope.ipynb"
 @pytest.mark.serial
 def test_the_notebook_begins_with_us():
     """DOLFINx from pip finds its MPI no sooner."""
-    cells = json.loads((DEMOS / "slope.ipynb").read_text(encoding="utf-8"))["cells"]
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
     first = next("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     assert first.startswith("import signorini_cr")
 
