@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import ufl
@@ -590,7 +591,7 @@ class Enclosure:
         can_hold, can_fail = self.truth(condition)
         a, b = self(first), self(second)
         either = can_hold & can_fail
-        agree = bool(np.any(either)) and _agree(condition, first, second)
+        agree = bool(np.any(either)) and _known_to_agree(e)
         joined = ALWAYS if agree else self._joined(condition, first, second, either)
         jet = self._choose(can_hold, either, a, b, joined)
         if agree and _is_extreme(condition, first, second):
@@ -1010,7 +1011,17 @@ _COMPARISONS = (*_ORDERED, classes.EQ, classes.NE)
 # ---- conditionals that are continuous
 
 
-@cache
+_agreeing: WeakKeyDictionary[Any, bool] = WeakKeyDictionary()
+"""What was found of conditionals that are still there: one with x in it has its mesh along."""
+
+
+def _known_to_agree(e: Any) -> bool:
+    """Tell whether the branches of a conditional agree, once for each."""
+    if e not in _agreeing:
+        _agreeing[e] = _agree(*e.ufl_operands)
+    return _agreeing[e]
+
+
 def _agree(condition: Any, first: Any, second: Any) -> bool:
     """Tell whether the branches are seen to be equal where the condition changes."""
     if not isinstance(condition, _ORDERED):
