@@ -16,6 +16,7 @@ from dolfinx.mesh import CellType, Mesh, create_submesh
 from mpi4py import MPI
 
 from .arrays import FloatArray, Int32Array, Int64Array
+from .garbage import watch
 from .jit import compiled
 
 _TAG = 1998
@@ -39,6 +40,7 @@ def submesh(mesh: Mesh, dim: int, entities: Int32Array) -> tuple[Mesh, Int32Arra
         The mesh, and the entity that each cell owned by this rank was.
     """
     made, parents, *_ = create_submesh(mesh, dim, entities)
+    watch(made)
     cells = np.arange(made.topology.index_map(dim).size_local, dtype=np.int32)
     if hasattr(parents, "sub_topology_to_topology"):  # since 0.10
         return made, parents.sub_topology_to_topology(cells, False)

@@ -1,21 +1,34 @@
-"""PETSc's objects on several ranks, freed by all of them together.
+"""What is to be freed on several ranks, or in time.
 
 What Python drops at a moment of its own choosing PETSc can't free on several ranks, and keeps until
 all of them call `PETSc.garbage_cleanup` for the object's communicator. Each mesh has its own, which
-ends with it, and whatever is still kept for it then is lost. So meshes are held here until they can
-be cleaned up.
+ends with it, and what is still kept for it then is lost, with a communicator that PETSc has made
+of it. So meshes, as C++ has them, are held here until they can be cleaned up: whenever a
+`NestedMesh` is gone, which may happen often on one mesh, and when the mesh itself is.
+
+A mesh has half a dozen communicators, of which MPICH has 2048 in a process, on one rank as well.
+UFL and DOLFINx leave cycles behind, by which a mesh stays until Python looks for some: when there
+are many new objects, whatever hangs on them, and hardly ever where there are many old ones. So it
+is told to look when there are many meshes.
 """
 
 from __future__ import annotations
 
-import weakref
+import gc
+from typing import Any
+from weakref import WeakSet, ref
 
 import numpy as np
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 from petsc4py import PETSc
 
-_held: list[tuple[weakref.ref, Mesh]] = []
+MANY = 50
+"""So many meshes more than there were after the last look for cycles are a reason for another."""
+
+_held: list[tuple[ref, Any]] = []
+_meshes: WeakSet[Mesh] = WeakSet()
+_allowed = MANY
 
 
 def release(*things: PETSc.Object | None) -> None:
@@ -25,10 +38,24 @@ def release(*things: PETSc.Object | None) -> None:
             thing.destroy()
 
 
+def watch(mesh: Mesh) -> None:
+    """Note a new mesh, and free what meshes before have left; collective."""
+    global _allowed
+    if mesh in _meshes:
+        return
+    # where it is switched off it would do harm, see `options.explained`
+    if len(_meshes) >= _allowed and gc.isenabled():
+        gc.collect()
+        _allowed = len(_meshes) + MANY
+    sweep(mesh.comm)
+    _meshes.add(mesh)
+    hold(mesh, mesh)
+
+
 def hold(owner: object, mesh: Mesh) -> None:
     """Note that there are objects on a mesh's communicator that end with their owner."""
     if mesh.comm.size > 1:
-        _held.append((weakref.ref(owner), mesh))
+        _held.append((ref(owner), mesh._cpp_object))
 
 
 def sweep(comm: MPI.Comm) -> None:
@@ -40,6 +67,6 @@ def sweep(comm: MPI.Comm) -> None:
     gone = np.array([owner() is None for owner, _ in mine], dtype=np.int32)
     comm.Allreduce(MPI.IN_PLACE, gone, op=MPI.MIN)
     done = [entry for entry, is_gone in zip(mine, gone, strict=True) if is_gone]
-    for _, mesh in done:
+    for mesh in {id(mesh): mesh for _, mesh in done}.values():
         PETSc.garbage_cleanup(mesh.comm)
     _held[:] = [entry for entry in _held if not any(entry is other for other in done)]

@@ -37,6 +37,7 @@ from mpi4py import MPI
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import coordinate_map
 from ..errors import InputError, insist_on_kind, naming, on_root, raise_together
+from ..garbage import watch
 from ..rounding import counted
 from . import gmshmesh
 from .exchange import Exchange
@@ -113,6 +114,10 @@ class Domain:
     parts: Mapping[str, int] = field(default_factory=lambda: dict(PARTS))
     materials: Materials = field(default_factory=Materials)
     descent: tuple[Refinement, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Free what meshes before have left; collective."""
+        watch(self.mesh)
 
     def __repr__(self) -> str:
         """Describe the domain in a line; the facets are those of this rank."""
