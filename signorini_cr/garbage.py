@@ -43,9 +43,12 @@ def watch(mesh: Mesh) -> None:
     global _allowed
     if mesh in _meshes:
         return
+    states = mesh.comm.allgather((len(_meshes) >= _allowed, gc.isenabled()))
     # where it is switched off it would do harm, see `options.explained`
-    if len(_meshes) >= _allowed and gc.isenabled():
-        gc.collect()
+    if any(full for full, _ in states) and all(on for _, on in states):
+        for _ in range(2):  # what is kept by PETSc's objects that are freed only now
+            gc.collect()
+            sweep(mesh.comm, everything=True)
         _allowed = len(_meshes) + MANY
     sweep(mesh.comm)
     _meshes.add(mesh)
@@ -58,8 +61,14 @@ def hold(owner: object, mesh: Mesh) -> None:
         _held.append((ref(owner), mesh._cpp_object))
 
 
-def sweep(comm: MPI.Comm) -> None:
-    """Free what owners have left that are gone on all ranks; collective."""
+def sweep(comm: MPI.Comm, everything: bool = False) -> None:
+    """Free what owners have left that are gone on all ranks; collective.
+
+    Args:
+        comm: The ranks.
+        everything: Free what all ranks have dropped, whoever it belonged to. After an error in a
+            solver PETSc may keep what has the owner along, who then is never gone.
+    """
     if comm.size == 1:
         return
     same = MPI.IDENT, MPI.CONGRUENT
@@ -67,6 +76,6 @@ def sweep(comm: MPI.Comm) -> None:
     gone = np.array([owner() is None for owner, _ in mine], dtype=np.int32)
     comm.Allreduce(MPI.IN_PLACE, gone, op=MPI.MIN)
     done = [entry for entry, is_gone in zip(mine, gone, strict=True) if is_gone]
-    for mesh in {id(mesh): mesh for _, mesh in done}.values():
+    for mesh in {id(mesh): mesh for _, mesh in (mine if everything else done)}.values():
         PETSc.garbage_cleanup(mesh.comm)
     _held[:] = [entry for entry in _held if not any(entry is other for other in done)]

@@ -15,9 +15,10 @@ from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from signorini_cr import Problem, exact, garbage, solve
+from signorini_cr import Problem, exact, garbage, solve, solve_levels
 from signorini_cr.fem.space import function_space, ghosted_vector
 from signorini_cr.mesh.domain import Domain
+from signorini_cr.multigrid.smoothing import GaussSeidel
 
 
 class Watch:
@@ -123,3 +124,41 @@ def test_what_is_needed_stays() -> None:
     again = fem.Function(solution.level.V)
     solution.level.system.residual(solution.u, again)
     assert np.allclose(again.x.array, solution.residual.x.array, rtol=0.0, atol=1e-12)
+
+
+def test_meshes_go_after_an_error_inside_the_cycle(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """PETSc's solver, which can't be freed then, holds none of them."""
+
+    def fail(*_: object) -> None:
+        raise ArithmeticError("in the cycle")
+
+    def end() -> None:
+        for solution in solve_levels(exact.A.problem, exact.A.structured(4), 3):
+            watch.add(solution.domain.mesh.comm, solution.level.number)
+            if solution.level.number == 1:
+                monkeypatch.setattr(GaussSeidel, "backward", fail)
+
+    with pytest.raises(ArithmeticError, match="in the cycle"):
+        end()
+    look_for_cycles_and_sweep()
+    assert watch.there == []
+
+
+def test_meshes_do_not_pile_up_when_monitors_raise(
+    watch: Watch, seldom: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On several ranks PETSc keeps what holds them then, until it is told to free all."""
+    monkeypatch.setattr(garbage, "MANY", 4)
+    monkeypatch.setattr(garbage, "_allowed", len(garbage._meshes) + 4)
+
+    def fail(*_: object) -> None:
+        raise KeyError("ours")
+
+    for number in range(12):
+        domain = exact.A.structured(4)
+        watch.add(domain.mesh.comm, number)
+        with pytest.raises(KeyError, match="ours"):
+            solve(exact.A.problem, domain, monitor=fail)
+    assert len(watch.there) <= 6

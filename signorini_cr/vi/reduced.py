@@ -135,7 +135,7 @@ class ReducedSolver:
         self.reached, self.reduction, self.iterations = np.inf, SET_SHARE, 0
         self._cut, self._comm = True, snes.getComm().tompi4py()
         self.force_errors: FloatArray = np.full(stiffness.number, np.inf)
-        self._step = self._x.duplicate()
+        self._step, self._stays = self._x.duplicate(), False
         self.ksp = ksp = PETSc.KSP().create(self.matrix.getComm())
         ksp.setOptionsPrefix(PREFIX)
         ksp.setOperators(self.matrix)
@@ -165,6 +165,10 @@ class ReducedSolver:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the cycle."""
+        if self._stays:  # but nothing that would keep all the meshes
+            self.ksp.setConvergenceTest(None)
+            if self._uses_cycle:
+                self.ksp.getPC().setPythonContext(None)
         release(self.ksp, self._step)
 
     def solve(self, outer: PETSc.KSP, _: PETSc.Vec, reduced: PETSc.Vec) -> None:
@@ -244,6 +248,7 @@ class ReducedSolver:
         except PETSc.Error:
             # PETSc crashes when it frees a KSP for whose vectors there was not memory enough
             self.ksp.incRef()
+            self._stays = True
             raise
         self.iterations += self.ksp.getIterationNumber()
         return test
