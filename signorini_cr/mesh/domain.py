@@ -97,7 +97,7 @@ def named(parts: Mapping[str, int], key: str | int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """A mesh whose exterior facets are sorted into Γ0, Γ1, Γg and other parts.
+    """A mesh whose exterior facets are sorted into Γ0, Γ1, Γg and other parts; collective to make.
 
     Attributes:
         mesh: Affine simplices; no ghost cells when we make it.
