@@ -317,6 +317,14 @@ class Pieces:
 
     def boxes(self, cells: Cells, decide: bool = False) -> Boxes:
         """Make the boxes around them; for `decide` see `Boxes.corners`, it is for simplices."""
+        boxes = self.hulls(cells, decide)
+        if self.corners.shape[:2] != (3, 2):
+            return boxes
+        slanted, edges = self._slanted(boxes.low, boxes.high)
+        return replace(boxes, slanted=slanted, edges=edges)
+
+    def hulls(self, cells: Cells, decide: bool = False) -> Boxes:
+        """Make the same, and do not look which are slanted."""
         if decide or self.whole.all():
             low, high = self.corners.min(axis=0), self.corners.max(axis=0)
         else:
@@ -324,11 +332,7 @@ class Pieces:
             low, high = ends.min(axis=0), ends.max(axis=0)
             room = 1e-15 * np.maximum(np.abs(low), np.abs(high))
             low, high = low - room, high + room
-        boxes = self._boxes(low, high, self.parent, cells, self.corners if decide else None)
-        if self.corners.shape[:2] != (3, 2):
-            return boxes
-        slanted, edges = self._slanted(low, high)
-        return replace(boxes, slanted=slanted, edges=edges)
+        return self._boxes(low, high, self.parent, cells, self.corners if decide else None)
 
     def points(self, cells: Cells, hats: FloatArray) -> Boxes:
         """Find the points with some barycentric coordinates, shape (d + 1, q), piece by piece."""

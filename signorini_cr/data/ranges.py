@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import ufl
 
-from ..arrays import FloatArray
+from ..arrays import BoolArray, FloatArray
 from ..fem.cells import Cells
 from .balls import indices
 from .germs import allowance, first_inside, may_be_singular
@@ -226,23 +226,26 @@ class Deviation:
         """
         if not self._compared:
             return
-        if pieces is None:
-            pieces = Pieces.of_cells(cells)
         mixture = np.arange(1.0, 1.0 + len(hats))
         beside = (1.0 - BESIDE) * hats + BESIDE * (mixture / mixture.sum())[:, None]
-        for part in chunks(len(pieces.parent)):
-            some, here = pieces[part], found[:, part]
-            points = some.points(cells, hats)
-            room = STRIP * np.maximum(np.abs(points.low), np.abs(points.high))
-            at = Enclosure(replace(points, low=points.low - room, high=points.high + room), order=0)
-            even = np.zeros(here.shape, dtype=bool)
-            for jet in map(at, self._compared):
-                even |= np.broadcast_to((jet.low <= 0) & (jet.high >= 0), here.size).reshape(
-                    here.shape
-                )
+        for part in chunks(found.shape[1]):
+            every = np.arange(part.start, part.stop)
+            some = pieces[part] if pieces is not None else Pieces.of_cells(cells, every)
+            near = np.flatnonzero(self._may_be_even(some.hulls(cells)))
+            some, which = some[near], every[near]
+            even = self._may_be_even(some.points(cells, hats)).reshape(len(found), len(near))
             if even.any():
-                others = values(self.expression, some.points(cells, beside))
-                here[even] = others.reshape(here.shape)[even]
+                others = values(self.expression, some.points(cells, beside)).reshape(even.shape)
+                found[:, which] = np.where(even, others, found[:, which])
+
+    def _may_be_even(self, boxes: Boxes) -> BoolArray:
+        """Tell in which boxes the two sides of some condition may be equal, nearly, shape (n,)."""
+        room = STRIP * np.maximum(np.abs(boxes.low), np.abs(boxes.high))
+        at = Enclosure(replace(boxes, low=boxes.low - room, high=boxes.high + room), order=0)
+        even = np.zeros(boxes.low.shape[1:], dtype=bool)
+        for jet in map(at, self._compared):
+            even |= (jet.low <= 0) & (jet.high >= 0)
+        return even
 
 
 def chunks(n: int) -> list[slice]:
