@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from dolfinx.mesh import (
     compute_midpoints,
     create_unit_square,
@@ -133,6 +135,17 @@ def test_the_script_of_the_documents_runs(shared_tmp_path, monkeypatch):
         force, bound = map(float, printed.split())
         assert 0 < force < 6 and 0 < bound < 0.5  # the load is 6
         assert is_picture(shared_tmp_path / "my.png")
+
+
+def test_the_script_that_draws_with_gmsh_runs(shared_tmp_path, monkeypatch):
+    monkeypatch.chdir(shared_tmp_path)
+    printed = of_the_how_to(shared_tmp_path / "plate.py", '"plate.msh"')
+    domain = signorini_cr.read_gmsh(shared_tmp_path / "plate.msh")
+    area = COMM.allreduce(fem.assemble_scalar(fem.form(fem.Constant(domain.mesh, 1.0) * ufl.dx)))
+    assert 2 - 0.04 * np.pi < area < 2 - 0.035 * np.pi  # the hole's corners are on its circle
+    if COMM.rank == 0:
+        force, bound = map(float, printed.split())
+        assert 0 < force < 3 * area and 0 < bound < 0.5
 
 
 def test_the_adaptive_script_of_the_documents_runs(shared_tmp_path, monkeypatch):
