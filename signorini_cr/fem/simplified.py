@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from fractions import Fraction
+from functools import cache, lru_cache
 from typing import Any, TypeAlias
 
 import ufl
@@ -41,11 +42,34 @@ class _TooLong(Exception):
 def simplified(expression: Any) -> Any:
     """Carry out derivatives, and let terms cancel where this makes the formula shorter.
 
+    A formula of coordinates and numbers alone is worked on once, on whatever meshes it comes.
+
     Args:
         expression: A scalar.
     """
+    others = [
+        e
+        for e in unique_pre_traversal(expression)
+        if isinstance(e, classes.Coefficient | classes.Constant | classes.GeometricQuantity)
+    ]
+    if len(others) != 1 or not isinstance(x := others[0], classes.SpatialCoordinate):
+        shorter = _shorter(expression)
+        return expression if shorter is None else shorter
+    general = _coordinates(ufl.domain.extract_unique_domain(x).ufl_coordinate_element())
+    shorter = _known(ufl.replace(expression, {x: general}))
+    return expression if shorter is None else ufl.replace(shorter, {general: x})
+
+
+@cache
+def _coordinates(element: Any) -> Any:
+    """Return the coordinates of a mesh that no program works on."""
+    return ufl.SpatialCoordinate(ufl.Mesh(element))
+
+
+def _shorter(expression: Any) -> Any:
+    """Do what `simplified` does; None where the formula does not get shorter."""
     plain = expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
-    found, shortest = expression, _size(plain)
+    found, shortest = None, _size(plain)
     elsewhere = _origin(plain)
     for origin in ({}, elsewhere) if elsewhere else ({},):
         reader = _Reader(origin)
@@ -58,6 +82,9 @@ def simplified(expression: Any) -> Any:
         if _size(other) < shortest:
             found, shortest = other, _size(other)
     return found
+
+
+_known = lru_cache(maxsize=64)(_shorter)
 
 
 def _origin(expression: Any) -> dict[Any, Fraction]:

@@ -112,8 +112,24 @@ def plane_axes(
     axes.tick_params(labelsize=11)
     if width < 3.0:
         axes.locator_params(nbins=4, axis="x")
-    axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+    short_numbers(axes.xaxis, axes.yaxis)
     return figure, axes, float(width)
+
+
+def short_numbers(*axes: XAxis | YAxis) -> None:
+    """Label axes with few digits, and with a power of ten beside them if need be."""
+    from matplotlib.ticker import ScalarFormatter
+
+    class Ticks(ScalarFormatter):
+        """Numbers as text, which takes a tenth of the time that formulas do."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return super().__call__(x, pos).removeprefix(r"$\mathdefault{").removesuffix("}$")
+
+    for axis in axes:
+        ticks = Ticks(useMathText=True)
+        ticks.set_powerlimits((-3, 4))
+        axis.set_major_formatter(ticks)
 
 
 def draw_lines(axes: Axes, segments: FloatArray | Sequence[FloatArray], **style: Any) -> None:

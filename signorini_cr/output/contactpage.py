@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray
 from ..errors import InputError
-from .canvas import BLUE, RED, draw_lines, label_ends, legend, new_figure
+from .canvas import BLUE, RED, draw_lines, label_ends, legend, new_figure, short_numbers
 from .units import PLAIN, Units
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def _contact_part(
         # From the left to the right as it is seen, in the arc length of contact.csv
         axes.set_xlim(*edges[[-1, 0] if _backwards(rows) else [0, -1]])
         axes.tick_params(labelsize=11)
-        axes.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+        short_numbers(axes.xaxis, axes.yaxis)
         axes.grid(alpha=0.25)
     marker: dict[str, Any] = {"marker": "o", "markersize": 4} if len(arc) <= 80 else {}
     upper.plot(arc, rows["u"], color=BLUE, linewidth=2, label="$u_h$", **marker)

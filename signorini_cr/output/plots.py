@@ -46,6 +46,7 @@ from .canvas import (
     new_figure,
     plane_axes,
     save,
+    short_numbers,
 )
 from .contactpage import contact_page
 from .raster import averaged, raster
@@ -215,7 +216,7 @@ def plot_solution(
             bar.ax.axhline(height, color="white", linewidth=0.8, alpha=0.7)
         label_bar(bar, units)
         bar.ax.tick_params(labelsize=11)
-        bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+        short_numbers(bar.ax.yaxis)
         legend(figure, ncols=3, ax=ax)
         axes.set_title(headline(title, f"$u_h$, {words}"), fontsize=14)
         save(figure, path)

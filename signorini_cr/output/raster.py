@@ -16,6 +16,9 @@ from ..multigrid.parents import Layout
 AT_ONCE = 2**20
 """Pairs of a pixel and a cell near it that are looked at in one go."""
 
+EDGE = 1e-9
+"""What counts as rounding in a barycentric coordinate."""
+
 
 def raster(
     u: fem.Function, pixels: int = 1000
@@ -79,36 +82,48 @@ def averaged(u: fem.Function) -> fem.Function:
 def _paint(image: FloatArray, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
     """Paint affine functions on triangles; where they meet the greatest value wins.
 
+    Row by row of the image: barycentric coordinates are affine along a row, so that a triangle's
+    pixels there are those between two numbers.
+
     Args:
         image: Changed in place.
         x: First coordinates of the corners, shape (3, cells).
         y: Second coordinates.
         values: At the corners, shape (3, cells).
     """
-    first_column, width = _between(x)
     first_row, height = _between(y)
-    number = width * height
-    before = np.cumsum(np.append(0, number))
+    area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+    right = np.stack([y[1] - y[2], y[2] - y[0], y[0] - y[1]]) / area
+    up = np.stack([x[2] - x[1], x[0] - x[2], x[1] - x[0]]) / area
+    slope = (values * right).sum(axis=0)
+    # Pixels in the boxes around them are no more than those in so many rows
+    before = np.cumsum(np.append(0, height * _between(x)[1]))
     cuts = np.searchsorted(before, np.append(np.arange(0, before[-1], AT_ONCE), before[-1]))
     for begin, end in itertools.pairwise(cuts):
-        cell = np.repeat(np.arange(begin, end), number[begin:end])
-        place = np.arange(len(cell)) + before[begin] - before[cell]
-        across = width[cell]
-        row = place // across
-        column = first_column[cell] + place - row * across
-        row += first_row[cell]
-        (x0, x1, x2), (y0, y1, y2) = x[:, cell], y[:, cell]
-        # Barycentric coordinates
-        right, up = column - x0, row - y0
-        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-        second = (right * (y2 - y0) - up * (x2 - x0)) / area
-        third = (up * (x1 - x0) - right * (y1 - y0)) / area
-        inside = np.minimum(np.minimum(second, third), 1.0 - second - third) >= -1e-9
-        u0, u1, u2 = values[:, cell[inside]]
-        second, third = second[inside], third[inside]
-        pixel = row[inside] * image.shape[1] + column[inside]
-        value = u0 * (1.0 - second - third) + u1 * second + u2 * third
-        np.maximum.at(image.reshape(-1), pixel, value)
+        cell = np.repeat(np.arange(begin, end), height[begin:end])
+        row = first_row[cell] + _counted(height[begin:end])
+        # Barycentric coordinates in this row, beside the first corner
+        there = up[:, cell] * (row - y[0, cell])
+        there[0] += 1.0
+        across = right[:, cell]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = (-EDGE - there) / across
+        low = np.where(across > 0.0, ends, -np.inf).max(axis=0)
+        high = np.where(across < 0.0, ends, np.inf).min(axis=0)
+        low[((across == 0.0) & (there < -EDGE)).any(axis=0)] = np.inf
+        first, last = np.ceil(x[0, cell] + low), np.floor(x[0, cell] + high)
+        spans = np.flatnonzero(last >= first)
+        first, last = (ends[spans].astype(int) for ends in (first, last))
+        cell, number = cell[spans], last - first + 1
+        start = (values[:, cell] * there[:, spans]).sum(axis=0) + slope[cell] * (first - x[0, cell])
+        place, along = row[spans] * image.shape[1] + first, _counted(number)
+        value = np.repeat(start, number) + np.repeat(slope[cell], number) * along
+        np.maximum.at(image.reshape(-1), np.repeat(place, number) + along, value)
+
+
+def _counted(number: Int64Array) -> Int64Array:
+    """Count from 0 to each of these numbers, one after the other: 0, 1, 0, 1, 2 for 2 and 3."""
+    return np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
 
 
 def _between(x: FloatArray) -> tuple[Int64Array, Int64Array]:

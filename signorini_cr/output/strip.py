@@ -24,6 +24,7 @@ from .canvas import (
     new_figure,
     plane_axes,
     save,
+    short_numbers,
 )
 from .raster import averaged, raster
 from .touching import contact_lines, in_words
@@ -168,7 +169,7 @@ def plot_strip(
     bar = figure.colorbar(shown, ax=list(panels.flat[: len(moments)]), aspect=30)
     label_bar(bar, units)
     bar.ax.tick_params(labelsize=11)
-    bar.ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
+    short_numbers(bar.ax.yaxis)
     legend(figure, list(marks.values()), list(marks), ncols=2)
     figure.suptitle(headline(title, "$u_h$ in time"), fontsize=14)
     save(figure, path)

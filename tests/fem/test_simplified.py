@@ -89,6 +89,20 @@ def test_what_gets_longer_is_left_alone():
         assert simplified(f) is f
 
 
+def test_a_formula_is_worked_on_once_for_all_meshes(monkeypatch):
+    first = simplified(minus_laplace((1 - x**2) * r**2.5 * ufl.cos(2.5 * theta)))
+    monkeypatch.setattr("signorini_cr.fem.simplified._Reader", None)
+    mesh = exact.S1.structured(2).mesh
+    x0, y0 = there = ufl.SpatialCoordinate(mesh)
+    radius = ufl.sqrt(x0**2 + y0**2)
+    u = (1 - x0**2) * radius**2.5 * ufl.cos(2.5 * ufl.atan2(y0, x0))
+    again = simplified(minus_laplace(u))
+    assert again == ufl.replace(first, {X: there})
+    assert ufl.domain.extract_unique_domain(again) == mesh.ufl_domain()
+    with pytest.raises(TypeError):  # nor is a cell's size a formula of coordinates
+        simplified(minus_laplace(u) * ufl.CellVolume(mesh))
+
+
 def test_forms_with_derived_loads():
     """A harmonic u needs no load; the bound for S1 is that of the load written down by hand."""
     harmonic = Problem(exact=lambda x: exact.B.problem.exact(x))
