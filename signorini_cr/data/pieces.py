@@ -88,7 +88,7 @@ class Pieces:
         """Take boundary facets themselves."""
         _, ends = corner_points(cells, side)
         n, corners = len(side.cells), ends.transpose(0, 2, 1)
-        hats = np.repeat(np.eye(len(corners))[:, :, None], n, axis=2)
+        hats = _unit(len(corners), n)
         return cls(np.arange(n), corners, hats, np.ones(n), Frame.of(cells, side))
 
     @classmethod
@@ -97,8 +97,10 @@ class Pieces:
         mesh = cells.domain.mesh
         which = np.arange(cells.number) if which is None else which
         nodes = cell_nodes(mesh)[which]
-        corners = mesh.geometry.x[nodes.T, : mesh.geometry.dim].transpose(0, 2, 1)
-        hats = np.repeat(np.eye(len(corners))[:, :, None], len(which), axis=2)
+        # NumPy is quick where rows are long
+        points = mesh.geometry.x.take(nodes.T, axis=0)[..., : mesh.geometry.dim]
+        corners = np.ascontiguousarray(points.transpose(0, 2, 1))
+        hats = _unit(len(corners), len(which))
         return cls(which, corners, hats, np.ones(len(which)))
 
     def __getitem__(self, which: BoolArray | IndexArray | slice) -> Pieces:
@@ -388,6 +390,11 @@ def _crossed(levels: FloatArray) -> tuple[BoolArray, FloatArray]:
     vertices, middles = own[:3], own[3:]
     off = np.abs(middles - 0.5 * (vertices.sum(axis=0) - vertices)).max(axis=0)
     return off > AFFINE * np.abs(vertices).max(axis=0), vertices
+
+
+def _unit(d: int, n: int) -> FloatArray:
+    """Return the unit matrix n times, shape (d, d, n); not to be changed."""
+    return np.broadcast_to(np.eye(d)[:, :, None], (d, d, n))
 
 
 def _between(x: FloatArray, start: IndexArray, end: IndexArray, where: FloatArray) -> FloatArray:

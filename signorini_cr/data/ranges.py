@@ -13,7 +13,7 @@ import numpy as np
 import ufl
 
 from ..arrays import BoolArray, FloatArray
-from ..fem.cells import Cells
+from ..fem.cells import Cells, blocks
 from .balls import indices
 from .germs import allowance, first_inside, may_be_singular
 from .jets import (
@@ -228,7 +228,7 @@ class Deviation:
             return
         mixture = np.arange(1.0, 1.0 + len(hats))
         beside = (1.0 - BESIDE) * hats + BESIDE * (mixture / mixture.sum())[:, None]
-        for part in chunks(found.shape[1]):
+        for part in blocks(found.shape[1]):
             every = np.arange(part.start, part.stop)
             some = pieces[part] if pieces is not None else Pieces.of_cells(cells, every)
             near = np.flatnonzero(self._may_be_even(some.hulls(cells)))

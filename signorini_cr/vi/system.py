@@ -167,18 +167,18 @@ class System:
         self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
         self._take_offset()
-        self._part_bounds()
+        self._part_bounds(np.flatnonzero(bounded))
         self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
         self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
 
-    def _part_bounds(self) -> None:
+    def _part_bounds(self, bounded: IndexArray) -> None:
         """Lift β by a little where it is α: the side that u is on tells which of them holds it."""
-        apart = self.upper > self.lower
-        both = np.concatenate([self.lower, self.upper])
-        size = float(np.abs(both[np.abs(both) < PETSc.INFINITY]).max(initial=0.0))
+        lower, upper = self.lower[bounded], self.upper[bounded]
+        both = np.abs(np.concatenate([lower, upper]))
+        size = float(both[both < PETSc.INFINITY].max(initial=0.0))
         size = self.u_D.function_space.mesh.comm.allreduce(size, op=MPI.MAX)
         least = max(APART * size, 1e-290)
-        self.upper = np.where(apart, self.upper, self.lower + least)
+        self.upper[bounded] = np.where(upper > lower, upper, lower + least)
 
     def _take_offset(self) -> None:
         """Choose the offset, and take it off u_D and the bounds; collective."""
@@ -254,15 +254,12 @@ class System:
 
     def _trivial(self) -> list[FloatArray]:
         """Multiply A by the most trivial start, and by that without its constant; collective."""
-        bounded = (self.lower > PETSc.NINFINITY) | (self.upper < PETSc.INFINITY)
-        products, start = [], self.A.createVecRight()
-        product, owned = self.A.createVecLeft(), self.A.getLocalSize()[0]
-        dirichlet, bounded = self.owned_dirichlet, bounded[:owned]
+        products, start, product = [], self.A.createVecRight(), self.A.createVecLeft()
+        dirichlet = self.owned_dirichlet
         for number in dict.fromkeys((self._middle(), -self.offset)):
             start.array[:] = number
             start.array[dirichlet] = self.u_D.x.array[dirichlet]
-            own = self.lower[:owned][bounded], self.upper[:owned][bounded]
-            start.array[bounded] = np.clip(number, *own)
+            start.array[self.bounded] = np.clip(number, self.bounds.lower, self.bounds.upper)
             self.A.mult(start, product)
             products.append(product.array_r.copy())
         release(start, product)
