@@ -211,6 +211,24 @@ def bound(expression: fem.Expression, own: Callable[[Any], Any]) -> fem.Expressi
     return made
 
 
+def facet_points(mesh: Mesh, entities: Int32Array, hats: FloatArray) -> FloatArray:
+    """Find points of facets.
+
+    Args:
+        mesh: The mesh.
+        entities: Pairs (cell, facet's number in the cell), shape (n, 2).
+        hats: Barycentric coordinates in the facet, whose vertices are in the order of the cell's
+            closure, shape (q, d).
+
+    Returns:
+        Shape (n, q, 3).
+    """
+    cells, local = entities.T
+    corners = np.array(basix.topology(mesh.basix_cell())[-2])
+    nodes = np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)
+    return np.asarray(hats @ mesh.geometry.x[nodes])
+
+
 class FacetExpression:
     """A UFL expression at points of the reference facet.
 
@@ -230,7 +248,6 @@ class FacetExpression:
         self._where = compiled(mesh.comm, fem.Expression, x, points, mesh.comm)
         self._shape = (len(points), -1)
         self._hats = np.column_stack([1.0 - points.sum(axis=1), points])
-        self._corners = np.array(basix.topology(mesh.basix_cell())[-2])
 
     def at(
         self, mesh: Mesh, entities: Int32Array, own: Callable[[Any], Any] = lambda given: given
@@ -252,9 +269,7 @@ class FacetExpression:
             values = expression.eval(mesh, entities).reshape(shape)
         except (AssertionError, TypeError):  # 0.9 wants them flattened, and turns nothing
             return expression.eval(mesh, entities.ravel()).reshape(shape)
-        cells, local = entities.T
-        nodes = np.take_along_axis(cell_nodes(mesh)[cells], self._corners[local], axis=1)
-        wanted = self._hats @ mesh.geometry.x[nodes, : mesh.geometry.dim]
+        wanted = facet_points(mesh, entities, self._hats)[..., : mesh.geometry.dim]
         found = self._where.eval(mesh, entities).reshape(shape)
         distance = np.linalg.norm(wanted[:, :, None] - found[:, None, :], axis=-1)
         return np.take_along_axis(values, distance.argmin(axis=2)[:, :, None], axis=1)

@@ -32,8 +32,9 @@ from ..fem.simplified import simplified
 from ..fem.space import facet_entities, facet_quadrature
 from ..mesh.domain import Domain
 from .cutting import Cut, cut
-from .jets import Boxes, Enclosure, Range, values
+from .jets import Boxes, Enclosure, Range, lowered, values
 from .pieces import Pieces
+from .pointwise import evaluate
 from .ranges import Deviation, errors_on, range_of
 
 NO_RANGE = "the coefficient has no computable upper and lower bound"
@@ -440,7 +441,7 @@ class Trace:
     """
 
     def __init__(self, expression: Expr, mesh: Mesh, degree: int):
-        """Compile the expression, written for a mesh, unless it is a number."""
+        """Compile the expression, written for a mesh, unless NumPy does as well."""
         self._expression, self.degree = expression, degree
         facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
         corners = basix.geometry(facet)
@@ -452,7 +453,10 @@ class Trace:
             middle = corners.mean(axis=0)
             near = [corners + part * (middle - corners) for part in BESIDE]
             at = np.vstack([corners, *near, middle, self.points])
-            self._values = compat.FacetExpression(expression, at, mesh)
+            self._plain, self._at = lowered(expression), np.column_stack([1.0 - at.sum(axis=1), at])
+            self._compiled = None
+            if evaluate(self._plain, np.zeros((1, 3))) is None:
+                self._compiled = compat.FacetExpression(expression, at, mesh)
 
     @property
     def expression(self) -> Expr:
@@ -486,12 +490,25 @@ class Trace:
         if self.constant is not None:
             count = len(self.weights)
             return tuple(np.full(s, self.constant) for s in ((k, n), n, (count, n)))  # type: ignore
-        values = np.ascontiguousarray(self._values.at(domain.mesh, entities, domain.own)[:, :, 0].T)
+        values = self._values(domain, entities)
         at, far, near, middle, inside = np.split(values, [k, 2 * k, 3 * k, 3 * k + 1])
-        step = np.abs(near - at)
-        is_step = (step > STEP * np.abs(values).max(axis=0)) & (np.abs(far - near) < STEADY * step)
-        limit = near + (near - far) * (BESIDE[1] / (BESIDE[0] - BESIDE[1]))
+        with np.errstate(invalid="ignore"):  # infinite ones are refused by those who know where
+            step = np.abs(near - at)
+            is_step = step > STEP * np.abs(values).max(axis=0)
+            is_step &= np.abs(far - near) < STEADY * step
+            limit = near + (near - far) * (BESIDE[1] / (BESIDE[0] - BESIDE[1]))
         return np.where(is_step, limit, at), middle[0], inside
+
+    def _values(self, domain: Domain, entities: Int32Array) -> FloatArray:
+        """Evaluate at all of the points, shape (points, n)."""
+        if self._compiled is not None:
+            found = self._compiled.at(domain.mesh, entities, domain.own)
+            return np.ascontiguousarray(found[:, :, 0].T)
+        # Compiling would take longer than all of a boundary's points do
+        x = compat.facet_points(domain.mesh, entities, self._at)
+        known = evaluate(self._plain, x.transpose(1, 0, 2).reshape(-1, 3))
+        assert known is not None
+        return known[0].reshape(len(self._at), len(entities))
 
 
 @dataclass(frozen=True, eq=False)

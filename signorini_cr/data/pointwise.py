@@ -204,8 +204,8 @@ _SMOOTH: dict[type, Callable[..., Any]] = {
     classes.Tanh: np.tanh,
 }
 _EXTREMES: dict[type, Callable[..., Any]] = {
-    classes.MinValue: np.minimum,
-    classes.MaxValue: np.maximum,
+    classes.MinValue: np.fmin,  # as compiled code has it where one of them is no number
+    classes.MaxValue: np.fmax,
 }
 _TRUTHS: dict[type, Callable[..., Any]] = {
     classes.LT: np.less,

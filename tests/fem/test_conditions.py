@@ -27,11 +27,11 @@ from signorini_cr import (
     Polygon,
     Problem,
     Robin,
-    compat,
     exact,
     solve,
     solve_levels,
 )
+from signorini_cr.data.moments import Trace
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.conditions import Condition
 from signorini_cr.fem.problem import Forms
@@ -277,13 +277,13 @@ def exterior_facet_indices_of(mesh):
 
 def test_boundary_data_are_sampled_once_a_mesh(monkeypatch):
     seen = []
-    at = compat.FacetExpression.at
+    at = Trace.at
 
     def counted(self, *where):
         seen.append(id(self))
         return at(self, *where)
 
-    monkeypatch.setattr(compat.FacetExpression, "at", counted)
+    monkeypatch.setattr(Trace, "at", counted)
     example = exact.S1_NEUMANN.problem
     problem = Problem(
         exact=example.exact,

@@ -1,0 +1,74 @@
+"""Data on boundary facets: the values of compiled code, without compiling."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import create_unit_cube, exterior_facet_indices
+from helpers import SQUARE
+from mpi4py import MPI
+
+from signorini_cr import compat
+from signorini_cr.data.moments import Trace
+from signorini_cr.fem.space import facet_entities, function_space
+
+FORMULAS = {
+    "polynomial": lambda x: x[0] ** 3 - 2 * x[0] * x[1] + 0.1,
+    "functions": lambda x: ufl.exp(x[0]) * ufl.sin(7 * x[1]) / (2 + ufl.cos(x[0])),
+    "no number on the left": lambda x: ufl.sqrt(x[0] - 0.5),
+    "infinite": lambda x: 1 / ufl.max_value(x[0] - 0.5, 0.0),
+    "one is no number": lambda x: ufl.max_value(ufl.ln(x[0] - 0.5), x[1]),
+    "choice": lambda x: ufl.conditional(x[0] < 0.37, x[1] ** 1.5, abs(x[0] - x[1])),
+    "angle": lambda x: ufl.atan2(x[1] - 0.3, x[0] - 0.4),
+    "derivative": lambda x: ufl.grad(ufl.sin(x[0] * x[1]))[0],
+}
+
+
+def traced(formula, mesh, domain, monkeypatch):
+    """Values at a rule's points on all facets of the boundary, by both ways."""
+    mesh.topology.create_connectivity(mesh.topology.dim - 1, mesh.topology.dim)
+    entities = facet_entities(mesh, exterior_facet_indices(mesh.topology))
+    expression = formula(ufl.SpatialCoordinate(mesh))
+    compiled = compat.FacetExpression(expression, Trace(expression, mesh, 4).points, mesh)
+    monkeypatch.setattr(compat, "FacetExpression", None)
+    found = Trace(expression, mesh, 4).at(domain, entities)[-1]
+    return found, compiled.at(mesh, entities)[:, :, 0].T
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_formulas_have_the_values_of_compiled_code(name, monkeypatch):
+    domain = SQUARE.mesh(0.2)
+    found, known = traced(FORMULAS[name], domain.mesh, domain, monkeypatch)
+    assert found == pytest.approx(known, rel=1e-13, abs=1e-15, nan_ok=True)
+
+
+def test_on_tetrahedra(monkeypatch):
+    class Cube:
+        mesh = create_unit_cube(MPI.COMM_WORLD, 2, 3, 2)
+
+    found, known = traced(lambda x: x[0] + x[1] ** 2 * x[2], Cube.mesh, Cube, monkeypatch)
+    assert found == pytest.approx(known, rel=1e-13)
+
+
+def test_what_is_no_formula_of_coordinates_is_compiled():
+    domain = SQUARE.mesh(0.3)
+    w = fem.Function(function_space(domain.mesh, "P1"))
+    w.interpolate(lambda x: 2 * x[0] - x[1])
+    facets = np.sort(np.concatenate(list(domain.all_facets.values())))
+    entities = facet_entities(domain.mesh, facets)
+    slope = Trace(ufl.dot(ufl.grad(w), ufl.FacetNormal(domain.mesh)), domain.mesh, 2)
+    slopes = slope.at(domain, entities)[1]
+    assert set(np.round(slopes, 12)) <= {2.0, -2.0, 1.0, -1.0}
+    assert domain.mesh.comm.allreduce(float(slopes.max(initial=-9.0)), op=MPI.MAX) == pytest.approx(
+        2.0
+    )
+
+
+def test_constants_count_as_they_are_then():
+    domain = SQUARE.mesh(0.5)
+    t = fem.Constant(domain.mesh, 2.0)
+    trace = Trace(t * ufl.SpatialCoordinate(domain.mesh)[0], domain.mesh, 2)
+    entities = facet_entities(domain.mesh, domain.all_facets[domain.parts["floor"]])
+    before = trace.at(domain, entities)[1]
+    t.value = 6.0
+    assert trace.at(domain, entities)[1] == pytest.approx(3.0 * before)
