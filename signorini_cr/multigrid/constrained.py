@@ -85,7 +85,6 @@ class ConstrainedMatrix:
         sizes = (len(dofs), PETSc.DECIDE), A.getSizes()[1]
         self._rows = PETSc.Mat().createAIJ(sizes, csr=csr, comm=A.comm)
         self._product = self._rows.createVecLeft()
-        self._magnitudes: PETSc.Mat | None = None
         # All own rows with an entry in such a column, as the pattern is symmetric
         near = self._named(column)
         near_numbers = numbers_of(A, np.flatnonzero(near))
@@ -138,13 +137,10 @@ class ConstrainedMatrix:
 
     def magnitude(self, x: PETSc.Vec) -> FloatArray:
         """Compute |A| |x|, of which rows of A x are made, in the constrainable dofs, shape (n,)."""
-        if self._magnitudes is None:
-            self._magnitudes = with_entries(self._rows, np.abs)
-        sizes = x.duplicate()
-        sizes.array[:] = np.abs(x.array_r)
-        self._magnitudes.mult(sizes, self._product)
-        release(sizes)
-        return self._product.array_r.copy()
+        self._to_columns.scatter(x, self._at_columns)
+        row, place, value = self._of_own
+        sizes = np.abs(value * self._at_columns.array_r[place])
+        return np.bincount(row, sizes, minlength=len(self.dofs)).astype(np.float64, copy=False)
 
     def flows(self, x: PETSc.Vec, b: PETSc.Vec) -> FloatArray:
         """Sum what a row of A x − b is made of but for constants in x, in these dofs, shape (n,).
@@ -161,7 +157,7 @@ class ConstrainedMatrix:
 
     def free(self) -> None:  # "destroy" is what PETSc calls a context with
         """Free everything but the matrix."""
-        release(self._rows, self._magnitudes, self._product)
+        release(self._rows, self._product)
         release(self._marks, self._at_columns, self._to_columns)
 
     def _named(self, numbers: Int32Array) -> BoolArray:

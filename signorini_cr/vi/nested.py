@@ -90,7 +90,7 @@ def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
     x = start.x.array[bounded]
     side = bounds.side(x)
     bound = bounds.on(side)
-    near = side * (x - bound) < _margin(start, bound)
+    near = side * (x - bound) < _margin(_largest(start), bound)
     start.x.array[bounded] = np.where(near, bound, x)
 
 
@@ -127,18 +127,24 @@ class _Expected:
 def _put_on_bounds(start: fem.Function, system: System, expected: _Expected) -> None:
     """Put active dofs on their bounds and the others off them, if only by rounding; collective."""
     x, bounds = start.x.array[system.bounded], system.bounds
+    scale = _largest(start)
     low, high = (
-        bound - sign * _margin(start, bound)
+        bound - sign * _margin(scale, bound)
         for sign, bound in ((-1.0, bounds.lower), (1.0, bounds.upper))
     )
     free = np.where(low < high, np.clip(x, low, high), 0.5 * (bounds.lower + bounds.upper))
     start.x.array[system.bounded] = np.where(expected.active.mask, bounds.on(expected.side), free)
 
 
-def _margin(start: fem.Function, bound: FloatArray) -> FloatArray:
-    """Compute a distance from bounds that rounding cannot hide; collective."""
-    comm = start.function_space.mesh.comm
-    scale = comm.allreduce(float(np.abs(start.x.array).max(initial=0.0)), op=MPI.MAX)
+def _largest(start: fem.Function) -> float:
+    """Find the largest absolute value of a function; collective."""
+    values = start.x.array
+    largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
+    return start.function_space.mesh.comm.allreduce(largest, op=MPI.MAX)
+
+
+def _margin(scale: float, bound: FloatArray) -> FloatArray:
+    """Compute a distance from bounds that rounding cannot hide where values are so large."""
     finite = np.where(np.isfinite(bound), np.abs(bound), 0.0)
     return 4.0 * np.spacing(np.maximum(finite, scale))
 
