@@ -29,10 +29,13 @@ from .heights import distance
 from .weights import Weighed, Weight
 
 NO_BOUNDS = "what flows through the part has no bounds"
-TOUCHES = "Γ1 touches Γ0: the force is no bounded functional of the solution there"
+TOUCHES = (
+    "Γ1 touches Γ0, where a change of u as small as one likes changes the force; with a weight that"
+    " is 0 there it has some"
+)
 MEETS = (
-    "the part touches another one on which u is set or bounded: what flows through it is no bounded"
-    " functional of the solution"
+    "the part touches another one on which u is set or bounded, where a change of u as small as one"
+    " likes changes what flows through it; with a weight that is 0 there it has some"
 )
 SPATIAL = "they are worked out for d = 2 only"
 
