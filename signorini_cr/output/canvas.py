@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import XAxis, YAxis
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure, SubFigure
+    from matplotlib.transforms import Transform
 
 Where = str | os.PathLike[str]
 
@@ -175,16 +176,53 @@ def legend(
     figure: Figure | SubFigure, *entries: Any, ncols: int, above: str = "", ax: Axes | None = None
 ) -> None:
     """Put a legend below everything, or below Axes that were given, and a text above it."""
-    below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18)}
-    (figure if ax is None else ax).legend(
+    holder = figure if ax is None else ax
+    size = 12 * letters(holder)
+    if size < 12:
+        labels = entries[1] if entries else (ax or figure.gca()).get_legend_handles_labels()[1]
+        letter = 0.55 * size / 72 * holder.figure.dpi  # about as wide as that
+        most = holder.bbox.width / letter
+        ncols = min(max(int(most / (9 + max(map(len, labels), default=0))), 1), ncols)
+        above = "\n".join(textwrap.fill(line, int(most)) for line in above.split("\n"))
+    place: dict[str, Any] = {"loc": "outside lower center"}
+    if ax is not None:
+        place = {"loc": "upper center"}
+        # below the axis and its label, whose letters are as small
+        place["bbox_to_anchor"] = (0.5, 0.0)
+        place["bbox_transform"] = _below(ax, 3.2 * size / 72)
+    holder.legend(
         *entries,
-        **({"loc": "outside lower center"} if ax is None else below),
+        **place,
         ncols=ncols,
-        fontsize=12,
+        fontsize=size,
         frameon=False,
         title=above or None,
-        title_fontsize=12,
+        title_fontsize=size,
     )
+
+
+def _below(ax: Axes, inches: float) -> Transform:
+    """Return the coordinates of Axes, so far below them."""
+    from matplotlib.transforms import ScaledTranslation
+
+    return ax.transAxes + ScaledTranslation(0.0, -inches, ax.figure.dpi_scale_trans)
+
+
+def letters(holder: Axes | Figure | SubFigure) -> float:
+    """How small letters are in what is narrow, as Axes of others are, in parts of the usual."""
+    return float(np.clip(holder.bbox.width / holder.figure.dpi / 6.0, 0.55, 1.0))
+
+
+def fit(ax: Axes | None, *bars: Axes) -> None:
+    """Have letters on Axes that were given, and on bars beside them, as small as these ask for."""
+    if ax is None:
+        return
+    part = letters(ax)
+    for each in (ax, *bars):
+        each.tick_params(labelsize=11 * part)
+        others = each.xaxis.get_offset_text(), each.yaxis.get_offset_text()
+        for text in (each.title, each.xaxis.label, each.yaxis.label, *others):
+            text.set_fontsize(part * float(text.get_fontsize()))
 
 
 def headline(title: str, what: str) -> str:

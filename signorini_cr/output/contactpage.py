@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray
 from ..errors import InputError
-from .canvas import BLUE, RED, draw_lines, label_ends, legend, new_figure, short_numbers
+from .canvas import BLUE, RED, draw_lines, fit, label_ends, legend, new_figure, short_numbers
 from .units import PLAIN, Units
 
 if TYPE_CHECKING:
@@ -79,6 +79,8 @@ def contact_page(
     if len(parts) == 1 and ax is None:  # there is room beside the curves
         _name_curves(panels[0, 0], entries)
         del entries[r"$\lambda_h$"]  # its axis says so
+    for axes in panels.ravel() if ax is not None else ():
+        fit(axes)
     legend(figure, list(entries.values()), list(entries), ncols=5 if ax is None else 3, above=along)
     return figure
 

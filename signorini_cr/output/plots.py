@@ -37,11 +37,13 @@ from .canvas import (
     draw_cells,
     draw_contours,
     draw_lines,
+    fit,
     grouped,
     headline,
     label_bar,
     label_ends,
     legend,
+    letters,
     log_ticks,
     new_figure,
     plane_axes,
@@ -148,6 +150,7 @@ def plot_mesh(
         legend(figure, ncols=3, ax=ax)
         hidden = "" if len(edges) else ", inner edges not drawn"
         axes.set_title(headline(title, f"mesh of {grouped(cells)} cells{hidden}"), fontsize=14)
+        fit(ax)
         save(figure, path)
         return figure
 
@@ -209,6 +212,9 @@ def plot_solution(
             axes.plot(points[:, 0], points[:, 1], linestyle="none", marker="o", markersize=7,
                       color="white", markeredgecolor="black", zorder=4, clip_on=False,
                       label="contact begins or ends")  # fmt: skip
+        if ax is not None and figure.get_layout_engine() is None:  # the bar takes its place of them
+            x0, y0, whole, height = ax.get_position().bounds
+            ax.set_position((x0, y0, 0.84 * whole, height))
         beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
         bar = figure.colorbar(shown, cax=beside)
         bar.set_ticks(list(inner) if len(inner) else list(limits))
@@ -219,6 +225,7 @@ def plot_solution(
         short_numbers(bar.ax.yaxis)
         legend(figure, ncols=3, ax=ax)
         axes.set_title(headline(title, f"$u_h$, {words}"), fontsize=14)
+        fit(ax, bar.ax)
         save(figure, path)
         return figure
 
@@ -254,7 +261,7 @@ def plot_contact(
     def draw() -> Figure | SubFigure:
         assert table is not None
         figure = contact_page(table, contact.transitions, size, ax, units)
-        figure.suptitle(headline(title, words), fontsize=14)
+        figure.suptitle(headline(title, words), fontsize=14 * letters(figure))
         save(figure, path)
         return figure
 

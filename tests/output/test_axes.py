@@ -73,6 +73,26 @@ def test_axes_show_what_the_solution_says(solution):
     assert [[len(line) for line in part] for part in parts] == [[33], [17]]
 
 
+@pytest.mark.parametrize("layout", ["constrained", None])
+def test_narrow_axes_have_room_for_what_stands_there(solution, layout):
+    """Two pictures on what Matplotlib makes unasked: nothing is cut off, no legend on another."""
+    figures = pytest.importorskip("matplotlib.figure")
+    figure = figures.Figure(figsize=(6.4, 4.8), layout=layout)
+    left, right = figure.subplots(1, 2)
+    plots.plot_mesh(solution.domain, ax=left)
+    plots.plot_solution(solution, ax=right)
+    if WORLD.rank > 0:
+        return
+    figure.draw_without_rendering()
+    places = [axes.get_legend().get_window_extent() for axes in (left, right)]
+    assert places[0].x1 < places[1].x0
+    (bar,) = right.child_axes
+    places += [axes.get_tightbbox() for axes in (left, right, bar)]
+    for place in places:
+        assert place.x0 >= -1 and place.x1 <= figure.bbox.width + 1
+    assert min(axes.bbox.width for axes in (left, right)) > 0.25 * figure.bbox.width
+
+
 def test_names_and_units_stand_beside_the_axes(solution):
     names = {"x": "distance", "u": "price", "flux": "heat"}
     units = plots.Units(x="km", u="$", flux="W/m²", names=names)
