@@ -15,9 +15,9 @@ from signorini_cr.fem.space import facet_entities, function_space
 FORMULAS = {
     "polynomial": lambda x: x[0] ** 3 - 2 * x[0] * x[1] + 0.1,
     "functions": lambda x: ufl.exp(x[0]) * ufl.sin(7 * x[1]) / (2 + ufl.cos(x[0])),
-    "no number on the left": lambda x: ufl.sqrt(x[0] - 0.5),
-    "infinite": lambda x: 1 / ufl.max_value(x[0] - 0.5, 0.0),
-    "one is no number": lambda x: ufl.max_value(ufl.ln(x[0] - 0.5), x[1]),
+    "no number on the left": lambda x: ufl.sqrt(x[0] - 0.437),
+    "infinite": lambda x: 1 / ufl.max_value(x[0] - 0.437, 0.0),
+    "one is no number": lambda x: ufl.max_value(ufl.ln(x[0] - 0.437), x[1]),
     "choice": lambda x: ufl.conditional(x[0] < 0.37, x[1] ** 1.5, abs(x[0] - x[1])),
     "angle": lambda x: ufl.atan2(x[1] - 0.3, x[0] - 0.4),
     "derivative": lambda x: ufl.grad(ufl.sin(x[0] * x[1]))[0],
