@@ -3,14 +3,16 @@
 import re
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
-ROOT = Path(__file__).parent.parent
+from sphinx.addnodes import desc_signature
+
+import signorini_cr
 
 project = "signorini_cr"
 copyright = "the signorini_cr authors"
 author = "The signorini_cr authors"
-text = (ROOT / "signorini_cr" / "__init__.py").read_text()
-version = release = re.findall(r'^__version__ = "(.*)"', text, re.M)[0]
+version = release = signorini_cr.__version__
 
 extensions = [
     "myst_parser",
@@ -64,7 +66,21 @@ def _for_download(app, name, content):
     content[0] = re.sub(r"\]\((\.\./[^)]*\.md)\)", r"](path:\1)", content[0])
 
 
+def _where_it_is_defined(app, doctree):
+    """Have the places that source pages link back to: names by the modules that define them."""
+    for signature in doctree.findall(desc_signature):
+        for name in list(signature["ids"]):
+            thing, (_, *rest) = signorini_cr, name.split(".")
+            while rest and isinstance(thing, ModuleType):
+                thing = getattr(thing, rest.pop(0))
+            if not isinstance(thing, ModuleType) and hasattr(thing, "__qualname__"):
+                other = ".".join([thing.__module__, thing.__qualname__, *rest])
+                if other not in signature["ids"]:
+                    signature["ids"].append(other)
+
+
 def setup(app):
     """Called by Sphinx."""
+    app.connect("doctree-read", _where_it_is_defined)
     app.connect("autodoc-process-docstring", _as_text, priority=900)
     app.connect("source-read", _for_download)

@@ -130,6 +130,12 @@ class Solver:
         changed = summed(comm, np.array([not moment.lasts for moment in moments], dtype=float))
         return bool(changed[0]), bool(changed[1])
 
+    def __repr__(self) -> str:
+        """Describe the solver in a line."""
+        dofs = self.V.dofmap.index_map.size_global
+        meshes = f"the last of {1 + len(self.refined)} meshes" if self.refined else "one mesh"
+        return f"<Solver: {dofs} dofs on {meshes}{', closed' if self._closed else ''}>"
+
     def __enter__(self) -> Self:
         """Begin."""
         return self

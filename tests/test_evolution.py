@@ -395,11 +395,13 @@ def test_what_a_solver_cannot_do_with_is_refused():
     domain = SQUARE.mesh(0.5)
     with Solver(waves(clock(domain)), domain, levels=2) as solver:
         solution = solver.solve()
+        assert repr(solver) == f"<Solver: {solution.dofs} dofs on the last of 2 meshes>"
         below = solve(waves(clock(domain)), domain)
         with pytest.raises(InputError, match=r"before: a Function on another mesh"):
             solver.solve(before=below)
         with pytest.raises(InputError, match=r"source is <function .*; a dolfinx Function"):
             solver.solve(source=lambda x: x[0])
+    assert repr(solver).endswith("meshes, closed>")
     with pytest.raises(InputError, match="the solver is closed"):
         solver.solve(before=solution)
 

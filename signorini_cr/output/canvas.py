@@ -209,7 +209,7 @@ def _below(ax: Axes, inches: float) -> Transform:
 
 
 def letters(holder: Axes | Figure | SubFigure) -> float:
-    """How small letters are in what is narrow, as Axes of others are, in parts of the usual."""
+    """Compute how small letters are on narrow Axes, or pages, in parts of the usual."""
     return float(np.clip(holder.bbox.width / holder.figure.dpi / 6.0, 0.55, 1.0))
 
 
