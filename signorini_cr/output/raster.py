@@ -113,7 +113,7 @@ def _paint(image: FloatArray, x: FloatArray, y: FloatArray, values: FloatArray) 
         low[((across == 0.0) & (there < -EDGE)).any(axis=0)] = np.inf
         first, last = np.ceil(x[0, cell] + low), np.floor(x[0, cell] + high)
         spans = np.flatnonzero(last >= first)
-        first, last = (ends[spans].astype(int) for ends in (first, last))
+        first, last = first[spans].astype(int), last[spans].astype(int)
         cell, number = cell[spans], last - first + 1
         start = (values[:, cell] * there[:, spans]).sum(axis=0) + slope[cell] * (first - x[0, cell])
         place, along = row[spans] * image.shape[1] + first, _counted(number)
