@@ -61,11 +61,35 @@ def test_what_is_not_known_is_not_told(value, within, text):
     assert known(value, within) == text
 
 
+STEP = {
+    "step": 1, "time": 0.5, "newton_iterations": 1, "linear_iterations": 2, "active": 0,
+    "length": 0.0, "force": 0.0, "energy": -1.0, "bound_h1": 0.12345, "quantities": {},
+}  # fmt: skip
+
+
 def test_the_table_of_steps_tells_bounds():
-    record = {"step": 1, "time": 0.5, "newton_iterations": 1, "linear_iterations": 2, "active": 0,
-              "length": 0.0, "force": 0.0, "energy": -1.0, "bound_h1": 0.12345}  # fmt: skip
-    assert series.row(record, record).split()[-1] == "0.124"
-    assert series.row(record | {"bound_h1": None}, record).split()[-1] == "none"
+    assert series.row(STEP, STEP).split()[-1] == "0.124"
+    assert series.row(STEP | {"bound_h1": None}, STEP).split()[-1] == "none"
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({}, "75"),
+        ({"weighted": True}, "74.71"),
+        ({"kind": "flux"}, "74.71"),
+        ({"reason": "none", "upper": None}, "74.71"),
+        ({"value": 70.0}, "74.71"),
+    ],
+    ids=["the force", "weighted", "a flux", "without bounds", "another part"],
+)
+def test_a_steps_force_has_the_digits_that_are_certain(change, told):
+    heat = {"kind": "force", "weighted": False, "value": 74.71, "lower": 52.0, "upper": 98.0}
+    record = STEP | {"force": 74.71, "quantities": {"heat": heat | {"reason": None} | change}}
+    assert series.row(record, record).split()[6] == told
+    for force, four in ((289.0, "289.0"), (0.0, "0.000"), (2.5e-7, "2.500e-7")):
+        alone = record | {"force": force, "quantities": {}}
+        assert series.row(alone, alone).split()[6] == four
 
 
 def test_nothing_certain_is_formatted_otherwise():

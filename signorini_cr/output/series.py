@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from ..errors import on_root
-from ..rounding import at_most, counted, interval, known
+from ..rounding import at_most, counted, interval, known, rounded_up
 from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
 from .report import FILES, bounded, energy_bounds, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
-from .tables import Column, energy, explained, levels_csv, rows_of, unit_of
+from .tables import Column, energy, explained, levels_csv, rows_of, short, unit_of
 from .units import GLUE, PLAIN, Units
 from .vtu import write_solution
 
@@ -33,10 +34,10 @@ COLUMNS: tuple[Column, ...] = (
     ("newton", 6, lambda r: str(r["newton_iterations"])),
     ("cg", 4, lambda r: str(r["linear_iterations"])),
     ("active", 6, lambda r: str(r["active"])),
-    ("contact", 8, lambda r: f"{r['length']:.3g}"),
-    ("force", 12, lambda r: known(r["force"], None, 4)),
+    ("contact", 8, lambda r: short(r["length"])),
+    ("force", 12, lambda r: _force(r)),
     ("energy", 12, lambda r: energy(r, 4)),
-    ("bound", 9, lambda r: "none" if r["bound_h1"] is None else at_most(r["bound_h1"])),
+    ("bound", 9, lambda r: "none" if r["bound_h1"] is None else short(rounded_up(r["bound_h1"]))),
 )
 """The printed table."""
 
@@ -110,6 +111,15 @@ def _told(record: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]
     return {**record, "told": told}
 
 
+def _force(record: Mapping[str, Any]) -> str:
+    """Format the contact force, where an interval for it was asked for with the digits of that."""
+    for found in record["quantities"].values():
+        plain = found["kind"] == "force" and not found["weighted"] and found["reason"] is None
+        if plain and math.isclose(found["value"], record["force"], rel_tol=1e-9):
+            return known(record["force"], found["upper"] - found["lower"], 4)
+    return short(record["force"], 4)
+
+
 def search_header() -> str:
     """Return the head of what is told of meshes that are tried."""
     return " ".join(f"{name:>{width}}" for name, width, _ in SEARCH)
@@ -172,8 +182,8 @@ def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
         lower, upper = min(each["lower"] for each in found), max(each["upper"] for each in found)
         ends = interval(lower, upper).replace(" ", GLUE)
         said.append(
-            f"certified: in each step's own problem, in which the steps before are data, {name} is"
-            f" in {ends}{unit_of(last, units)}; its interval in each step is in {TABLE}"
+            f"certified: in no step's own problem, in which the steps before are data, is {name}"
+            f" outside {ends}{unit_of(last, units)}; its interval in each step is in {TABLE}"
         )
     return said
 

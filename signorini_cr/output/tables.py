@@ -238,25 +238,25 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
         ("level", 5, lambda r: str(r["level"])),
         ("cells", 7, lambda r: str(r["cells"])),
         ("dofs", 7, lambda r: str(r["dofs"])),
-        ("h", 7, lambda r: _short(r["h"])),
+        ("h", 7, lambda r: short(r["h"])),
         ("newton", 6, lambda r: str(r["newton_iterations"])),
         ("cg", 3, lambda r: str(r["linear_iterations"])),
         ("active", 6, lambda r: str(r["contact"]["active"])),
     ]
     if exact:
         columns += [
-            ("H1 error", 8, lambda r: _short(r["error_h1"])),
+            ("H1 error", 8, lambda r: short(r["error_h1"])),
             ("rate", 4, lambda r: _fixed(r["rate_h1"])),
-            ("L2 error", 8, lambda r: _short(r["error_l2"])),
+            ("L2 error", 8, lambda r: short(r["error_l2"])),
             ("rate", 4, lambda r: _fixed(r["rate_l2"])),
         ]
     else:
         columns += [
             ("energy", 12, energy),
-            ("contact", 8, lambda r: _short(r["contact"]["length"])),
+            ("contact", 8, lambda r: short(r["contact"]["length"])),
         ]
     if bound:
-        columns.append(("bound", 7, lambda r: _short(rounded_up(r["bound_h1"]))))
+        columns.append(("bound", 7, lambda r: short(rounded_up(r["bound_h1"]))))
     if bound and exact:
         # Eighty columns: the number of cells gives way, it is in levels.csv
         del columns[1]
@@ -279,13 +279,13 @@ def energy(record: Mapping[str, Any], otherwise: int = 7) -> str:
     return known(record["energy"], wide, otherwise if wide is None else 7)
 
 
-def _short(value: float | None) -> str:
-    """Format a number in three digits and at most seven characters (below 1e10)."""
+def short(value: float | None, digits: int = 3) -> str:
+    """Format a number in so many digits and at most four characters more (below 1e10)."""
     if value is None:
         return "-"
     if value == 0 or 1e-3 <= abs(value) < 1e4:
-        return f"{value:#.3g}".rstrip(".")
-    mantissa, power = f"{value:.2e}".split("e")
+        return f"{value:#.{digits}g}".rstrip(".")
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa}e{int(power)}"
 
 

@@ -181,8 +181,8 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
             pick(record["quantities"][name][end] for record in report["times"])
             for pick, end in ((min, "lower"), (max, "upper"))
         ]
-        certain = "certified: in each step's own problem, in which the steps before are data,"
-        told = re.search(rf"{certain} {name} is in \[(.*?), (.*?)\]", flat)
+        certain = "certified: in no step's own problem, in which the steps before are data,"
+        told = re.search(rf"{certain} is {name} outside \[(.*?), (.*?)\]", flat)
         low, high = (float(text.replace("−", "-")) for text in told.groups())
         assert low <= ends[0] and ends[1] <= high
         assert (low, high) == pytest.approx(ends, rel=0.1, abs=0.1)
