@@ -14,7 +14,7 @@ for folder in sys.path[1:]:
         print(folder)
 sys.stdout.flush()
 
-if sys.version_info < (3, 11):  # noqa: UP036 (the active Python may be any)
+if sys.version_info < (3, 12):  # noqa: UP036 (the active Python may be any)
     sys.exit(1)
 if not all(importlib.util.find_spec(name) for name in ("dolfinx", "petsc4py", "gmsh", "scipy")):
     sys.exit(1)

@@ -87,6 +87,7 @@ REPORT = {
     "on, as it is after the last step.",
     "search": "Only of runs in time on an adapted mesh: the meshes that were tried, coarsest "
     "first, each with level, cells, dofs and, as bound_h1, the largest bound of all steps.",
+    "times": "Only of runs in time: the steps, each with the figures of times.csv.",
 }
 """The keys of report.json, those of an object behind a dot."""
 

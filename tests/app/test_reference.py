@@ -122,7 +122,8 @@ def test_every_figure_is_in_the_reference(known, shared_tmp_path, capsys) -> Non
     assert report["levels"][0].get("quantities") == {}  # of which each file has its own
     (level,) = report["levels"]
     named = names_in("Keys of report.json")
-    assert dotted(report) == [name for name in named if name not in ("units", "names", "search")]
+    elsewhere = ("units", "names", "search", "times")
+    assert dotted(report) == [name for name in named if name not in elsewhere]
     assert dotted(level | {"quantities": None}) == names_in("Keys of a level")
     head = next(csv.reader((folder / "levels.csv").read_text(encoding="utf-8").splitlines()))
     assert head == [name.replace(".", "_") for name in dotted(level) if name != "quantities"]

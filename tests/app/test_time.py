@@ -23,7 +23,7 @@ from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
 from signorini_cr.output import plots
-from signorini_cr.output.meanings import STEP
+from signorini_cr.output.meanings import REPORT, STEP
 from signorini_cr.output.series import is_kept
 
 pytestmark = pytest.mark.slow
@@ -149,6 +149,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         for key in ("kind", "weighted", "value", "lower", "upper", "reason")
     ]
     assert list(report["times"][0]) == list(STEP)
+    assert set(report) <= {name.partition(".")[0] for name in REPORT}
     ends = ["energy_bounds_lower", "energy_bounds_upper"]
     several = {"quantities": asked, "energy_bounds": ends}
     columns = [several.get(name, [name]) for name in STEP]
@@ -424,6 +425,7 @@ def test_a_mesh_adapted_to_all_steps(case, undrawn, shared_tmp_path, capfd):
         largest = max(step["bound_h1"] for step in report["times"])
         assert float(bound) == pytest.approx(largest, rel=0.01)
         assert report["search"][-1]["bound_h1"] == pytest.approx(largest, rel=1e-6)
+        assert set(report) <= {name.partition(".")[0] for name in REPORT}
         assert [each["level"] for each in report["search"]] == list(range(int(level) + 1))
         assert len(report["times"]) == 6 and report["complete"]
 
