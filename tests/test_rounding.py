@@ -87,7 +87,7 @@ def test_a_steps_force_has_the_digits_that_are_certain(change, told):
     heat = {"kind": "force", "weighted": False, "value": 74.71, "lower": 52.0, "upper": 98.0}
     record = STEP | {"force": 74.71, "quantities": {"heat": heat | {"reason": None} | change}}
     assert series.row(record, record).split()[6] == told
-    for force, four in ((289.0, "289.0"), (0.0, "0.000"), (2.5e-7, "2.500e-7")):
+    for force, four in ((289.0, "289.0"), (0.0, "0.000"), (2.5e-7, "2.500e-7"), (12344.0, "12340")):
         alone = record | {"force": force, "quantities": {}}
         assert series.row(alone, alone).split()[6] == four
 

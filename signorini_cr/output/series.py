@@ -18,7 +18,7 @@ from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
 from .report import FILES, bounded, energy_bounds, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
-from .tables import Column, energy, explained, levels_csv, rows_of, short, unit_of
+from .tables import Column, energy, explained, is_plain_force, levels_csv, rows_of, short, unit_of
 from .units import GLUE, PLAIN, Units
 from .vtu import write_solution
 
@@ -113,11 +113,11 @@ def _told(record: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]
 
 def _force(record: Mapping[str, Any]) -> str:
     """Format the contact force, where an interval for it was asked for with the digits of that."""
+    force = record["force"]
     for found in record["quantities"].values():
-        plain = found["kind"] == "force" and not found["weighted"] and found["reason"] is None
-        if plain and math.isclose(found["value"], record["force"], rel_tol=1e-9):
-            return known(record["force"], found["upper"] - found["lower"], 4)
-    return short(record["force"], 4)
+        if is_plain_force(found) and math.isclose(found["value"], force, rel_tol=1e-9):
+            return known(force, found["upper"] - found["lower"], 4)
+    return short(force, 4) if abs(force) < 1e4 else known(force, None, 4)
 
 
 def search_header() -> str:

@@ -110,9 +110,13 @@ def certified(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:
 
 def _is_all_of(force: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
     """Tell whether a quantity is the total contact force under another name."""
+    return is_plain_force(found) and all(found[end] == force[end] for end in ("lower", "upper"))
+
+
+def is_plain_force(found: Mapping[str, Any]) -> bool:
+    """Tell whether a quantity is a contact force without a weight, and has bounds."""
     plain = found.get("kind") == "force" and not found["weighted"]
-    ends = ("lower", "upper", "reason")
-    return plain and force["reason"] is None and all(found[end] == force[end] for end in ends)
+    return plain and found["reason"] is None
 
 
 def unit_of(found: Mapping[str, Any], units: Units) -> str:
