@@ -287,9 +287,9 @@ def short(value: float | None, digits: int = 3) -> str:
     """Format a number in so many digits and at most four characters more (below 1e10)."""
     if value is None:
         return "-"
-    if value == 0 or 1e-3 <= abs(value) < 1e4:
-        return f"{value:#.{digits}g}".rstrip(".")
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    if -3 <= int(power) < digits:
+        return f"{value:#.{digits}g}".rstrip(".")
     return f"{mantissa}e{int(power)}"
 
 

@@ -12,6 +12,7 @@ from signorini_cr.output.tables import (
     legend,
     levels_csv,
     markdown_table,
+    short,
     table_header,
     table_row,
     times,
@@ -33,6 +34,16 @@ def plain(text):
     """With spaces that break, and what stands under a head behind it."""
     head, *items = [text] if isinstance(text, str) else text
     return " ".join([head, "; ".join(items)]).strip().replace("\u00a0", " ")
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [(0.0, "0.00"), (0.00123, "0.00123"), (0.00099996, "0.00100"), (0.000123, "1.23e-4"),
+     (3.0, "3.00"), (999.4, "999"), (999.7, "1.00e3"), (1234.5, "1.23e3"), (9999.7, "1.00e4"),
+     (123456.0, "1.23e5"), (None, "-")],
+)  # fmt: skip
+def test_three_digits_fit_into_a_column(value, told):
+    assert short(value) == told and len(told) <= 7
 
 
 @pytest.mark.parametrize("factor", [1.0, 1e-9, 123.456, 7.1e5])
