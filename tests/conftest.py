@@ -1,6 +1,7 @@
 """What all tests share: a time limit, one folder for all ranks, the marker `serial`."""
 
 import faulthandler
+import gc
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +25,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if MPI.COMM_WORLD.rank == 0:
         jit.remove_unfinished(until=time.time() - jit.ABANDONED)
     MPI.COMM_WORLD.Barrier()
+
+
+def pytest_collection_finish() -> None:
+    # What has been imported stays: whoever looks for cycles need not go through it each time
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

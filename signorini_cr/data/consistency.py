@@ -14,7 +14,7 @@ from ..arrays import BoolArray, FloatArray, Int32Array
 from ..compat import cell_nodes
 from ..fem.conditions import Condition, as_number
 from ..fem.problem import Forms
-from ..fem.space import facet_entities, facet_measures
+from ..fem.space import facet_entities, facet_measures, facet_normals
 from ..mesh.domain import Domain
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
 from .pointwise import evaluate
@@ -184,13 +184,7 @@ class _Solution:
         """Find midpoints of facets, their cells and outward normals."""
         entities = facet_entities(self.mesh, self.domain.facets(part))
         corners, _ = facet_measures(self.mesh, self.domain.facets(part))
-        middle, cells = corners.mean(axis=1), entities[:, 0]
-        edges = corners[:, 1:] - corners[:, :1]
-        up = np.broadcast_to([0.0, 0.0, 1.0], middle.shape)
-        normal = np.cross(edges[:, 0], edges[:, 1] if edges.shape[1] > 1 else up)
-        inside = self.mesh.geometry.x[cell_nodes(self.mesh)[cells]].mean(axis=1)
-        normal *= np.sign((normal * (middle - inside)).sum(axis=1))[:, None]
-        return middle, cells, normal / np.linalg.norm(normal, axis=1)[:, None]
+        return corners.mean(axis=1), entities[:, 0], facet_normals(self.mesh, entities)
 
     def _values(self, e: Any, x: FloatArray, cells: Int32Array) -> Found:
         """Evaluate an expression at points; what can't be told is nan."""

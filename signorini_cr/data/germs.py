@@ -20,7 +20,8 @@ from dolfinx import fem
 from ufl import classes
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from .jets import SERIES, Boxes, Enclosure, Range, Unknown, mul, out, power_series, square_of
+from .jets import SERIES, Boxes, Enclosure, Range, mul, out, power_series, square_of
+from .pointwise import Unknown
 
 SECTORS = 16
 """Sectors that the directions from a point into a triangle are divided into."""

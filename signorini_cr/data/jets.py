@@ -27,16 +27,12 @@ from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..mesh.domain import Domain
 from .balls import EPS, LOOSE, NONE, ORDER, Balls, Factor, Rows, indices, middle, union
-from .pointwise import FUNCTIONS
+from .pointwise import Unknown, by_operators, is_affine
 
 Range = tuple[FloatArray, FloatArray]
 """Lower and upper bounds."""
 Truth = tuple[BoolArray, BoolArray]
 """Where a condition can hold, and where it can fail."""
-
-
-class Unknown(Exception):
-    """An expression whose range is not known here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,23 +230,15 @@ def values(expression: Any, points: Boxes) -> FloatArray:
         Unknown: The expression holds an operator that is not known here.
     """
     at = Enclosure(points, order=0)
-    known: dict[Any, Any] = {}
 
-    def value(e: Any) -> Any:
-        if e not in known:
-            function = FUNCTIONS.get(type(e))
-            if function is None:
-                jet = at(e)
-                known[e] = 0.5 * (jet.low + jet.high)
-            else:
-                known[e] = function(*(value(operand) for operand in e.ufl_operands))
-        return known[e]
+    def centre(e: Any) -> FloatArray:
+        jet = at(e)
+        with np.errstate(all="ignore"):
+            return 0.5 * (jet.low + jet.high)
 
-    with np.errstate(all="ignore"):
-        found = np.asarray(value(expression))
-        if not np.isfinite(found).all():
-            jet = at(expression)
-            found = np.where(np.isfinite(found), found, 0.5 * (jet.low + jet.high))
+    found = np.asarray(by_operators(expression, centre))
+    if not np.isfinite(found).all():
+        found = np.where(np.isfinite(found), found, centre(expression))
     return np.broadcast_to(found, points.low.shape[1:])
 
 
@@ -372,13 +360,8 @@ class Enclosure:
 
     def _function(self, function: fem.Function) -> Jet:
         """Enclose Functions that are affine on each cell, or constant."""
-        box, domain, element = self.boxes, self.boxes.domain, function.function_space.ufl_element()
-        known = (
-            element.reference_value_shape == ()
-            and element.family_name in ("P", "Lagrange", "Discontinuous Lagrange")
-            and element.degree <= 1
-        )
-        if box.cells is None or domain is None or not known:
+        box, domain = self.boxes, self.boxes.domain
+        if box.cells is None or domain is None or not is_affine(function):
             raise Unknown(function.name)
         function = domain.own(function)
         values = function.x.array[function.function_space.dofmap.list[box.cells]]

@@ -14,9 +14,10 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
 from ..fem.space import facet_quadrature
 from .cutting import Cut, cut, refine
-from .jets import Boxes, Enclosure, Unknown
+from .jets import Boxes, Enclosure
 from .moments import LOAD_DEGREE, OnFacets, Volume
 from .pieces import Pieces
+from .pointwise import Unknown
 from .ranges import errors_on, range_on
 from .triangles import Triangles, trace_constant
 

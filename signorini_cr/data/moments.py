@@ -34,7 +34,7 @@ from ..mesh.domain import Domain
 from .cutting import Cut, cut
 from .jets import Boxes, Enclosure, Range, lowered, values
 from .pieces import Pieces
-from .pointwise import evaluate
+from .pointwise import Samples, Unknown
 from .ranges import Deviation, errors_on, range_of
 
 NO_RANGE = "the coefficient has no computable upper and lower bound"
@@ -67,6 +67,10 @@ class Rule:
         )
 
 
+FEW = 1 << 16
+"""At so many points NumPy has evaluated a formula before a compiler has begun."""
+
+
 class Volume:
     """Values of an expression in cells.
 
@@ -77,22 +81,37 @@ class Volume:
     """
 
     def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
-        """Compile the expression, unless it is a number."""
+        """Note what is to be evaluated."""
         self.number, self.rule = as_number(expression), rule
         self.expression, self._mesh = expression, mesh
-        self._values = None
-        if self.number is None:
-            self._values = compat.compile_expression(expression, rule.points, mesh)
 
     def at(self, cells: Cells) -> FloatArray:
-        """Evaluate at the quadrature points of owned cells, shape (cells, q)."""
-        assert self._values is not None
-        which = np.arange(cells.number, dtype=np.int32)
-        values = compat.bound(self._values, cells.domain.own)
-        found: FloatArray = values.eval(cells.domain.mesh, which)
-        found = found.reshape(cells.number, len(self.rule.weights))
+        """Evaluate at the quadrature points of owned cells, shape (cells, q); collective."""
+        found = self._by_numpy(cells) if self._few_on(cells.domain.mesh) else None
+        if found is None:
+            which = np.arange(cells.number, dtype=np.int32)
+            values = compat.bound(self._compiled, cells.domain.own)
+            found = values.eval(cells.domain.mesh, which).reshape(cells.number, -1)
         self.deviation.off_null_sets(found.T, None, cells, self.rule.hats)
         return found
+
+    def _few_on(self, mesh: Mesh) -> bool:
+        """Tell whether there are so few points that compiling would take longer; on all ranks."""
+        number = mesh.topology.index_map(mesh.topology.dim).size_global
+        return number * len(self.rule.weights) <= FEW
+
+    def _by_numpy(self, cells: Cells) -> FloatArray | None:
+        """Evaluate without compiling; None where that can't be done, the same on all ranks."""
+        samples = Samples(cells.domain, np.arange(cells.number), self.rule.hats.T)
+        try:
+            return samples.of(self.deviation.expression)
+        except Unknown:
+            return None
+
+    @cached_property
+    def _compiled(self) -> fem.Expression:
+        """The expression, compiled; collective when first asked for."""
+        return compat.compile_expression(self.expression, self.rule.points, self._mesh)
 
     @cached_property
     def deviation(self) -> Deviation:
@@ -441,7 +460,7 @@ class Trace:
     """
 
     def __init__(self, expression: Expr, mesh: Mesh, degree: int):
-        """Compile the expression, written for a mesh, unless NumPy does as well."""
+        """Prepare the expression, which was written for a mesh."""
         self._expression, self.degree = expression, degree
         facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
         corners = basix.geometry(facet)
@@ -454,9 +473,7 @@ class Trace:
             near = [corners + part * (middle - corners) for part in BESIDE]
             at = np.vstack([corners, *near, middle, self.points])
             self._plain, self._at = lowered(expression), np.column_stack([1.0 - at.sum(axis=1), at])
-            self._compiled = None
-            if evaluate(self._plain, np.zeros((1, 3))) is None:
-                self._compiled = compat.FacetExpression(expression, at, mesh)
+            self._mesh, self._points = mesh, at
 
     @property
     def expression(self) -> Expr:
@@ -501,14 +518,16 @@ class Trace:
 
     def _values(self, domain: Domain, entities: Int32Array) -> FloatArray:
         """Evaluate at all of the points, shape (points, n)."""
-        if self._compiled is not None:
-            found = self._compiled.at(domain.mesh, entities, domain.own)
-            return np.ascontiguousarray(found[:, :, 0].T)
-        # Compiling would take longer than all of a boundary's points do
-        x = compat.facet_points(domain.mesh, entities, self._at)
-        known = evaluate(self._plain, x.transpose(1, 0, 2).reshape(-1, 3))
-        assert known is not None
-        return known[0].reshape(len(self._at), len(entities))
+        try:  # compiling would take longer than all of a boundary's points do
+            found = Samples.on_facets(domain, entities, self._at).of(self._plain)
+        except Unknown:
+            found = self._compiled.at(domain.mesh, entities, domain.own)[:, :, 0]
+        return np.ascontiguousarray(found.T)
+
+    @cached_property
+    def _compiled(self) -> compat.FacetExpression:
+        """The expression, compiled; collective when first asked for."""
+        return compat.FacetExpression(self._expression, self._points, self._mesh)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Values of UFL expressions at points, each with a bound of what rounding may have done to it.
+"""Values of UFL expressions at points, alone or with a bound of what rounding may have done.
 
 The bound follows the operations (running error analysis): every one of them adds its own rounding
 to what its operands bring along, and the coordinates bring along what they are not known by. Where
@@ -8,6 +8,8 @@ a value is the difference of large numbers, or belongs to a steep function, the 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,7 +21,10 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.corealg.traversal import unique_post_traversal
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array
+from ..compat import cell_nodes
+from ..fem.space import facet_corners, facet_normals
+from ..mesh.domain import Domain
 
 Value: TypeAlias = tuple[Any, Any]
 """A number and the bound of its error; of a condition, the truth and 0."""
@@ -27,8 +32,119 @@ Value: TypeAlias = tuple[Any, Any]
 EPS = float(np.finfo(np.float64).eps)
 
 
-class _Unknown(Exception):
+class Unknown(Exception):
     """An operator that is not known here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points of cells or facets, at which formulas are evaluated without compiling them.
+
+    Attributes:
+        domain: The mesh.
+        cells: The cell of each row of points, shape (n,).
+        hats: Barycentric coordinates in the cell, shape (q, d + 1) or (n, q, d + 1).
+        facets: Pairs (cell, facet's number in the cell), shape (n, 2), if that is where they are.
+    """
+
+    domain: Domain
+    cells: Int32Array | IndexArray
+    hats: FloatArray
+    facets: Int32Array | None = None
+
+    @classmethod
+    def on_facets(cls, domain: Domain, facets: Int32Array, hats: FloatArray) -> Samples:
+        """Take the same points on each of some boundary facets.
+
+        Args:
+            domain: The mesh.
+            facets: Pairs (cell, facet's number in the cell), shape (n, 2).
+            hats: Barycentric coordinates in a facet, whose vertices are in the order of the cell's
+                closure, shape (q, d).
+        """
+        cells, local = facets.T
+        ends = facet_corners(domain.mesh)
+        in_cells = np.zeros((*ends.shape[:1], len(hats), len(ends)))
+        np.put_along_axis(in_cells, ends[:, None], hats[None], axis=2)
+        return cls(domain, cells, in_cells[local], facets)
+
+    @cached_property
+    def x(self) -> FloatArray:
+        """Coordinates, shape (n, q, 3)."""
+        mesh = self.domain.mesh
+        return np.asarray(self.hats @ mesh.geometry.x[cell_nodes(mesh)[self.cells]])
+
+    @cached_property
+    def normals(self) -> FloatArray:
+        """Outward unit normals of the facets, shape (n, 3).
+
+        Raises:
+            Unknown: They are points of cells.
+        """
+        if self.facets is None:
+            raise Unknown("normal")
+        return facet_normals(self.domain.mesh, self.facets)
+
+    def of(self, expression: Any) -> FloatArray:
+        """Evaluate a lowered scalar as compiled code would, shape (n, q).
+
+        Raises:
+            Unknown: It holds an operator, or a kind of Function, that is not known here.
+        """
+        found = by_operators(expression, self._leaf)
+        return np.array(np.broadcast_to(found, self.x.shape[:2]), dtype=np.float64)
+
+    def _leaf(self, e: Any) -> Any:
+        if isinstance(e, classes.ScalarValue | classes.Zero):
+            return float(e)
+        if isinstance(e, fem.Constant) and e.ufl_shape == ():
+            return float(e.value)
+        if isinstance(e, fem.Function) and is_affine(e):
+            function = self.domain.own(e)
+            values = function.x.array[function.function_space.dofmap.list[self.cells]]
+            if values.shape[1] == 1:
+                return values
+            return (self.hats @ values[:, :, None])[..., 0]
+        if isinstance(e, classes.Indexed):
+            vector, index = e.ufl_operands
+            if all(isinstance(i, classes.FixedIndex) for i in index):
+                place = tuple(map(int, index))
+                if isinstance(vector, fem.Constant):
+                    return float(np.asarray(vector.value)[place])
+                if isinstance(vector, classes.SpatialCoordinate):
+                    return self.x[..., place[0]]
+                if isinstance(vector, classes.FacetNormal):
+                    return self.normals[:, None, place[0]]
+        raise Unknown(type(e).__name__)
+
+
+def is_affine(function: fem.Function) -> bool:
+    """Tell whether a Function is one of scalars, and affine or constant on each cell."""
+    element = function.function_space.ufl_element()
+    return (
+        element.reference_value_shape == ()
+        and element.family_name in ("P", "Lagrange", "Discontinuous Lagrange")
+        and element.degree <= 1
+    )
+
+
+def by_operators(expression: Any, leaf: Callable[[Any], Any]) -> Any:
+    """Evaluate an expression with NumPy's functions for its operators.
+
+    Args:
+        expression: A lowered scalar.
+        leaf: Gives the values of all else that is in it.
+    """
+    known: dict[Any, Any] = {}
+
+    def value(e: Any) -> Any:
+        if e not in known:
+            function = FUNCTIONS.get(type(e))
+            known[e] = leaf(e) if function is None else function(*map(value, e.ufl_operands))
+        return known[e]
+
+    with np.errstate(all="ignore"):
+        return value(expression)
 
 
 def evaluate(
@@ -59,10 +175,10 @@ def evaluate(
             try:
                 try:
                     found = reader.read(component)
-                except _Unknown:
+                except Unknown:
                     plain = apply_derivatives(apply_algebra_lowering(component))
                     found = reader.read(expand_indices(plain))
-            except _Unknown:
+            except Unknown:
                 return None
             values[at], bounds[at] = found
     return values, bounds
@@ -104,7 +220,7 @@ class _Reader:
             part = operands[0]
             for index in node.ufl_operands[1]:
                 if not isinstance(index, classes.FixedIndex):
-                    raise _Unknown("free index")
+                    raise Unknown("free index")
                 part = part[int(index)]
             return part
         if isinstance(node, classes.Variable):
@@ -113,11 +229,11 @@ class _Reader:
             for kind, rule in _RULES.items():
                 if isinstance(node, kind):
                     return rule(*operands)
-        raise _Unknown(type(node).__name__)
+        raise Unknown(type(node).__name__)
 
     def _function(self, function: fem.Function) -> Any:
         if self.cells is None or len(function.ufl_shape) > 1:
-            raise _Unknown(function.name)
+            raise Unknown(function.name)
         values = np.zeros((len(self.points), max((1, *function.ufl_shape))))
         if len(values):
             values[:] = np.reshape(function.eval(self.points, self.cells), values.shape)

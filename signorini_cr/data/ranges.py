@@ -22,7 +22,6 @@ from .jets import (
     Enclosure,
     Jet,
     Range,
-    Unknown,
     differences,
     has_conditions,
     is_local,
@@ -30,6 +29,7 @@ from .jets import (
     values,
 )
 from .pieces import EDGES, Levels, Pieces
+from .pointwise import Unknown
 
 Errors = Callable[[Boxes, FloatArray], FloatArray]
 """What is to be known of data on boxes and simplices of given half extents; shape (rows, n)."""

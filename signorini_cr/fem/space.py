@@ -120,6 +120,27 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
     return x, measures(x)
 
 
+def facet_normals(mesh: Mesh, entities: Int32Array) -> FloatArray:
+    """Find the outward unit normals of exterior facets.
+
+    Args:
+        mesh: The mesh.
+        entities: As `facet_entities` has them, shape (n, 2).
+
+    Returns:
+        Shape (n, 3).
+    """
+    cells, local = entities.T
+    nodes = cell_nodes(mesh)[cells]
+    x = mesh.geometry.x[np.take_along_axis(nodes, facet_corners(mesh)[local], axis=1)]
+    edges = x[:, 1:] - x[:, :1]
+    up = np.broadcast_to([0.0, 0.0, 1.0], edges[:, 0].shape)
+    normal = np.cross(edges[:, 0], edges[:, 1] if edges.shape[1] > 1 else up)
+    outwards = x.mean(axis=1) - mesh.geometry.x[nodes].mean(axis=1)
+    normal *= np.sign((normal * outwards).sum(axis=1))[:, None]
+    return np.asarray(normal / np.linalg.norm(normal, axis=1)[:, None])
+
+
 def measures(x: FloatArray) -> FloatArray:
     """Compute the measures of simplices with vertices x, shape (n, vertices, gdim)."""
     edges = x[:, 1:] - x[:, :1]

@@ -1,4 +1,4 @@
-"""Data on boundary facets: the values of compiled code, without compiling."""
+"""Data in few cells and on boundary facets: the values of compiled code, without compiling."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,9 @@ from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import compat
-from signorini_cr.data.moments import Trace
+from signorini_cr.data import moments
+from signorini_cr.data.moments import Rule, Trace, Volume
+from signorini_cr.fem.cells import Cells
 from signorini_cr.fem.space import facet_entities, function_space
 
 FORMULAS = {
@@ -24,33 +26,82 @@ FORMULAS = {
 }
 
 
-def traced(formula, mesh, domain, monkeypatch):
+def affine(mesh, name, degree):
+    w = fem.Function(fem.functionspace(mesh, (name, degree)))
+    w.interpolate(lambda x: 2 * x[0] - x[1] + 0.5 * x[2])
+    return w
+
+
+OF_MESHES = {
+    "normal": lambda mesh: ufl.FacetNormal(mesh)[0] - 3 * ufl.FacetNormal(mesh)[1],
+    "affine": lambda mesh: affine(mesh, "Lagrange", 1) ** 2,
+    "affine, with steps": lambda mesh: ufl.exp(affine(mesh, "DG", 1)),
+    "steps": lambda mesh: 1 + affine(mesh, "DG", 0),
+}
+"""What depends on more than x."""
+
+
+def written(name, mesh):
+    if name in OF_MESHES:
+        return OF_MESHES[name](mesh)
+    return FORMULAS[name](ufl.SpatialCoordinate(mesh))
+
+
+def traced(expression, mesh, domain, monkeypatch):
     """Values at a rule's points on all facets of the boundary, by both ways."""
     mesh.topology.create_connectivity(mesh.topology.dim - 1, mesh.topology.dim)
     entities = facet_entities(mesh, exterior_facet_indices(mesh.topology))
-    expression = formula(ufl.SpatialCoordinate(mesh))
     compiled = compat.FacetExpression(expression, Trace(expression, mesh, 4).points, mesh)
     monkeypatch.setattr(compat, "FacetExpression", None)
     found = Trace(expression, mesh, 4).at(domain, entities)[-1]
     return found, compiled.at(mesh, entities)[:, :, 0].T
 
 
-@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("name", [*FORMULAS, *OF_MESHES])
 def test_formulas_have_the_values_of_compiled_code(name, monkeypatch):
     domain = SQUARE.mesh(0.2)
-    found, known = traced(FORMULAS[name], domain.mesh, domain, monkeypatch)
+    found, known = traced(written(name, domain.mesh), domain.mesh, domain, monkeypatch)
     assert found == pytest.approx(known, rel=1e-13, abs=1e-15, nan_ok=True)
 
 
-def test_on_tetrahedra(monkeypatch):
-    class Cube:
-        mesh = create_unit_cube(MPI.COMM_WORLD, 2, 3, 2)
+@pytest.mark.parametrize("name", sorted({*FORMULAS, *OF_MESHES} - {"normal"}))
+def test_in_cells_they_have_them_too(name, monkeypatch):
+    domain = SQUARE.mesh(0.2)
+    cells = Cells(domain, function_space(domain.mesh, "CR"), [])
+    volume = Volume(written(name, domain.mesh), domain.mesh, Rule(domain.mesh, 4))
+    monkeypatch.setattr(moments, "FEW", 0)
+    known = volume.at(cells)
+    monkeypatch.undo()
+    monkeypatch.setattr(compat, "bound", None)
+    assert volume.at(cells) == pytest.approx(known, rel=1e-13, abs=1e-15, nan_ok=True)
 
-    found, known = traced(lambda x: x[0] + x[1] ** 2 * x[2], Cube.mesh, Cube, monkeypatch)
-    assert found == pytest.approx(known, rel=1e-13)
+
+class Cube:
+    """What is asked of a domain here."""
+
+    def __init__(self):
+        self.mesh = create_unit_cube(MPI.COMM_WORLD, 2, 3, 2)
+
+    def own(self, function):
+        return function
 
 
-def test_what_is_no_formula_of_coordinates_is_compiled():
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda mesh, x: x[0] + x[1] ** 2 * x[2],
+        lambda mesh, x: ufl.FacetNormal(mesh)[2] + 2 * ufl.FacetNormal(mesh)[0],
+        lambda mesh, x: x[0] * affine(mesh, "DG", 1),
+    ],
+)
+def test_on_tetrahedra(formula, monkeypatch):
+    cube = Cube()
+    expression = formula(cube.mesh, ufl.SpatialCoordinate(cube.mesh))
+    found, known = traced(expression, cube.mesh, cube, monkeypatch)
+    assert found == pytest.approx(known, rel=1e-13, abs=1e-15)
+
+
+def test_what_is_no_such_formula_is_compiled():
     domain = SQUARE.mesh(0.3)
     w = fem.Function(function_space(domain.mesh, "P1"))
     w.interpolate(lambda x: 2 * x[0] - x[1])
@@ -62,6 +113,9 @@ def test_what_is_no_formula_of_coordinates_is_compiled():
     assert domain.mesh.comm.allreduce(float(slopes.max(initial=-9.0)), op=MPI.MAX) == pytest.approx(
         2.0
     )
+    cells = Cells(domain, function_space(domain.mesh, "CR"), [])
+    second = Volume(ufl.grad(w)[0], domain.mesh, Rule(domain.mesh, 2))
+    assert second.at(cells) == pytest.approx(2.0)
 
 
 def test_constants_count_as_they_are_then():
