@@ -509,7 +509,7 @@ def test_what_c_and_b_take_up_on_thin_cells(move, b, c):
             - 2 * float(normal[1]) * ufl.sin(first) * ufl.sin(last)
         )
 
-    def f(x):
+    def f(x, c=c):
         return c * u(x) - ufl.div(kappa(x) * ufl.grad(u(x)))
 
     problem = Problem(
@@ -529,12 +529,13 @@ def test_what_c_and_b_take_up_on_thin_cells(move, b, c):
     on_below = ufl.conditional(ufl.lt(n[1], -1.0 + 1e-6), 1.0, 0.0)
     dx, ds = ufl.dx(domain=mesh, degree=12), ufl.ds(domain=mesh, degree=12)
     e = u(x) - solution.u
-    square = kappa(x) * ufl.inner(ufl.grad(e), ufl.grad(e)) * dx + c * e**2 * dx
-    square += b * on_right * e**2 * ds
+    mass, loss = (fem.Constant(mesh, each) for each in (c, b))  # one form for all of them
+    square = kappa(x) * ufl.inner(ufl.grad(e), ufl.grad(e)) * dx + mass * e**2 * dx
+    square += loss * on_right * e**2 * ds
     flux = kappa(x) * ufl.dot(ufl.grad(u(x)), n)
-    J = 0.5 * (kappa(x) * ufl.inner(ufl.grad(u(x)), ufl.grad(u(x))) + c * u(x) ** 2) * dx
-    J += -f(x) * u(x) * dx + 0.5 * b * on_right * u(x) ** 2 * ds
-    J -= (on_below * flux + on_right * (flux + b * u(x))) * u(x) * ds
+    J = 0.5 * (kappa(x) * ufl.inner(ufl.grad(u(x)), ufl.grad(u(x))) + mass * u(x) ** 2) * dx
+    J += -f(x, mass) * u(x) * dx + 0.5 * loss * on_right * u(x) ** 2 * ds
+    J -= (on_below * flux + on_right * (flux + loss * u(x))) * u(x) * ds
     error, energy = (
         WORLD.allreduce(fem.assemble_scalar(fem.form(form, dtype=np.float64)))
         for form in (square, J)
