@@ -141,7 +141,7 @@ class Grid:
                 whatever the matrix's magnitude.
         """
         terms = x.duplicate()
-        terms.array[:] = self.operator.whole_diagonal * x.array_r
+        np.multiply(self.operator.whole_diagonal, x.array_r, out=terms.array)
         for dofs in (self.dirichlet, constrained):
             terms.array[dofs] = 0.0
         norm = terms.norm()
