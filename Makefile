@@ -6,8 +6,8 @@ limit = timeout --kill-after=20 2400
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair coverage mutants ranks readers \
-    browser test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair coverage mutants ranks \
+    ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -66,9 +66,10 @@ mutants:
 	$(run) python3 tests/mutants.py multigrid --count 100
 
 # What depends on how a mesh is shared out, on more ranks than that.
-ranks:
-	$(run) $(limit) mpirun -n 3 python3 -m pytest -m ranks -k 'not rates'
-	$(run) $(limit) mpirun -n 4 python3 -m pytest -m ranks -k 'not rates'
+ranks: ranks-3 ranks-4
+
+ranks-3 ranks-4: ranks-%:
+	$(run) $(limit) mpirun -n $* python3 -m pytest -m ranks -k 'not rates'
 
 # What is left for others, read by others: meshio, VTK, PyVista, Jupyter; -p fails without one.
 readers:
