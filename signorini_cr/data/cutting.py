@@ -14,9 +14,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array
-from ..compat import cell_nodes
 from ..fem.cells import Cells, blocks
-from .jets import Boxes, Range
+from .jets import Boxes
 from .pieces import JUMP, QUARTERS, SLANTED, UNKNOWN, Levels, Pieces
 from .ranges import Errors, errors_on
 
@@ -101,7 +100,9 @@ def cut(
     found = np.full((len(weights), n), np.inf)
     pending = np.arange(n)
     if not local:
-        low, high = _extents(cells)
+        low, high = np.empty((2, cells.domain.mesh.geometry.dim, n))
+        for part in blocks(n):
+            low[:, part], high[:, part] = cells.extents(part)
         top = int(np.log2(max(total / GROUPS, 1.0)) / 2)
         slanted = (high - low).prod(axis=0) > 2.0 * SLANTED * cells.volume
         if cells.tdim == 2 and 2 * comm.allreduce(np.count_nonzero(slanted)) > total:
@@ -386,23 +387,6 @@ def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
     power[~np.isfinite(share)] = highest + 1
     sums = comm.allreduce(np.bincount(power, share, minlength=highest + 2))
     return float(least * 2.0 ** np.searchsorted(np.cumsum(sums)[1:-1], enough, side="right"))
-
-
-def _extents(cells: Cells) -> Range:
-    """Find the least and largest coordinates in each cell, shapes (gdim, cells)."""
-    mesh = cells.domain.mesh
-    nodes = cell_nodes(mesh)[: cells.number]
-    low, high = np.empty((2, mesh.geometry.dim, cells.number))
-    points = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
-    for part in blocks(cells.number):
-        first, *others = np.ascontiguousarray(nodes[part].T, dtype=np.intp)
-        for x, least, most in zip(points, low[:, part], high[:, part], strict=True):
-            least[:] = most[:] = x[first]
-            for node in others:
-                corner = x[node]
-                np.minimum(least, corner, out=least)
-                np.maximum(most, corner, out=most)
-    return low, high
 
 
 def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, FloatArray, IndexArray]:

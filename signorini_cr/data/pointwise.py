@@ -136,15 +136,18 @@ def by_operators(expression: Any, leaf: Callable[[Any], Any]) -> Any:
         leaf: Gives the values of all else that is in it.
     """
     known: dict[Any, Any] = {}
-
-    def value(e: Any) -> Any:
-        if e not in known:
-            function = FUNCTIONS.get(type(e))
-            known[e] = leaf(e) if function is None else function(*map(value, e.ufl_operands))
-        return known[e]
-
+    stack = [expression]  # rather than calls within one another: it may be deep
     with np.errstate(all="ignore"):
-        return value(expression)
+        while expression not in known:
+            e = stack[-1]
+            function = FUNCTIONS.get(type(e))
+            operands = () if function is None else e.ufl_operands
+            if unknown := [operand for operand in operands if operand not in known]:
+                stack += unknown
+                continue
+            known[e] = leaf(e) if function is None else function(*(known[o] for o in operands))
+            stack.pop()
+    return known[expression]
 
 
 def evaluate(

@@ -230,9 +230,13 @@ class Deviation:
         beside = (1.0 - BESIDE) * hats + BESIDE * (mixture / mixture.sum())[:, None]
         for part in blocks(found.shape[1]):
             every = np.arange(part.start, part.stop)
-            some = pieces[part] if pieces is not None else Pieces.of_cells(cells, every)
-            near = np.flatnonzero(self._may_be_even(some.hulls(cells)))
-            some, which = some[near], every[near]
+            if pieces is None:
+                boxes = Boxes(*cells.extents(part), cells=every, domain=cells.domain)
+            else:
+                boxes = pieces[part].hulls(cells)
+            near = np.flatnonzero(self._may_be_even(boxes))
+            which = every[near]
+            some = Pieces.of_cells(cells, which) if pieces is None else pieces[which]
             even = self._may_be_even(some.points(cells, hats)).reshape(len(found), len(near))
             if even.any():
                 others = values(self.expression, some.points(cells, beside)).reshape(even.shape)

@@ -175,6 +175,17 @@ class Cells:
         """Return the same cells with lengths as they are."""
         return self if self.stretch is None else Cells(self.domain, self.V, self.fixed, self.sinks)
 
+    def extents(self, part: slice) -> tuple[FloatArray, FloatArray]:
+        """Find least and largest coordinates in some cells, shapes (gdim, cells in the part)."""
+        mesh = self.domain.mesh
+        nodes = compat.cell_nodes(mesh)[: self.number][part]
+        low = high = mesh.geometry.x.take(nodes[:, 0], axis=0)
+        for node in nodes.T[1:]:
+            corner = mesh.geometry.x.take(node, axis=0)
+            low, high = np.minimum(low, corner), np.maximum(high, corner)
+        low, high = (np.ascontiguousarray(x.T[: mesh.geometry.dim]) for x in (low, high))
+        return low, high
+
     def corners(self, part: slice) -> tuple[FloatArray, FloatArray]:
         """Find stretched vertices and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""
         mesh = self.domain.mesh

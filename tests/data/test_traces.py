@@ -11,6 +11,7 @@ from mpi4py import MPI
 from signorini_cr import compat
 from signorini_cr.data import moments
 from signorini_cr.data.moments import Rule, Trace, Volume
+from signorini_cr.data.pointwise import Samples
 from signorini_cr.fem.cells import Cells
 from signorini_cr.fem.space import facet_entities, function_space
 
@@ -116,6 +117,18 @@ def test_what_is_no_such_formula_is_compiled():
     cells = Cells(domain, function_space(domain.mesh, "CR"), [])
     second = Volume(ufl.grad(w)[0], domain.mesh, Rule(domain.mesh, 2))
     assert second.at(cells) == pytest.approx(2.0)
+
+
+def test_formulas_may_be_deep():
+    domain = SQUARE.mesh(0.5)
+    x = ufl.SpatialCoordinate(domain.mesh)
+    deep = x[0]
+    for _ in range(800):
+        deep = deep + x[1] * 0.5**20
+    cells = Cells(domain, function_space(domain.mesh, "CR"), [])
+    rule = Rule(domain.mesh, 2)
+    found = Samples(domain, np.arange(cells.number), rule.hats.T)
+    assert found.of(deep) == pytest.approx(found.of(x[0]) + 800 * 0.5**20 * found.of(x[1]))
 
 
 def test_constants_count_as_they_are_then():
