@@ -125,13 +125,15 @@ class Factor:
         if not rows:
             return NONE
         shape = np.broadcast_shapes(self.planes.shape[2:], other.planes.shape[2:])
-        total = np.zeros((3, len(rows), *shape))
+        total = np.empty((3, len(rows), *shape))
         bounded = self.bounded and other.bounded
-        for i, j, k in terms:
-            some = self.planes[:, i] * other.planes[:, j]
+        for i, j, k, first in terms:
+            sums = total[:, k]
+            some = np.multiply(self.planes[:, i], other.planes[:, j], out=sums if first else None)
             if not bounded:
                 np.fmax(some[2], 0.0, out=some[2])
-            total[:, k] += some
+            if not first:
+                sums += some
         mid, least, rad = total
         least -= LOOSE * rad
         rad -= least
@@ -141,12 +143,12 @@ class Factor:
 @cache
 def _terms(
     variables: int, order: int, left: Rows, right: Rows
-) -> tuple[tuple[tuple[slice, ...], ...], Rows]:
+) -> tuple[tuple[tuple[slice, slice, slice, bool], ...], Rows]:
     """List the products in the coefficients of a product, from the first order on.
 
     Returns:
-        Triples of slices of rows: two to multiply, one of which at least is a single row, and those
-        to add the products to; and what the latter are.
+        Slices of rows: two to multiply, one of which at least is a single row, and those to add the
+        products to, with whether they are the first that these get; and what these are.
     """
     every = indices(variables)
     sums = {}
@@ -156,18 +158,26 @@ def _terms(
             sums[i, j] = every.index(index)
     rows = tuple(sorted(set(sums.values())))
     runs: list[list[tuple[int, int, int]]] = []
+    firsts: list[bool] = []
+    begun: set[int] = set()
     for i, j in sorted(sums, key=lambda pair: (pair[0] > 0, pair[1] > 0, *pair)):
         term = left.index(i), right.index(j), rows.index(sums[i, j])
         last = runs[-1][-2:] if runs else []
         steps = [
             tuple(q - p for p, q in zip(a, b, strict=True)) for a, b in pairwise([*last, term])
         ]
-        if steps and steps[0] == steps[-1] in ((0, 1, 1), (1, 0, 1)):
+        is_first = term[2] not in begun
+        begun.add(term[2])
+        if steps and steps[0] == steps[-1] in ((0, 1, 1), (1, 0, 1)) and is_first == firsts[-1]:
             runs[-1].append(term)
         else:
             runs.append([term])
-    slices = (tuple(slice(a, b + 1) for a, b in zip(run[0], run[-1], strict=True)) for run in runs)
-    return tuple(slices), rows
+            firsts.append(is_first)
+    terms = []
+    for run, first in zip(runs, firsts, strict=True):
+        i, j, k = (slice(a, b + 1) for a, b in zip(run[0], run[-1], strict=True))
+        terms.append((i, j, k, first))
+    return tuple(terms), rows
 
 
 @cache
