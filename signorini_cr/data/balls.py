@@ -175,8 +175,8 @@ def _terms(
             firsts.append(is_first)
     terms = []
     for run, first in zip(runs, firsts, strict=True):
-        i, j, k = (slice(a, b + 1) for a, b in zip(run[0], run[-1], strict=True))
-        terms.append((i, j, k, first))
+        a, b, target = (slice(p, q + 1) for p, q in zip(run[0], run[-1], strict=True))
+        terms.append((a, b, target, first))
     return tuple(terms), rows
 
 
