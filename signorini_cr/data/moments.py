@@ -67,7 +67,7 @@ class Rule:
         )
 
 
-FEW = 1 << 16
+FEW = 1 << 14
 """At so many points NumPy has evaluated a formula before a compiler has begun."""
 
 
