@@ -176,8 +176,7 @@ class ReducedSolver:
         self._stiffness.sort(self._x, self._b)
         inactive, first = self._snes.getVIInactiveSet().array, self.matrix.getOwnershipRange()[0]
         self.active = ActiveSet.without(self._cycle.operator.dofs, inactive, first)
-        kept = np.ones(self._step.local_size, dtype=bool)  # by SNES, whatever is held from here on
-        kept[self.active.dofs] = False
+        without = self.active.dofs  # for SNES, whatever is held from here on
         careful = self._snes.getIterationNumber() >= CAREFUL
         if careful:
             self._hold()
@@ -198,7 +197,9 @@ class ReducedSolver:
                 self.reached = max(test.reached, rounding)
         if careful:
             self._shorten()
-        reduced.array[:] = self._step.array_r[kept]
+        # piece by piece, as a mask would take memory of the size of x, whose first touch takes long
+        head, *others = np.split(self._step.array_r, without)
+        np.concatenate([head, *(piece[1:] for piece in others)], out=reduced.array)
         outer.setIterationNumber(self.ksp.getIterationNumber())
         outer.setConvergedReason(self.ksp.getConvergedReason())
 
