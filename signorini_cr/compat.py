@@ -211,22 +211,20 @@ def bound(expression: fem.Expression, own: Callable[[Any], Any]) -> fem.Expressi
     return made
 
 
-def facet_points(mesh: Mesh, entities: Int32Array, hats: FloatArray) -> FloatArray:
-    """Find points of facets.
+def facet_vertices(mesh: Mesh, entities: Int32Array) -> FloatArray:
+    """Find the coordinates of facets' vertices, in the order of the cell's closure.
 
     Args:
         mesh: The mesh.
         entities: Pairs (cell, facet's number in the cell), shape (n, 2).
-        hats: Barycentric coordinates in the facet, whose vertices are in the order of the cell's
-            closure, shape (q, d).
 
     Returns:
-        Shape (n, q, 3).
+        Shape (n, d, 3).
     """
     cells, local = entities.T
     corners = np.array(basix.topology(mesh.basix_cell())[-2])
     nodes = np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)
-    return np.asarray(hats @ mesh.geometry.x[nodes])
+    return np.asarray(mesh.geometry.x[nodes])
 
 
 class FacetExpression:
@@ -269,7 +267,7 @@ class FacetExpression:
             values = expression.eval(mesh, entities).reshape(shape)
         except (AssertionError, TypeError):  # 0.9 wants them flattened, and turns nothing
             return expression.eval(mesh, entities.ravel()).reshape(shape)
-        wanted = facet_points(mesh, entities, self._hats)[..., : mesh.geometry.dim]
+        wanted = (self._hats @ facet_vertices(mesh, entities))[..., : mesh.geometry.dim]
         found = self._where.eval(mesh, entities).reshape(shape)
         distance = np.linalg.norm(wanted[:, :, None] - found[:, None, :], axis=-1)
         return np.take_along_axis(values, distance.argmin(axis=2)[:, :, None], axis=1)

@@ -473,7 +473,7 @@ class Trace:
             near = [corners + part * (middle - corners) for part in BESIDE]
             at = np.vstack([corners, *near, middle, self.points])
             self._plain, self._at = lowered(expression), np.column_stack([1.0 - at.sum(axis=1), at])
-            self._mesh, self._points = mesh, at
+            self._mesh = mesh
 
     @property
     def expression(self) -> Expr:
@@ -527,7 +527,7 @@ class Trace:
     @cached_property
     def _compiled(self) -> compat.FacetExpression:
         """The expression, compiled; collective when first asked for."""
-        return compat.FacetExpression(self._expression, self._points, self._mesh)
+        return compat.FacetExpression(self._expression, self._at[:, 1:], self._mesh)
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,7 @@ class Samples:
         """
         cells, local = facets.T
         ends = facet_corners(domain.mesh)
-        in_cells = np.zeros((*ends.shape[:1], len(hats), len(ends)))
+        in_cells = np.zeros((len(ends), len(hats), len(ends)))
         np.put_along_axis(in_cells, ends[:, None], hats[None], axis=2)
         return cls(domain, cells, in_cells[local], facets)
 

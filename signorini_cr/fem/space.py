@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..arrays import FloatArray, IndexArray, Int32Array
-from ..compat import cell_nodes
+from ..compat import cell_nodes, facet_vertices
 from ..errors import InputError
 
 ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
@@ -114,9 +114,7 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
         Coordinates of shape (n, d, 3), vertices in the order of the cell's closure, and measures
         of shape (n,).
     """
-    cells, local = facet_entities(mesh, facets).T
-    corners = facet_corners(mesh)
-    x = mesh.geometry.x[np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)]
+    x = facet_vertices(mesh, facet_entities(mesh, facets))
     return x, measures(x)
 
 
@@ -130,13 +128,11 @@ def facet_normals(mesh: Mesh, entities: Int32Array) -> FloatArray:
     Returns:
         Shape (n, 3).
     """
-    cells, local = entities.T
-    nodes = cell_nodes(mesh)[cells]
-    x = mesh.geometry.x[np.take_along_axis(nodes, facet_corners(mesh)[local], axis=1)]
+    x = facet_vertices(mesh, entities)
     edges = x[:, 1:] - x[:, :1]
     up = np.broadcast_to([0.0, 0.0, 1.0], edges[:, 0].shape)
     normal = np.cross(edges[:, 0], edges[:, 1] if edges.shape[1] > 1 else up)
-    outwards = x.mean(axis=1) - mesh.geometry.x[nodes].mean(axis=1)
+    outwards = x.mean(axis=1) - mesh.geometry.x[cell_nodes(mesh)[entities[:, 0]]].mean(axis=1)
     normal *= np.sign((normal * outwards).sum(axis=1))[:, None]
     return np.asarray(normal / np.linalg.norm(normal, axis=1)[:, None])
 
