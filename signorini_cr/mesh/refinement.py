@@ -75,7 +75,8 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
         topology.create_connectivity(1, 2)
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
-    return _child(domain, fine, _child_tags(domain, fine, facets), parent), parent
+    tags = _child_tags(domain, fine, facets)
+    return _child(domain, fine, tags, parent, alike=True), parent
 
 
 def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, Int32Array]:
@@ -158,10 +159,13 @@ def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
     return meshtags(mesh, 1, facet[order], label[label > 0][order])
 
 
-def _child(domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array) -> Domain:
+def _child(
+    domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array, alike: bool = False
+) -> Domain:
     """Make the fine domain: its cells consist of what their parents do."""
     materials = domain.materials.of_children(parent)
-    descent = (*domain.descent, Refinement(weakref.ref(domain.mesh), parent))
+    step = Refinement(weakref.ref(domain.mesh), parent, alike=alike)
+    descent = (*domain.descent, step)
     return Domain(fine, tags, parts=domain.parts, materials=materials, descent=descent)
 
 

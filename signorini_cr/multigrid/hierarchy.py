@@ -113,7 +113,9 @@ class Hierarchy:
             exchange: The same.
         """
         finest = self.meshes[-1]
-        parents = Parents(finest.domain.mesh, domain.mesh, parent_cell, exchange)
+        coarse, last = finest.domain.mesh, domain.descent[-1:]
+        alike = any(step.alike and step.mesh() is coarse for step in last)
+        parents = Parents(coarse, domain.mesh, parent_cell, exchange, alike)
         self.meshes = (*self.meshes, NestedMesh(finest.physics, domain, parents))
 
     @contextmanager

@@ -120,6 +120,7 @@ class Parents:
         fine: Mesh,
         cell: Int32Array | IndexArray,
         exchange: Exchange | None = None,
+        alike: bool = False,
     ):
         """Relate two nested meshes.
 
@@ -129,9 +130,11 @@ class Parents:
             cell: For each local fine cell the local coarse cell that holds it; or its row among
                 those that the exchange fetches.
             exchange: What fetches them from other ranks, if fine cells have moved.
+            alike: Whether coarse cells are known to be cut in the same way, see `Refinement`.
         """
         self.cell = cell
         self._coarse, self._fine, self._exchange = coarse, fine, exchange
+        self._alike = alike
 
     def take(
         self, values: npt.NDArray, nodes: Int32Array, cells: Int32Array | slice = slice(None)
@@ -198,8 +201,8 @@ class Parents:
     @cached_property
     def regular(self) -> bool:
         """Whether every coarse cell has its 2^d children in a row, on this rank."""
-        if self._exchange is not None:
-            return False
+        if self._exchange is not None or self._alike:
+            return self._alike
         topology = self._coarse.topology
         cells = topology.index_map(topology.dim).size_local
         children = 2**topology.dim
@@ -220,10 +223,12 @@ class Parents:
         nodes = compat.cell_nodes(fine)[: len(self.cell)]
         parents = compat.cell_nodes(coarse)
         if len(self.cell) > 0 and self.regular:
-            # Does the pattern of the first cell repeat? One coordinate of each vertex tells, in a
-            # direction where no two points of a cell are at the same place
             first = x_coarse[parents[:1].repeat(children, axis=0)]
             pattern = barycentric_coordinates(first, x[nodes[:children]])
+            if self._alike:
+                return pattern
+            # Does the pattern of the first cell repeat? One coordinate of each vertex tells, in a
+            # direction where no two points of a cell are at the same place
             theirs, own = (points @ _DIRECTION[: points.shape[1]] for points in (x_coarse, x))
             inner = theirs[parents[: len(nodes) // children]]
             deviation = max(

@@ -113,6 +113,21 @@ def made_again(mesh: dolfinx.mesh.Mesh) -> dolfinx.mesh.Mesh:
     )
 
 
+def test_cells_are_cut_alike(domain):
+    """The corners of child k have the same barycentric coordinates in every parent."""
+    fine, parent = refine(domain)
+    assert fine.descent[-1].alike
+    here, below = (
+        np.pad(d.mesh.geometry.x[:, :2], ((0, 0), (0, 1)), constant_values=1.0)[cell_nodes(d.mesh)]
+        for d in (fine, domain)
+    )
+    found = np.linalg.solve(below[parent].swapaxes(1, 2), here.swapaxes(1, 2)).swapaxes(1, 2)
+    each = found.reshape(-1, 4, 3, 3)
+    assert np.abs(each - each[:1]).max(initial=0.0) < 1e-12
+    marked, _ = refine_marked(domain, np.ones(len(parent) // 4, dtype=bool))
+    assert not marked.descent[-1].alike
+
+
 def test_refinement_keeps_the_domain(domain):
     before = geometry(domain)
     for level in range(1, 4):
