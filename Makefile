@@ -6,8 +6,8 @@ limit = timeout --kill-after=20 2400
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair coverage mutants ranks \
-    ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair quick-pair coverage \
+    mutants ranks ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -50,6 +50,10 @@ test-alone:
 
 test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
+
+# Of these what takes next to no time, or depends on how a mesh is shared out
+quick-pair:
+	$(run) $(limit) mpirun -n 2 python3 -m pytest -m 'ranks or not slow'
 
 # Branches of signorini_cr/ that no test takes, on one rank and on two together
 coverage:
