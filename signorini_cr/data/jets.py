@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cache, cached_property
+from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -286,34 +286,18 @@ class Enclosure:
             return self._compose(self(e), power_series(-1.0))
 
     def _jet(self, e: Any) -> Jet:
-        if isinstance(e, classes.ScalarValue | classes.Zero):
-            return self._constant(float(e))
-        if isinstance(e, fem.Constant) and e.ufl_shape == ():
-            return self._constant(float(e.value))
-        if isinstance(e, fem.Function):
-            return self._function(e)
-        if isinstance(e, classes.Indexed):
-            return self._component(*e.ufl_operands)
-        if isinstance(e, classes.Conditional):
-            return self._conditional(e)
-        if isinstance(e, classes.Power):
-            return self._power(*e.ufl_operands)
-        if isinstance(e, classes.Sqrt):
-            return self._number_power(e, 1.0)
-        if isinstance(e, classes.Atan2):
-            return self._atan2(*(self(operand) for operand in e.ufl_operands))
-        operands: Any = getattr(e, "ufl_operands", ())
-        if isinstance(e, classes.Abs) and self.boxes.corners is not None:
-            return self._size(operands[0])
-        for kind, series in SERIES.items():
-            if isinstance(e, kind):
-                return self._compose(self(operands[0]), series)
-        for kind, rule in _RULES.items():
-            if isinstance(e, kind):
-                return rule(self, *(self(operand) for operand in operands))
-        raise Unknown(type(e).__name__)
+        kind: type = type(e)
+        rule = _rule_for(kind)
+        if rule is None:
+            raise Unknown(kind.__name__)
+        return rule(self, e)
 
     # ---- what expressions begin with
+
+    def _given(self, e: Any) -> Jet:
+        if e.ufl_shape != ():
+            raise Unknown(type(e).__name__)
+        return self._constant(float(e.value))
 
     def _constant(self, value: float) -> Jet:
         return Jet(np.array(value), np.array(value))
@@ -544,12 +528,15 @@ class Enclosure:
         """All coefficients from the first order on."""
         return tuple(range(1, len(indices(self.boxes.variables, self.order))))
 
-    def _size(self, e: Any) -> Jet:
-        """Enclose |e| on simplices, where e may have one sign though it has both on the box."""
-        a = self(e)
+    def _absolute(self, e: Any) -> Jet:
+        """Enclose |a|; on simplices a may have one sign though it has both on the box."""
+        (operand,) = e.ufl_operands
+        a = self(operand)
+        if self.boxes.corners is None:
+            return self._compose(a, _abs)
         low, high, _ = self._difference(a, self._constant(0.0))
         if self.boxes.along is None and self.order >= 2:
-            low, high = self._by_slopes(low, high, e, classes.Zero())
+            low, high = self._by_slopes(low, high, operand, classes.Zero())
         above, below = low >= 0, high <= 0
         jet = self._choose(above, ~(above | below), a, Jet(-a.high, -a.low, -a.rest))
         return replace(jet, low=np.maximum(jet.low, 0.0))
@@ -968,23 +955,50 @@ _RULES: dict[type, Callable[..., Jet]] = {
     classes.Division: Enclosure._quotient,
     classes.MaxValue: Enclosure._maximum,
     classes.MinValue: Enclosure._minimum,
+    classes.Atan2: Enclosure._atan2,
     classes.Conj: lambda _, a: a,
     classes.Real: lambda _, a: a,
 }
+"""Jets of an operator's arguments are all that these take."""
+
+_Rule: TypeAlias = Callable[[Enclosure, Any], Jet]
+
+
+def _of_series(series: Callable[[Range], Sequence[Range]]) -> _Rule:
+    return lambda at, e: at._compose(at(e.ufl_operands[0]), series)
+
+
+def _of_jets(rule: Callable[..., Jet]) -> _Rule:
+    return lambda at, e: rule(at, *(at(operand) for operand in e.ufl_operands))
+
+
+_KINDS: dict[type, _Rule] = {
+    **{kind: _of_series(series) for kind, series in SERIES.items()},
+    **{kind: _of_jets(rule) for kind, rule in _RULES.items()},
+    classes.ScalarValue: lambda at, e: at._constant(float(e)),
+    classes.Zero: lambda at, e: at._constant(float(e)),
+    classes.Indexed: lambda at, e: at._component(*e.ufl_operands),
+    classes.Power: lambda at, e: at._power(*e.ufl_operands),
+    classes.Sqrt: lambda at, e: at._number_power(e, 1.0),
+    classes.Abs: Enclosure._absolute,
+    classes.Conditional: Enclosure._conditional,
+    fem.Constant: Enclosure._given,
+    fem.Function: Enclosure._function,
+}
+
+
+@cache
+def _rule_for(kind: type) -> _Rule | None:
+    """Find what encloses expressions of a kind; None for those that are not known here."""
+    return next((rule for known, rule in _KINDS.items() if issubclass(kind, known)), None)
+
 
 _KNOWN = (
-    *SERIES,
-    *_RULES,
+    *_KINDS,
     classes.ConstantValue,
-    classes.Conditional,
     classes.Condition,
-    classes.Power,
-    classes.Atan2,
-    classes.Indexed,
     classes.MultiIndex,
     classes.SpatialCoordinate,
-    fem.Constant,
-    fem.Function,
 )
 """What needs no lowering."""
 _ORDERED = (classes.GT, classes.GE, classes.LT, classes.LE)

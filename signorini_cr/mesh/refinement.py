@@ -450,20 +450,20 @@ def _neighbours(
     around = coarse.topology.connectivity(1, 2)
     start, first = around.offsets, around.array[around.offsets[:-1]]
     links = np.diff(start)
-    half_of = 2 * np.arange(_count(facet_map), dtype=np.int32)
-    half_of[owned:] += inner
     place = _everyones(coarse.topology.index_map(0))[corners] if together else corners
 
     of_cells: Int32Array = np.empty((cells, 4, 3), dtype=np.int32)
     of_cells[:, 3] = 2 * owned + 3 * c[:, None] + np.arange(3, dtype=np.int32)
     halves = np.empty(2 * len(around.array), dtype=np.int32)
     for j in range(3):
-        f = facets[:, j]
+        f, one, other = facets[:, j], (j + 1) % 3, (j + 2) % 3
+        half_0 = 2 * f + inner * (f >= owned)
         at = 2 * start[f] + (first[f] != c)  # where the first half lists this cell's child
-        for k in (j + 1) % 3, (j + 2) % 3:
-            half = (place[:, k] > place[:, _third(j, k)]).astype(np.int32)
-            of_cells[:, k, j] = half_of[f] + half
-            halves[at + half * links[f]] = 4 * c + k
+        step = links[f]
+        half = (place[:, one] > place[:, other]).astype(np.int32)
+        for k, here in (one, half), (other, 1 - half):
+            of_cells[:, k, j] = half_0 + here
+            halves[at + here * step] = 4 * c + k
         of_cells[:, j, j] = of_cells[:, 3, j]
 
     pairs = np.empty((cells, 3, 2), dtype=np.int32)

@@ -22,6 +22,7 @@ from signorini_cr.app.screen import wrapped
 from signorini_cr.app.statement import folded
 from signorini_cr.errors import NotConverged
 from signorini_cr.mesh import mshfile
+from signorini_cr.output import plots
 
 pytestmark = pytest.mark.slow
 
@@ -530,12 +531,18 @@ MESHES = {
 }
 
 
-def run(*argv: str | Path) -> tuple[int, str, str]:
-    """The command in this process, on all ranks: status, stdout and stderr of this rank."""
+def run(*argv: str | Path, drawn: bool = False) -> tuple[int, str, str]:
+    """The command in this process, on all ranks: status, stdout and stderr of this rank.
+
+    Without pictures, which take longest, unless they are asked for.
+    """
     with (
+        pytest.MonkeyPatch.context() as patch,
         contextlib.redirect_stdout(io.StringIO()) as out,
         contextlib.redirect_stderr(io.StringIO()) as err,
     ):
+        if not drawn:
+            patch.setattr(plots, "can_draw", lambda comm: False)
         status = cli.main([str(word) for word in argv])
     return status, out.getvalue(), err.getvalue()
 
@@ -868,7 +875,7 @@ def test_progress_is_for_terminals(write, monkeypatch) -> None:
 
 def test_check(write) -> None:
     path, out = write(CASE), Path("out")
-    status, text, err = run("check", path, "--out", out)
+    status, text, err = run("check", path, "--out", out, drawn=True)
     assert (status, err) == (0, "")
     if COMM.rank == 0:
         assert "case.toml: in order" in text
