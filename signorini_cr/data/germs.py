@@ -20,6 +20,7 @@ from dolfinx import fem
 from ufl import classes
 
 from ..arrays import BoolArray, FloatArray, IndexArray
+from ..fem.cells import at_points
 from .jets import SERIES, Boxes, Enclosure, Range, mul, out, power_series, square_of
 from .pointwise import Unknown
 
@@ -310,7 +311,7 @@ def allowance(
         if germ is None or 2 * germ[0] <= -d:
             continue
         power, largest = germ
-        points = np.einsum("cgn,cq->gqn", offset, hats)
+        points = at_points(offset, hats)
         nearest = np.linalg.norm(points, axis=0).min(axis=0) * (1 - NARROW)
         with np.errstate(divide="ignore"):
             most = largest * np.maximum(nearest**power, reach**power)

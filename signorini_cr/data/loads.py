@@ -11,7 +11,17 @@ from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick, poincare, sum_rows
+from ..fem.cells import (
+    BoundaryFacets,
+    Cells,
+    at_points,
+    blocks,
+    dot_rows,
+    measures,
+    pick,
+    poincare,
+    sum_rows,
+)
 from ..fem.space import facet_quadrature
 from .cutting import Cut, cut, refine
 from .jets import Boxes, Enclosure
@@ -119,7 +129,7 @@ class VolumeMoments:
         rule = f.plain
         values = f.deviation.values(cut.pieces, cells, rule.hats)
         weights = rule.weights[:, None] * cut.pieces.part
-        hats = np.einsum("chn,cq->hqn", cut.pieces.hats, rule.hats)
+        hats = at_points(cut.pieces.hats, rule.hats)
         bumps = np.stack([4.0 * np.delete(hats, i, axis=0).prod(axis=0) for i in range(len(hats))])
 
         def integral(integrand: FloatArray) -> FloatArray:
@@ -542,7 +552,7 @@ class Segments:
             facets,
             BoundaryFacets(facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]),
             at,
-            np.einsum("chn,qc->qhn", pieces.hats, hats),
+            at_points(pieces.hats, hats.T).swapaxes(0, 1),
             weights,
             measure,
             values,

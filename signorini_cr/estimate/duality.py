@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.loads import NOTHING, Segments, VolumeMoments, reacts, trace_of
 from ..data.moments import Coefficient
-from ..fem.cells import Cells, blocks, corner_points, dot_rows, pick, poincare, sum_rows
+from ..fem.cells import Cells, at_points, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bend_squares, on_facet
 from .flux import Flux, field_squares
 from .heights import distance
@@ -611,7 +611,7 @@ def _over_pieces(kappa: Coefficient, part: slice, integrals: Integrals) -> Float
     first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
     if first < last:
         pieces = cut.pieces[np.arange(first, last)]
-        hats = np.einsum("chn,cq->qhn", pieces.hats, rule.hats)
+        hats = at_points(pieces.hats, rule.hats).swapaxes(0, 1)
         known = cut.errors_inside[:, first:last], kappa.inside[:, first:last]
         there = integrals(pieces.parent, *known, hats) * pieces.part
         which, place = np.unique(pieces.parent - part.start, return_inverse=True)

@@ -57,6 +57,19 @@ def dot_rows(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
+def at_points(ends: FloatArray, hats: FloatArray) -> FloatArray:
+    """Evaluate what is affine on each of some simplices at the same points of all.
+
+    Args:
+        ends: Values at the vertices, shape (d + 1, …, n).
+        hats: Barycentric coordinates of the points, shape (d + 1, q).
+
+    Returns:
+        Shape (…, q, n).
+    """
+    return np.asarray(hats.T @ np.moveaxis(ends, 0, -2))
+
+
 def poincare(tdim: int) -> float:
     """Return C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
 

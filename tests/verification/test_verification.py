@@ -117,6 +117,7 @@ def test_quick_suite_passes(shared_tmp_path):
     assert len(re.findall(r"\| yes \|", text)) == 4 + 2 + len(manufactured.CLASSES) + 4
 
 
+@pytest.mark.serial
 def test_no_bound_is_below_the_error_however_loose():
     """Cases that are hard to be sharp on; the suite itself says how sharp the bounds are."""
     group = sharpness.sharpness(20, True)
