@@ -15,6 +15,7 @@ from signorini_cr import (
     Problem,
     Robin,
     Solution,
+    solve,
     solve_adaptive,
     solve_in_time,
     solve_levels,
@@ -65,6 +66,17 @@ PROBLEMS = {
 }
 
 
+COMPILED = Problem(
+    f=lambda x: -3.0 - ufl.bessel_J(0, 5.0 * x[0]),
+    g=lambda x: ufl.bessel_J(1, x[1]),
+    obstacle=lambda x: -0.2 + 0.1 * ufl.bessel_J(0, 4.0 * x[0]),
+    dirichlet=lambda x: 0.1 * ufl.bessel_J(1, x[0]),
+    coefficient=lambda x: 2.0 + ufl.bessel_J(0, x[0] * x[1]),
+    reaction=lambda x: 2.0 + ufl.bessel_J(0, x[1]),
+)
+"""What NumPy has no functions for; there is no certificate, by which meshes could be adapted."""
+
+
 def solved(
     kind: str, problem: Problem, comm: MPI.Comm, restart: Restart | None = None
 ) -> Iterator[Solution]:
@@ -105,6 +117,24 @@ def test_the_figures_are_those_of_one_rank(kind: str, name: str) -> None:
         restart = Restart.of(all_ranks, restart, kind == "adaptive")
     (again,) = solved(kind, PROBLEMS[name], COMM, COMM.bcast(restart))
     assert again.energy == pytest.approx(one.energy, rel=1e-8)
+
+
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_so_are_those_of_data_that_are_compiled(element: str) -> None:
+    """On a single cell, which all ranks but one are without."""
+    one, all_ranks = (
+        solve(
+            COMPILED,
+            Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]).mesh(
+                2**0.5, comm
+            ),
+            element,
+        )
+        for comm in (MPI.COMM_SELF, COMM)
+    )
+    assert one.cells == all_ranks.cells == 1
+    assert one.energy == pytest.approx(all_ranks.energy, rel=1e-8)
+    assert all_ranks.certificate.reason == one.certificate.reason is not None
 
 
 def in_time(comm: MPI.Comm, scheme: str) -> list[float]:

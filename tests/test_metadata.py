@@ -281,6 +281,7 @@ def test_workflows_call_what_exists():
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     stages = set(re.findall(r"SUITE=\w+ make ([\w-]+)", script))
     parts = {"test-alone", "test-pair", "quick-pair", "ranks-3", "ranks-4"}  # of these
+    assert stages - {"ranks-3", "ranks-4"} <= make
     assert "docs" in stages and stages - parts | {"test", "ranks"} <= called
     for template in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"):
         form = loaded(template.relative_to(ROOT))

@@ -294,7 +294,7 @@ class Enclosure:
 
     # ---- what expressions begin with
 
-    def _given(self, e: Any) -> Jet:
+    def _of_constant(self, e: Any) -> Jet:
         if e.ufl_shape != ():
             raise Unknown(type(e).__name__)
         return self._constant(float(e.value))
@@ -529,7 +529,7 @@ class Enclosure:
         return tuple(range(1, len(indices(self.boxes.variables, self.order))))
 
     def _absolute(self, e: Any) -> Jet:
-        """Enclose |a|; on simplices a may have one sign though it has both on the box."""
+        """Enclose an absolute value; on simplices there may be one sign where a box has both."""
         (operand,) = e.ufl_operands
         a = self(operand)
         if self.boxes.corners is None:
@@ -965,10 +965,12 @@ _Rule: TypeAlias = Callable[[Enclosure, Any], Jet]
 
 
 def _of_series(series: Callable[[Range], Sequence[Range]]) -> _Rule:
+    """Make the rule of a function of one argument from the ranges of its Taylor coefficients."""
     return lambda at, e: at._compose(at(e.ufl_operands[0]), series)
 
 
 def _of_jets(rule: Callable[..., Jet]) -> _Rule:
+    """Make the rule of an operator from what takes the jets of its arguments."""
     return lambda at, e: rule(at, *(at(operand) for operand in e.ufl_operands))
 
 
@@ -982,9 +984,11 @@ _KINDS: dict[type, _Rule] = {
     classes.Sqrt: lambda at, e: at._number_power(e, 1.0),
     classes.Abs: Enclosure._absolute,
     classes.Conditional: Enclosure._conditional,
-    fem.Constant: Enclosure._given,
+    fem.Constant: Enclosure._of_constant,
     fem.Function: Enclosure._function,
 }
+"""How expressions of each kind are enclosed. Roots and absolute values are more than their series;
+no other kinds are the same or include one another."""
 
 
 @cache

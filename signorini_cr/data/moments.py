@@ -68,7 +68,7 @@ class Rule:
 
 
 FEW = 1 << 14
-"""At so many points NumPy has evaluated a formula before a compiler has begun."""
+"""At so many points, on all ranks, NumPy has evaluated a formula before a compiler has begun."""
 
 
 class Volume:
@@ -91,7 +91,9 @@ class Volume:
         if found is None:
             which = np.arange(cells.number, dtype=np.int32)
             values = compat.bound(self._compiled, cells.domain.own)
-            found = values.eval(cells.domain.mesh, which).reshape(cells.number, -1)
+            found = values.eval(cells.domain.mesh, which).reshape(
+                cells.number, len(self.rule.weights)
+            )
         self.deviation.off_null_sets(found.T, None, cells, self.rule.hats)
         return found
 

@@ -133,7 +133,10 @@ def by_operators(expression: Any, leaf: Callable[[Any], Any]) -> Any:
 
     Args:
         expression: A lowered scalar.
-        leaf: Gives the values of all else that is in it.
+        leaf: Gives the values of all else that is in it; it may raise Unknown.
+
+    Returns:
+        Values of the shape that NumPy makes of those of the leaves.
     """
     known: dict[Any, Any] = {}
     stack = [expression]  # rather than calls within one another: it may be deep

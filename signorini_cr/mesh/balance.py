@@ -54,7 +54,7 @@ def balance(domain: Domain, parent: Int32Array) -> Refined:
     parents = Exchange(comm, rank, known[:, 0])
     tags = tagged(mesh, known[:, 1:])
     *before_it, last = domain.descent
-    descent = (*before_it, last._replace(parent=parents.place, exchange=parents, alike=False))
+    descent = (*before_it, last._replace(parent=parents.place, exchange=parents))
     moved = Domain(mesh, tags, parts=domain.parts, materials=materials, descent=descent)
     return moved, parents.place, parents
 

@@ -62,13 +62,15 @@ class Refinement(NamedTuple):
         mesh: The coarse one, as long as anyone else needs it.
         parent: Row of the coarse cell that holds each cell, shape (cells,).
         exchange: What fetches these rows from other ranks, if cells have moved.
-        alike: Whether all cells were cut in the same way, and their children follow one another.
+        pattern: Barycentric coordinates in its parent of the corners of each child, shape
+            (children, d + 1, d + 1), where all cells are known to have been cut in the same way,
+            the children of each in a row.
     """
 
     mesh: weakref.ref[Mesh]
     parent: Int32Array | IndexArray
     exchange: Exchange | None = None
-    alike: bool = False
+    pattern: FloatArray | None = None
 
     def carry(self, values: npt.NDArray) -> npt.NDArray:
         """Give the fine cells what their parents have, of the coarse cells in order; collective."""

@@ -17,9 +17,19 @@ from dolfinx.mesh import refine as split
 from mpi4py import MPI
 
 from .. import compat
-from ..arrays import Int32Array, Int64Array
+from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError
 from .domain import Domain, Refinement
+
+SIMILAR: FloatArray = np.array(
+    [
+        [[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5]],
+        [[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.5, 0.5]],
+        [[0.5, 0.0, 0.5], [0.0, 0.5, 0.5], [0.0, 0.0, 1.0]],
+        [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]],
+    ]
+)
+"""The corners of the four children that `refine` makes, see there; as `Refinement.pattern`."""
 
 
 def refine(domain: Domain) -> tuple[Domain, Int32Array]:
@@ -76,7 +86,7 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
     tags = _child_tags(domain, fine, facets)
-    return _child(domain, fine, tags, parent, alike=True), parent
+    return _child(domain, fine, tags, parent, SIMILAR), parent
 
 
 def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, Int32Array]:
@@ -160,11 +170,15 @@ def tagged(mesh: Mesh, label: Int32Array) -> MeshTags:
 
 
 def _child(
-    domain: Domain, fine: Mesh, tags: MeshTags, parent: Int32Array, alike: bool = False
+    domain: Domain,
+    fine: Mesh,
+    tags: MeshTags,
+    parent: Int32Array,
+    pattern: FloatArray | None = None,
 ) -> Domain:
     """Make the fine domain: its cells consist of what their parents do."""
     materials = domain.materials.of_children(parent)
-    step = Refinement(weakref.ref(domain.mesh), parent, alike=alike)
+    step = Refinement(weakref.ref(domain.mesh), parent, pattern=pattern)
     descent = (*domain.descent, step)
     return Domain(fine, tags, parts=domain.parts, materials=materials, descent=descent)
 
@@ -457,13 +471,13 @@ def _neighbours(
     halves = np.empty(2 * len(around.array), dtype=np.int32)
     for j in range(3):
         f, one, other = facets[:, j], (j + 1) % 3, (j + 2) % 3
-        half_0 = 2 * f + inner * (f >= owned)
+        half_0 = 2 * f + np.int32(inner) * (f >= owned)
         at = 2 * start[f] + (first[f] != c)  # where the first half lists this cell's child
-        step = links[f]
+        beside = links[f]
         half = (place[:, one] > place[:, other]).astype(np.int32)
         for k, here in (one, half), (other, 1 - half):
             of_cells[:, k, j] = half_0 + here
-            halves[at + here * step] = 4 * c + k
+            halves[at + here * beside] = 4 * c + k
         of_cells[:, j, j] = of_cells[:, 3, j]
 
     pairs = np.empty((cells, 3, 2), dtype=np.int32)

@@ -108,14 +108,16 @@ class Hierarchy:
         """Add a mesh.
 
         Args:
-            domain: The mesh, whose cells lie in those of the finest so far, and boundary parts.
+            domain: The mesh, whose cells lie in those of the finest so far, and boundary parts;
+                the last step of its descent knows whether the same pattern is in all of them.
             parent_cell: For each local cell the coarse cell that holds it, as for `Parents`.
             exchange: The same.
         """
         finest = self.meshes[-1]
-        coarse, last = finest.domain.mesh, domain.descent[-1:]
-        alike = any(step.alike and step.mesh() is coarse for step in last)
-        parents = Parents(coarse, domain.mesh, parent_cell, exchange, alike)
+        coarse, pattern = finest.domain.mesh, None
+        if domain.descent and domain.descent[-1].mesh() is coarse:
+            pattern = domain.descent[-1].pattern
+        parents = Parents(coarse, domain.mesh, parent_cell, exchange, pattern)
         self.meshes = (*self.meshes, NestedMesh(finest.physics, domain, parents))
 
     @contextmanager

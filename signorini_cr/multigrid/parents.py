@@ -1,7 +1,8 @@
 """Fine cells in their parents: the parents' shape functions at the fine dofs.
 
-All that is known of two nested meshes is the coarse cell that each fine cell lies in. On regular
-refinements the same pattern repeats in every parent, and one copy of it does for all.
+All that need be known of two nested meshes is the coarse cell that each fine cell lies in. On
+regular refinements the same pattern repeats in every parent, and one copy of it does for all; of
+those that we make it is known beforehand.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ class Parents:
         fine: Mesh,
         cell: Int32Array | IndexArray,
         exchange: Exchange | None = None,
-        alike: bool = False,
+        pattern: FloatArray | None = None,
     ):
         """Relate two nested meshes.
 
@@ -130,11 +131,11 @@ class Parents:
             cell: For each local fine cell the local coarse cell that holds it; or its row among
                 those that the exchange fetches.
             exchange: What fetches them from other ranks, if fine cells have moved.
-            alike: Whether coarse cells are known to be cut in the same way, see `Refinement`.
+            pattern: The same in every parent, if that is known, see `Refinement`.
         """
         self.cell = cell
         self._coarse, self._fine, self._exchange = coarse, fine, exchange
-        self._alike = alike
+        self._pattern = None if exchange is not None else pattern
 
     def take(
         self, values: npt.NDArray, nodes: Int32Array, cells: Int32Array | slice = slice(None)
@@ -201,8 +202,8 @@ class Parents:
     @cached_property
     def regular(self) -> bool:
         """Whether every coarse cell has its 2^d children in a row, on this rank."""
-        if self._exchange is not None or self._alike:
-            return self._alike
+        if self._exchange is not None or self._pattern is not None:
+            return self._exchange is None
         topology = self._coarse.topology
         cells = topology.index_map(topology.dim).size_local
         children = 2**topology.dim
@@ -223,12 +224,12 @@ class Parents:
         nodes = compat.cell_nodes(fine)[: len(self.cell)]
         parents = compat.cell_nodes(coarse)
         if len(self.cell) > 0 and self.regular:
-            first = x_coarse[parents[:1].repeat(children, axis=0)]
-            pattern = barycentric_coordinates(first, x[nodes[:children]])
-            if self._alike:
-                return pattern
+            if self._pattern is not None:
+                return self._pattern
             # Does the pattern of the first cell repeat? One coordinate of each vertex tells, in a
             # direction where no two points of a cell are at the same place
+            first = x_coarse[parents[:1].repeat(children, axis=0)]
+            pattern = barycentric_coordinates(first, x[nodes[:children]])
             theirs, own = (points @ _DIRECTION[: points.shape[1]] for points in (x_coarse, x))
             inner = theirs[parents[: len(nodes) // children]]
             deviation = max(

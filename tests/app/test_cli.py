@@ -534,7 +534,7 @@ MESHES = {
 def run(*argv: str | Path, drawn: bool = False) -> tuple[int, str, str]:
     """The command in this process, on all ranks: status, stdout and stderr of this rank.
 
-    Without pictures, which take longest, unless they are asked for.
+    Without pictures, which take longest, unless they are asked for: as without Matplotlib.
     """
     with (
         pytest.MonkeyPatch.context() as patch,
@@ -889,7 +889,8 @@ def test_check(write) -> None:
 def test_the_deck(shared_tmp_path: Path) -> None:
     """Two materials, two ducts: heat is needed, but not above them."""
     out = shared_tmp_path / "out"
-    status, text, err = run("solve", helpers.MESHES / "deck.toml", "--out", out, "--levels", "2")
+    words = "solve", helpers.MESHES / "deck.toml", "--out", out, "--levels", "2"
+    status, text, err = run(*words, drawn=True)
     assert (status, err) == (0, "")
     if COMM.rank > 0:
         return

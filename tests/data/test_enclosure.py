@@ -12,6 +12,7 @@ from mpi4py import MPI
 from signorini_cr import Polygon, Problem, exact, solve
 from signorini_cr.app import expressions
 from signorini_cr.compat import cell_nodes
+from signorini_cr.data import jets
 from signorini_cr.data.balls import indices
 from signorini_cr.data.jets import Boxes, Enclosure, lowered, values
 from signorini_cr.data.pieces import Pieces
@@ -452,3 +453,12 @@ def test_angles_hold_on_triangles_beside_their_cut(side):
         assert np.all((jet.low <= angle) & (angle <= jet.high))
         if flat[0].max() < -0.1:  # one-sided
             assert jet.high - jet.low < np.pi
+
+
+@pytest.mark.serial
+def test_one_rule_for_each_kind_of_expression():
+    """What kinds include one another would hang on their order."""
+    known = [kind for kind in jets._KINDS if kind is not fem.Function and kind is not fem.Constant]
+    every = [kind for kind in vars(ufl.classes).values() if isinstance(kind, type)]
+    for each in every:
+        assert sum(issubclass(each, kind) for kind in known) <= 1, each

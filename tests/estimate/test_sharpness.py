@@ -2,7 +2,7 @@
 
 The errors are integrated here, by Gauss's rule on squares that are mapped to the cells, with the
 solutions' gradients written down by hand; at a singular point the rule is graded. That figures are
-the same on any number of ranks test_sharpness_pinned.py shows, on problems that reach every term.
+the same on one rank and on two test_sharpness_pinned.py shows, on problems that reach every term.
 """
 
 from functools import partial

@@ -24,11 +24,15 @@ def test_extents(first):
 
 
 @pytest.mark.parametrize("shape", [(), (2,)])
-def test_affine_functions_at_points(shape):
-    """Values at the middles of edges and inside, from those at the vertices, simplex by simplex."""
-    hats = np.array([[0.5, 0.5, 0.0, 0.2], [0.5, 0.0, 0.5, 0.3], [0.0, 0.5, 0.5, 0.5]])
-    ends = np.random.default_rng(0).standard_normal((3, *shape, 5))
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("n", [0, 5])
+def test_affine_functions_at_points(shape, d, n):
+    """Weighted sums of the values at the vertices, simplex by simplex."""
+    rng = np.random.default_rng(0)
+    hats = rng.dirichlet(np.ones(d + 1), 4).T
+    ends = rng.standard_normal((d + 1, *shape, n))
     found = at_points(ends, hats)
-    assert found.shape == (*shape, 4, 5)
-    for q, (a, b, c) in enumerate(hats.T):
-        assert np.allclose(found[..., q, :], a * ends[0] + b * ends[1] + c * ends[2], atol=1e-15)
+    assert found.shape == (*shape, 4, n)
+    for q, weights in enumerate(hats.T):
+        expected = sum(weight * end for weight, end in zip(weights, ends, strict=True))
+        assert np.allclose(found[..., q, :], expected, atol=1e-15)

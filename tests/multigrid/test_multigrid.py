@@ -24,7 +24,7 @@ from signorini_cr import NotConverged, Polygon, Problem, exact, garbage, solve, 
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.space import function_space, ghosted_vector
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
-from signorini_cr.mesh.refinement import refine, refine_marked
+from signorini_cr.mesh.refinement import SIMILAR, refine, refine_marked
 from signorini_cr.multigrid import bottom
 from signorini_cr.multigrid.constrained import ConstrainedMatrix
 from signorini_cr.multigrid.cycle import Grid, Multigrid, is_galerkin_product
@@ -73,6 +73,11 @@ def refined(domain, pattern):
     return refine_marked(domain, np.arange(0, cells, 3, dtype=np.int32))
 
 
+def related(coarse, fine, parent_cell):
+    """As a hierarchy does it, which knows of the pattern where there is one."""
+    return Parents(coarse.mesh, fine.mesh, parent_cell, pattern=fine.descent[-1].pattern)
+
+
 def vector(V, array):
     return ghosted_vector(V, array.copy())
 
@@ -94,7 +99,7 @@ def test_affine_functions_are_prolonged_exactly(element, pattern):
     u, v = (fem.Function(function_space(d.mesh, element)) for d in (coarse, fine))
     for function in (u, v):
         function.interpolate(affine)
-    parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+    parents = related(coarse, fine, parent_cell)
     result = prolongate(u, v.function_space, parents)
     assert difference(result, v.x.array) < 1e-12
 
@@ -111,8 +116,18 @@ def test_children_in_a_row_need_not_repeat(seed):
     u, v = (fem.Function(function_space(d.mesh)) for d in (coarse, fine))
     for function in (u, v):
         function.interpolate(affine)
-    parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+    parents = related(coarse, fine, parent_cell)
     assert difference(prolongate(u, v.function_space, parents), v.x.array) < 1e-12
+
+
+def test_a_hierarchy_knows_how_cells_were_cut():
+    """What it knows is what a search among the cells finds."""
+    *_, last = solve_levels(exact.S1.problem, exact.S1.structured(4), 2)
+    parents = last.level.parents
+    assert parents.barycentric is SIMILAR
+    coarse = last.level.meshes[0].domain.mesh
+    found = Parents(coarse, last.domain.mesh, parents.cell).barycentric
+    assert found.shape == SIMILAR.shape and np.abs(found - SIMILAR).max() < 1e-14
 
 
 def averaging(coarse, fine, parents):
@@ -138,7 +153,7 @@ def test_prolongation_is_its_matrix(element, pattern, size):
     coarse = (CROOKED if size < 1.0 else TRIANGLE).mesh(size)
     fine, parent_cell = refined(coarse, pattern)
     V, W = (function_space(d.mesh, element) for d in (coarse, fine))
-    parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+    parents = related(coarse, fine, parent_cell)
     spaces = Layout.of_space(V), Layout.of_space(W), parents
     matrix = averaging(*spaces) if element == "CR" else prolongation(*spaces).matrix()
     u = fem.Function(V)
@@ -161,7 +176,7 @@ def test_transfers_are_their_matrices(element, pattern, size):
         p1, dofs = Layout.of_p1(fine.mesh), Layout.of_space(function_space(fine.mesh))
         transfer = inclusion(p1, dofs)
     else:
-        parents = Parents(coarse.mesh, fine.mesh, parent_cell)
+        parents = related(coarse, fine, parent_cell)
         p1, dofs = Layout.of_p1(coarse.mesh), Layout.of_space(function_space(fine.mesh, element))
         transfer = prolongation(p1, dofs, parents)
     matrix = transfer.matrix()
