@@ -38,6 +38,7 @@ from signorini_cr import (
 from signorini_cr.compat import cell_nodes
 from signorini_cr.estimate.functional import Functional, Masses
 from signorini_cr.fem.cells import BoundaryFacets, Cells
+from signorini_cr.output import plots
 
 ROOT = Path(__file__).parent.parent
 DEMOS = ROOT / "demos"
@@ -138,6 +139,11 @@ def strip(
     domain = Polygon(STRIP, SIDES, names=SIDES).mesh(size)
     named = dict(zip(SIDES, conditions, strict=True))
     return solve_levels(Problem(conditions=named, **data), domain, levels)
+
+
+def undrawn(patch: pytest.MonkeyPatch) -> None:
+    """Have runs in this process draw no pictures, which take longest: as without Matplotlib."""
+    patch.setattr(plots, "can_draw", lambda comm: False)
 
 
 def is_picture(path: Path) -> bool:

@@ -27,6 +27,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.ranks]
 
 COMM = MPI.COMM_WORLD
 PLAIN = Problem(f=-3.0, obstacle=-0.2)
+VERTICES, LABELS = [[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]
+TRIANGLE = Polygon(VERTICES, LABELS)
 
 
 def tensor(x: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
@@ -81,11 +83,8 @@ def solved(
     kind: str, problem: Problem, comm: MPI.Comm, restart: Restart | None = None
 ) -> Iterator[Solution]:
     """On a triangle, which gmsh cuts into two."""
-    labels = ["contact", "dirichlet", "neumann"]
     materials = {"soft": np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])}
-    polygon = Polygon(
-        [[0, 0], [1, 0], [0, 1]], labels, materials=materials if problem.materials else {}
-    )
+    polygon = Polygon(VERTICES, LABELS, materials=materials) if problem.materials else TRIANGLE
     domain = polygon.mesh(1.0, comm)
     if kind == "adaptive":
         return solve_adaptive(problem, domain, levels=5, restart=restart)
@@ -123,14 +122,7 @@ def test_the_figures_are_those_of_one_rank(kind: str, name: str) -> None:
 def test_so_are_those_of_data_that_are_compiled(element: str) -> None:
     """On a single cell, which all ranks but one are without."""
     one, all_ranks = (
-        solve(
-            COMPILED,
-            Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]).mesh(
-                2**0.5, comm
-            ),
-            element,
-        )
-        for comm in (MPI.COMM_SELF, COMM)
+        solve(COMPILED, TRIANGLE.mesh(2**0.5, comm), element) for comm in (MPI.COMM_SELF, COMM)
     )
     assert one.cells == all_ranks.cells == 1
     assert one.energy == pytest.approx(all_ranks.energy, rel=1e-8)
@@ -138,8 +130,9 @@ def test_so_are_those_of_data_that_are_compiled(element: str) -> None:
 
 
 def in_time(comm: MPI.Comm, scheme: str) -> list[float]:
-    domain = Polygon([[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]).mesh(1.0, comm)
-    steps = solve_in_time(PLAIN, domain, end=1.0, steps=3, scheme=scheme, levels=2)
+    steps = solve_in_time(
+        PLAIN, TRIANGLE.mesh(1.0, comm), end=1.0, steps=3, scheme=scheme, levels=2
+    )
     return [solution.energy for _, solution in steps]
 
 

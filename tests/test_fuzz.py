@@ -28,7 +28,7 @@ import basix.ufl
 import numpy as np
 import pytest
 import ufl
-from helpers import MESHES
+from helpers import MESHES, undrawn
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
@@ -36,7 +36,6 @@ from mpi4py import MPI
 from signorini_cr.app import cli, problemfile
 from signorini_cr.app.expressions import parse
 from signorini_cr.errors import InputError, NotConverged
-from signorini_cr.output import plots
 
 pytestmark = pytest.mark.serial
 few = settings(
@@ -387,7 +386,7 @@ def solve_file(path: Path) -> None:
     """The command ends as it should, with words where it has no results; nothing is drawn."""
     out, said = Path(scratch().name) / "out", io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(said):
-        patch.setattr(plots, "can_draw", lambda comm: False)
+        undrawn(patch)
         status = cli.main(["solve", str(path), "--levels", "1", "--out", str(out), "-q"])
     assert status in (cli.DONE, cli.BAD_INPUT, cli.NOT_CONVERGED), said.getvalue()
     assert "Traceback" not in said.getvalue()

@@ -231,10 +231,9 @@ class _Reader:
             return part
         if isinstance(node, classes.Variable):
             return operands[0]
-        if node.ufl_shape == ():
-            for kind, rule in _RULES.items():
-                if isinstance(node, kind):
-                    return rule(*operands)
+        rule = _RULES.get(type(node))
+        if node.ufl_shape == () and rule is not None:
+            return rule(*operands)
         raise Unknown(type(node).__name__)
 
     def _function(self, function: fem.Function) -> Any:

@@ -135,7 +135,7 @@ class Parents:
         """
         self.cell = cell
         self._coarse, self._fine, self._exchange = coarse, fine, exchange
-        self._pattern = None if exchange is not None else pattern
+        self._pattern = pattern
 
     def take(
         self, values: npt.NDArray, nodes: Int32Array, cells: Int32Array | slice = slice(None)
@@ -202,8 +202,10 @@ class Parents:
     @cached_property
     def regular(self) -> bool:
         """Whether every coarse cell has its 2^d children in a row, on this rank."""
-        if self._exchange is not None or self._pattern is not None:
-            return self._exchange is None
+        if self._exchange is not None:
+            return False
+        if self._pattern is not None:
+            return True
         topology = self._coarse.topology
         cells = topology.index_map(topology.dim).size_local
         children = 2**topology.dim

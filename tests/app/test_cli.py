@@ -22,7 +22,6 @@ from signorini_cr.app.screen import wrapped
 from signorini_cr.app.statement import folded
 from signorini_cr.errors import NotConverged
 from signorini_cr.mesh import mshfile
-from signorini_cr.output import plots
 
 pytestmark = pytest.mark.slow
 
@@ -534,7 +533,7 @@ MESHES = {
 def run(*argv: str | Path, drawn: bool = False) -> tuple[int, str, str]:
     """The command in this process, on all ranks: status, stdout and stderr of this rank.
 
-    Without pictures, which take longest, unless they are asked for: as without Matplotlib.
+    Without pictures, unless they are asked for.
     """
     with (
         pytest.MonkeyPatch.context() as patch,
@@ -542,7 +541,7 @@ def run(*argv: str | Path, drawn: bool = False) -> tuple[int, str, str]:
         contextlib.redirect_stderr(io.StringIO()) as err,
     ):
         if not drawn:
-            patch.setattr(plots, "can_draw", lambda comm: False)
+            helpers.undrawn(patch)
         status = cli.main([str(word) for word in argv])
     return status, out.getvalue(), err.getvalue()
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from signorini_cr import Domain, Polygon, Problem, limits, memory, solve_adaptive, solve_levels
 from signorini_cr.app import cli
 from signorini_cr.errors import InputError, NotConverged
-from signorini_cr.output import checkpoint, plots
+from signorini_cr.output import checkpoint
 from signorini_cr.restart import Restart
 
 pytestmark = pytest.mark.slow
@@ -44,7 +44,7 @@ def rectangle(size: float) -> Domain:
 def case(shared_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Write case.toml into the folder of the test, which is the current one."""
     monkeypatch.chdir(shared_tmp_path)
-    monkeypatch.setattr(plots, "can_draw", lambda comm: False)  # which takes longest
+    helpers.undrawn(monkeypatch)
 
     def write(mode: str = "uniform", old: str = "", new: str = "") -> None:
         if COMM.rank == 0:

@@ -22,7 +22,6 @@ from signorini_cr.app import cli, timerun
 from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
-from signorini_cr.output import plots
 from signorini_cr.output.meanings import REPORT, STEP
 from signorini_cr.output.series import is_kept
 
@@ -65,8 +64,8 @@ def case(shared_tmp_path):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Without pictures, which take most of the time that a run on few cells takes."""
-    monkeypatch.setattr(plots, "can_draw", lambda comm: False)
+    """Without pictures."""
+    helpers.undrawn(monkeypatch)
 
 
 def in_scheme(scheme):
@@ -89,7 +88,7 @@ def whole(tmp_path_factory):
             path.write_text(in_scheme(scheme), encoding="utf-8")
         with pytest.MonkeyPatch.context() as patch:
             if scheme != "bdf2":
-                patch.setattr(plots, "can_draw", lambda comm: False)
+                helpers.undrawn(patch)
             assert solved(path, path.parent / "out") == 0
         return path.parent / "out"
 
@@ -278,7 +277,7 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
     path, whole, draws = case(in_scheme(scheme)), whole(scheme), (scheme, after) == ("bdf2", 2)
     out = shared_tmp_path / "out"
     if not draws:
-        monkeypatch.setattr(plots, "can_draw", lambda comm: False)
+        helpers.undrawn(monkeypatch)
     with monkeypatch.context() as patch:
         original, begin = evolution.Solver.solve, timerun.Steps._solve_on
         left = [math.inf]  # until the mesh is found
@@ -476,7 +475,7 @@ def test_a_mesh_that_does_not_fit_leaves_the_one_below(
     assert solved(case(LIMITED), out, "--resume") == 3  # the reason is the same as before
     assert not report_in(out)["complete"]
     monkeypatch.undo()
-    monkeypatch.setattr(plots, "can_draw", lambda comm: False)
+    helpers.undrawn(monkeypatch)
     limited = LIMITED + "max_dofs = 300\n"
     whole = shared_tmp_path / "whole"
     assert solved(case(limited), whole) == 0
