@@ -31,6 +31,7 @@ from dolfinx import jit
 from ffcx.codegeneration import jit as ffcx_jit
 from mpi4py import MPI
 
+from . import temporary
 from .errors import InputError, on_root
 
 T = TypeVar("T")
@@ -39,8 +40,6 @@ Loaded: TypeAlias = tuple[list[Any], ModuleType]
 
 ABANDONED = 60.0
 """Seconds without a change from which on a source file without mark belongs to nobody."""
-ROOM = 2_000_000
-"""Bytes that compiling a form takes, at most."""
 OWN = "signorini-cr-forms-"
 """What the names of temporary folders begin with; the number of their process follows."""
 
@@ -102,10 +101,16 @@ def _moved(comm: MPI.Comm) -> bool:
     folder = _elsewhere or str(jit.get_options()["cache_dir"])
 
     def move() -> tuple[str, str] | None:
-        fault = _fault(Path(folder))
-        if fault is None:
-            return None
-        words = f"compiled forms cannot be kept in {folder} ({fault})"
+        found = _fault(Path(folder))
+        if found is None:
+            place = tempfile.gettempdir()
+            if (found := temporary.fault(place)) is None:
+                return None
+            raise InputError(
+                f"forms cannot be compiled: the folder for temporary files, {place}, cannot be"
+                f" written to ({found}); TMPDIR may name another"
+            )
+        words = f"compiled forms cannot be kept in {folder} ({found})"
         try:
             if _elsewhere is None:
                 return _own_folder(), words
@@ -125,12 +130,9 @@ def _fault(folder: Path) -> str | None:
     """Say in words what keeps us from writing into a folder."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(bytes(ROOM))
-            file.flush()
     except OSError as error:
         return error.strerror or str(error)
-    return None
+    return temporary.fault(folder)
 
 
 def _own_folder() -> str:

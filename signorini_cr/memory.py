@@ -16,6 +16,8 @@ CGROUPS = Path("/sys/fs/cgroup")
 
 LEAST = 4e8
 """Bytes of address space; libraries that are loaded with less end the process in many ways."""
+FEWEST = 64
+"""Files open at a time. MPI, which would end the process, takes 24 for itself and two ranks."""
 
 _PETSC_ERR_MEM = 55
 _WORDS = (
@@ -45,7 +47,10 @@ def ran_out_of_memory(error: BaseException | None) -> bool:
 
 
 def too_little() -> str | None:
-    """Say so where ``ulimit -v`` leaves no room for MPI, PETSc and DOLFINx."""
+    """Say so where ``ulimit`` leaves no room for MPI, PETSc and DOLFINx."""
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if files != resource.RLIM_INFINITY and files < FEWEST:
+        return f"ulimit -n allows {files} open files, and {FEWEST} are needed"
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY or limit >= LEAST:
         return None

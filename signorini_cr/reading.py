@@ -8,6 +8,18 @@ from pathlib import Path
 from .errors import InputError
 
 
+def insist_on_end(path: Path) -> None:
+    """Refuse what may be without an end, before it is opened, which alone may take for ever.
+
+    Raises:
+        OSError: The system does not tell.
+        InputError: It is a device or a pipe.
+    """
+    kind = path.stat().st_mode
+    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+        raise InputError("this is a device or a pipe; a file is needed")
+
+
 def read_regular(path: Path, most: int) -> bytes:
     """Read what a file holds that has an end; not a pipe, a terminal or /dev/zero.
 
@@ -19,9 +31,7 @@ def read_regular(path: Path, most: int) -> bytes:
         OSError: The system refuses to read it.
         InputError: It is no such file, or has more.
     """
-    kind = path.stat().st_mode  # looked at before it is opened, which may never end
-    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
-        raise InputError("this is a device or a pipe; a file is needed")
+    insist_on_end(path)
     with path.open("rb") as file:
         data = file.read(most + 1)
     if len(data) > most:

@@ -180,6 +180,15 @@ def test_where_forms_cannot_be_kept_they_are_compiled_all_the_same(
         make(5.0)
 
 
+def test_where_the_compiler_has_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It keeps files elsewhere while it is at work."""
+    monkeypatch.setenv("TMPDIR", "/proc/x")
+    monkeypatch.setattr("tempfile.tempdir", "/proc/x")
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(InputError, match=r"files, /proc/x, cannot be written to .*TMPDIR may name"):
+        make(7.25)
+
+
 @pytest.mark.serial
 def test_temporary_folders_of_runs_that_were_killed_go(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

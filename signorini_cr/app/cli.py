@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from .. import temporary
 from ..memory import ran_out_of_memory, too_little
 from .commandline import (
     UsageError,
@@ -81,12 +82,19 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         screen.complain(f"{args.file}: {complaint}")
         return NOT_CONVERGED
     try:
+        elsewhere = temporary.choose()
+    except OSError as error:
+        screen.complain(str(error))
+        return BAD_INPUT
+    try:
         start_petsc(args.petsc)
         from mpi4py import MPI
 
         comm = MPI.COMM_WORLD
         screen.root = comm.rank == 0
         screen.quiet, screen.verbose = args.quiet, getattr(args, "verbose", False)
+        if elsewhere is not None:
+            screen.warn(elsewhere)
         if (complaint := left_alone(comm.size)) is not None:
             screen.complain(complaint)
             return BAD_INPUT

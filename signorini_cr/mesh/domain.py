@@ -35,7 +35,7 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array
-from ..compat import coordinate_map
+from ..compat import cell_nodes, coordinate_map
 from ..errors import InputError, insist_on_kind, naming, on_root, raise_together
 from ..garbage import watch
 from ..rounding import counted
@@ -45,6 +45,7 @@ from .materials import Materials
 from .materials import numbered as numbered_materials
 from .partition import by_position
 from .polygon import check_labels, check_loops, circle, coordinates, cut
+from .thin import too_thin
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
@@ -421,7 +422,7 @@ def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
         return f"the mesh has coordinates of type {mesh.geometry.x.dtype}: float64 is needed"
     if facet_tags.dim != tdim - 1:
         return f"the tags have dimension {facet_tags.dim}: facets have dimension {tdim - 1}"
-    return None
+    return too_thin(mesh.geometry.x[cell_nodes(mesh), :tdim])
 
 
 @dataclass(frozen=True, eq=False)

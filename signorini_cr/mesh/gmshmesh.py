@@ -22,6 +22,7 @@ from . import mshfile
 from .lines import arranged, sorted_out
 from .mshfile import KINDS, MshFile
 from .planar import overlap, pieces
+from .thin import too_thin
 
 _MOST_TRIANGLES = 2e7
 _MOST_FACETS = 1e5  # on the boundary
@@ -145,6 +146,8 @@ def triangulate(
             np.concatenate(found),
             np.repeat(labels, [len(ends) for ends in found]),
         )
+    if (narrow := too_thin(raw.points[raw.triangles])) is not None:
+        raise InputError(f"the polygon is too narrow, or its edges are too different: {narrow}")
     raw = raw._replace(points=raw.points + away)
     if not polygons:
         return raw
@@ -450,12 +453,8 @@ def _check_cells(file: MshFile) -> None:
 
 def _check_facets(raw: Triangulation, names: Mapping[int, str]) -> None:
     """Insist on labels of exterior facets, one each, and on triangles side by side."""
-    u, v = np.diff(raw.points[raw.triangles], axis=1).swapaxes(0, 1)
-    area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-    flat = np.flatnonzero(~(area > 1e-14 * ((u**2).sum(axis=1) + (v**2).sum(axis=1))))
-    if len(flat):
-        x, y = raw.points[raw.triangles[flat[0], 0]]
-        raise InputError(f"the triangle at ({x:g}, {y:g}) has no area")
+    if (found := too_thin(raw.points[raw.triangles])) is not None:
+        raise InputError(found)
     of_cells = _key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]], len(raw.points))
     keys, sides, count = np.unique(of_cells, return_inverse=True, return_counts=True)
     sides = sides.reshape(of_cells.shape)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError, on_root
+from ..reading import insist_on_end
 from ..restart import Restart
 from .files import disk_errors
 
@@ -87,6 +89,9 @@ def read_arrays(path: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
+        insist_on_end(path)
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is no archive")
         with np.load(path) as file:
             arrays = dict(file)
         if not np.array_equal(arrays.pop("sum"), _sum(arrays)):

@@ -121,6 +121,52 @@ def test_where_memory_ends_at_the_beginning_one_message_tells(most: int, tmp_pat
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("most", [20, 40])
+def test_where_few_files_may_be_open_one_message_tells(most: int, tmp_path: Path) -> None:
+    """`ulimit -n`, before MPI ends the process."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    (tmp_path / "run.py").write_text(
+        f"import resource, sys\nresource.setrlimit(resource.RLIMIT_NOFILE, ({most}, {most}))\n"
+        "from signorini_cr.app import cli\nsys.exit(cli.main())\n"
+    )
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = helpers.start(tmp_path / "run.py", *argv)
+    words = " ".join(done.stderr.split())
+    assert done.returncode == cli.NOT_CONVERGED, words
+    assert words.endswith(f"ulimit -n allows {most} open files, and 64 are needed")
+    assert not (tmp_path / "out").exists()
+
+
+PLACES = """import os, sys
+from signorini_cr import temporary
+os.environ.update(TMPDIR="/proc/nowhere")
+temporary.USUAL = USUAL
+from signorini_cr.app import cli
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("there", [True, False])
+def test_where_temporary_files_cannot_be_written(there: bool, tmp_path: Path) -> None:
+    """Open MPI would end the process with a signal."""
+    (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))
+    usual = ("/proc/nowhere", str(tmp_path)) if there else ("/dev/full", "/proc")
+    (tmp_path / "run.py").write_text(PLACES.replace("= USUAL", f"= {usual!r}"))
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = helpers.start(tmp_path / "run.py", *argv)
+    words = " ".join(done.stderr.split())
+    begins = "temporary files cannot be kept in /proc/nowhere (No such file or directory)"
+    if there:
+        assert words == f"signorini-cr: warning: {begins}: {tmp_path} takes them"
+        assert done.returncode == 0
+    else:
+        assert words.startswith(f"signorini-cr: {begins}, nor in another usual place; TMPDIR may")
+        assert done.returncode == cli.BAD_INPUT
+    assert (tmp_path / "out").exists() is there
+
+
+@pytest.mark.serial
 def test_a_run_without_a_home_folder(tmp_path: Path) -> None:
     """Open MPI and DOLFINx ask for it; what is compiled goes where the system says it is."""
     (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))

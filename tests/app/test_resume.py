@@ -154,16 +154,28 @@ def test_another_problem_is_refused(old, new, words, told, case, capfd) -> None:
     assert Path("out", "report.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("damage", [b"", b"PK", b"no archive"])
-def test_a_damaged_file_is_refused(damage: bytes, case, capfd) -> None:
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "nothing": (lambda path: path.write_bytes(b""), "it is no archive"),
+    "a beginning": (lambda path: path.write_bytes(b"PK"), "it is no archive"),
+    "text": (lambda path: path.write_text("no archive"), "it is no archive"),
+    "a pipe": (os.mkfifo, "this is a device or a pipe; a file is needed"),
+    "zeros": (lambda path: path.symlink_to("/dev/zero"), "this is a device or a pipe"),
+    "much": (lambda path: path.open("wb").truncate(2**34), "it is no archive"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_refused(damage: str, case, capfd) -> None:
+    """Before anything is read from it that may have no end."""
     case()
-    assert solved("--levels", 1) == 0
+    make, words = DAMAGES[damage]
     if COMM.rank == 0:
-        Path("out", checkpoint.NAME).write_bytes(damage)
-    COMM.Barrier()
+        Path("out").mkdir()
+        make(Path("out", checkpoint.NAME))
     assert solved("--resume") == cli.BAD_INPUT
     if COMM.rank == 0:
-        assert "--resume: cannot read out/restart.npz" in " ".join(capfd.readouterr().err.split())
+        said = " ".join(capfd.readouterr().err.split())
+        assert "--resume: cannot read out/restart.npz: " + words in said
 
 
 def rewritten(change: Callable[[dict, dict], None]) -> None:

@@ -17,6 +17,7 @@ from signorini_cr.errors import InputError, NotConverged, on_root, raise_togethe
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.partition import bisect
+from signorini_cr.mesh.thin import thinness
 
 COMM = MPI.COMM_WORLD
 RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
@@ -626,6 +627,43 @@ def test_own_surfaces_in_space():
     mesh.topology.create_entities(1)
     tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
     assert "3 dimensions" in fails_alike(lambda: Domain.from_tags(mesh, tags))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_thinness_is_the_longest_side_by_the_least_height(dim: int) -> None:
+    """Heights are distances from the planes through the other corners, by least squares."""
+    random = np.random.default_rng(dim)
+    for corners in random.normal(size=(20, dim + 1, dim)) * [1.0, 0.01, 30.0][:dim]:
+        heights = []
+        for i, apex in enumerate(corners):
+            base = np.delete(corners, i, axis=0)
+            spans, way = (base[1:] - base[0]).T, apex - base[0]
+            heights.append(np.linalg.norm(way - spans @ np.linalg.lstsq(spans, way)[0]))
+        longest = max(np.linalg.norm(a - b) for a, b in itertools.combinations(corners, 2))
+        expected = longest / min(heights)
+        assert thinness(corners[None]) == pytest.approx([expected], rel=1e-9)
+    assert thinness(np.zeros((1, dim + 1, dim))) == np.inf
+
+
+@pytest.mark.parametrize(
+    "squeezed, told", [(1e-7, "e+07 times as long as it is high"), (0.0, "has no ")]
+)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_own_cells_that_are_too_thin(squeezed: float, told: str, dim: int) -> None:
+    """Some diagonals of their matrices would be 0 or negative."""
+    make = dolfinx.mesh.create_unit_square if dim == 2 else dolfinx.mesh.create_unit_cube
+    mesh = make(COMM, *[2] * dim)
+    mesh.geometry.x[:, 1] *= squeezed
+    tags = dolfinx.mesh.meshtags(mesh, dim - 1, np.array([], dtype=np.int32), 1)
+    said = fails_alike(lambda: Domain.from_tags(mesh, tags))
+    assert said.startswith(f"the {('triangle', 'tetrahedron')[dim - 2]} at (")
+    assert told in said
+
+
+def test_a_polygon_that_is_too_narrow() -> None:
+    polygon = Polygon([(0, 0), (1, 0), (0.5, 1e-8)], ["contact", "dirichlet", "neumann"])
+    said = fails_alike(polygon.mesh, 1.0)
+    assert said.startswith("the polygon is too narrow") and "1e+08 times as long" in said
 
 
 def test_no_gmsh(monkeypatch) -> None:

@@ -112,6 +112,11 @@ FILES = {  # points, triangles (from 1), what is said of it; contact from 1 to 2
         [*SQUARE, "0 0", "1 0", "1 1", "0 1"], ["1 2 3", "1 3 4", "5 6 7", "5 7 8"], "overlaps",
     ),
     "far away": ([*SQUARE[:3], "0 1e200"], ["1 2 3", "1 3 4"], "node 4 lies at"),
+    "far from the others": (
+        [*SQUARE[:3], "0 3e7"], ["1 2 3", "1 3 4"],
+        r"triangle at \(0, 0\) is 3e\+07 times as long as it is high: up to 1e\+06 times",
+    ),
+    "in a line": ([*SQUARE[:3], "2 2"], ["1 2 3", "1 3 4"], "triangle at .0, 0. has no area"),
     "a number that is none": ([*SQUARE[:3], "0 nan"], ["1 2 3", "1 3 4"], "in line 14"),
 }  # fmt: skip
 

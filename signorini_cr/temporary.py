@@ -1,0 +1,58 @@
+"""Files that are gone when a run ends: where there is room for them.
+
+MPI keeps some while it runs, and ends the process where it can't; the compiler has some for each
+form that it is given.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+ROOM = 2_000_000
+"""Bytes that compiling a form takes, at most."""
+VARIABLES = ("TMPDIR", "TEMP", "TMP")
+"""What may name the folder, the first before the others."""
+USUAL = ("/tmp", "/var/tmp")
+
+
+def fault(folder: str | os.PathLike[str]) -> str | None:
+    """Say in words what keeps us from writing as much as `ROOM` into a folder."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(ROOM))
+            file.flush()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def choose() -> str | None:
+    """See to it that there is a folder, for this process and those that it starts.
+
+    To be called before MPI is loaded.
+
+    Returns:
+        What a user should know if it is not the one that is named, or usual.
+
+    Raises:
+        OSError: There is none; the message is for the user.
+    """
+    named = [place for name in VARIABLES if (place := os.environ.get(name))]
+    found: dict[str, str] = {}
+    for place in (*named, *USUAL):
+        if (words := fault(place)) is None:
+            break
+        found.setdefault(place, words)
+    else:
+        first, words = next(iter(found.items()))
+        raise OSError(
+            f"temporary files cannot be kept in {first} ({words}), nor in another usual place;"
+            " TMPDIR may name a folder"
+        )
+    if not found:
+        return None
+    os.environ["TMPDIR"] = tempfile.tempdir = place
+    first, words = next(iter(found.items()))
+    return f"temporary files cannot be kept in {first} ({words}): {Path(place)} takes them"
