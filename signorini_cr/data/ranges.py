@@ -228,16 +228,17 @@ class Deviation:
             return
         mixture = np.arange(1.0, 1.0 + len(hats))
         beside = (1.0 - BESIDE) * hats + BESIDE * (mixture / mixture.sum())[:, None]
-        for part in blocks(found.shape[1]):
-            every = np.arange(part.start, part.stop)
-            if pieces is None:
-                boxes = Boxes(*cells.extents(part), cells=every, domain=cells.domain)
-            else:
-                boxes = pieces[part].hulls(cells)
-            near = np.flatnonzero(self._may_be_even(boxes))
-            which = every[near]
-            some = Pieces.of_cells(cells, which) if pieces is None else pieces[which]
-            even = self._may_be_even(some.points(cells, hats)).reshape(len(found), len(near))
+        whole = Pieces.of_cells(cells) if pieces is None and self.local else pieces
+        if whole is None:  # the cells, whose extents are all that the data depend on
+            near = cells.search(lambda low, high: self._may_be_even(Boxes(low, high)))
+        else:
+            parts = blocks(found.shape[1])
+            here = [self._may_be_even(whole[part].hulls(cells)) for part in parts]
+            near = np.flatnonzero(np.concatenate([*here, np.empty(0, dtype=bool)]))
+        for part in blocks(len(near)):
+            which = near[part]
+            some = Pieces.of_cells(cells, which) if whole is None else whole[which]
+            even = self._may_be_even(some.points(cells, hats)).reshape(len(found), len(which))
             if even.any():
                 others = values(self.expression, some.points(cells, beside)).reshape(even.shape)
                 found[:, which] = np.where(even, others, found[:, which])
@@ -248,7 +249,7 @@ class Deviation:
         at = Enclosure(replace(boxes, low=boxes.low - room, high=boxes.high + room), order=0)
         even = np.zeros(boxes.low.shape[1:], dtype=bool)
         for jet in map(at, self._compared):
-            even |= (jet.low <= 0) & (jet.high >= 0)
+            even |= ~((jet.low > 0) | (jet.high < 0))  # also where nothing is known
         return even
 
 

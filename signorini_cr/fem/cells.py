@@ -6,7 +6,7 @@ opposite vertex i.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -34,6 +34,25 @@ BESSEL = 3.8317059702
 def blocks(cells: int) -> Iterator[slice]:
     """Cut the cells into consecutive ranges."""
     return (slice(a, min(a + BLOCK, cells)) for a in range(0, cells, BLOCK))
+
+
+def _extents(mesh: Mesh, nodes: Int32Array) -> tuple[FloatArray, FloatArray]:
+    """Find least and largest coordinates of cells with some vertices, shapes (gdim, n)."""
+    low = high = mesh.geometry.x.take(nodes[:, 0], axis=0)
+    for node in nodes.T[1:]:
+        corner = mesh.geometry.x.take(node, axis=0)
+        low, high = np.minimum(low, corner), np.maximum(high, corner)
+    low, high = (np.ascontiguousarray(x.T[: mesh.geometry.dim]) for x in (low, high))
+    return low, high
+
+
+def _search(
+    mesh: Mesh, cells: IndexArray, may: Callable[[FloatArray, FloatArray], BoolArray]
+) -> IndexArray:
+    """Find those of some cells in whose extents there may be something; see `Cells.search`."""
+    nodes, parts = compat.cell_nodes(mesh), (cells[part] for part in blocks(len(cells)))
+    found = [which[may(*_extents(mesh, nodes[which]))] for which in parts]
+    return np.concatenate([cells[:0], *found])
 
 
 def pick(values: FloatArray, where: slice | IndexArray) -> FloatArray:
@@ -190,14 +209,30 @@ class Cells:
 
     def extents(self, part: slice) -> tuple[FloatArray, FloatArray]:
         """Find least and largest coordinates in some cells, shapes (gdim, cells in the part)."""
-        mesh = self.domain.mesh
-        nodes = compat.cell_nodes(mesh)[: self.number][part]
-        low = high = mesh.geometry.x.take(nodes[:, 0], axis=0)
-        for node in nodes.T[1:]:
-            corner = mesh.geometry.x.take(node, axis=0)
-            low, high = np.minimum(low, corner), np.maximum(high, corner)
-        low, high = (np.ascontiguousarray(x.T[: mesh.geometry.dim]) for x in (low, high))
-        return low, high
+        return _extents(self.domain.mesh, compat.cell_nodes(self.domain.mesh)[: self.number][part])
+
+    def search(self, may: Callable[[FloatArray, FloatArray], BoolArray]) -> IndexArray:
+        """Find owned cells in whose extents there may be something, ascending.
+
+        Where there is none in a coarser cell's, there is none in those of what it was cut into.
+
+        Args:
+            may: Tells so of boxes by least and largest coordinates, shapes (gdim, n); shape (n,).
+        """
+        mesh, way = self.domain.mesh, list[tuple[Mesh, IndexArray | Int32Array]]()
+        for step in reversed(self.domain.descent):
+            coarse = step.mesh()
+            if coarse is None or step.exchange is not None:
+                break
+            way.append((mesh, step.parent))
+            mesh = coarse
+        found = _search(mesh, np.arange(len(compat.cell_nodes(mesh))), may)
+        for fine, parent in reversed(way):
+            inside = np.zeros(len(compat.cell_nodes(mesh)), dtype=bool)
+            inside[found] = True
+            found = _search(fine, np.flatnonzero(inside[parent]), may)
+            mesh = fine
+        return found[found < self.number]
 
     def corners(self, part: slice) -> tuple[FloatArray, FloatArray]:
         """Find stretched vertices and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""

@@ -1,12 +1,17 @@
 """The mesh as arrays, against DOLFINx's own geometry, cell by cell."""
 
+import gc
+
 import numpy as np
 import pytest
 from dolfinx.mesh import entities_to_geometry
-from helpers import SQUARE
+from helpers import SQUARE, corners
 
 from signorini_cr.fem.cells import Cells, at_points
 from signorini_cr.fem.space import function_space
+from signorini_cr.mesh import balance as balancing
+from signorini_cr.mesh.balance import balance
+from signorini_cr.mesh.refinement import refine, refine_marked
 
 
 @pytest.mark.parametrize("first", [0, 3])
@@ -21,6 +26,45 @@ def test_extents(first):
         assert (low[:, cell] == corners.min(axis=0)).all()
         assert (high[:, cell] == corners.max(axis=0)).all()
     assert low.shape == high.shape == (2, cells.number - first)
+
+
+def crossed(low, high):
+    """Boxes that x + 2 y = 0.83 meets."""
+    return (low[0] + 2 * low[1] <= 0.83) & (high[0] + 2 * high[1] >= 0.83)
+
+
+@pytest.mark.parametrize("how", ["uniform", "marked", "forgotten", "moved"])
+def test_search(how, monkeypatch):
+    """What is found by way of coarser cells is what is found in all; few of these are looked at."""
+    monkeypatch.setattr(balancing, "LIMIT", 0.0)
+    meshes = [SQUARE.mesh(0.2)]
+    for _ in range(4):
+        coarse = meshes[-1]
+        if how == "marked":
+            meshes.append(refine_marked(coarse, corners(coarse.mesh).mean(axis=1)[:, 0] < 0.6)[0])
+        else:
+            fine, parent = refine(coarse)
+            meshes.append(balance(fine, parent)[0] if how == "moved" else fine)
+    fine = meshes[-1]
+    if how == "forgotten":
+        del meshes[1:3], coarse
+        gc.collect()
+    cells = Cells(fine, function_space(fine.mesh, "CR"), [])
+    seen = 0
+
+    def may(low, high):
+        """Tell which boxes a line meets."""
+        nonlocal seen
+        seen += low.shape[1]
+        return (low[0] + 2 * low[1] <= 0.83) & (high[0] + 2 * high[1] >= 0.83)
+
+    found = cells.search(may)
+    looked_at, seen = seen, 0
+    expected = np.flatnonzero(may(*cells.extents(slice(None))))
+    assert found.tolist() == expected.tolist()
+    assert cells.comm.allreduce(len(found)) > 0
+    if how in ("uniform", "marked"):
+        assert looked_at < seen / 2
 
 
 @pytest.mark.parametrize("shape", [(), (2,)])
