@@ -4,6 +4,8 @@
 
 draws mutants of a street (or of one file), runs the street's tests on each in a process of its
 own, forked from this one so that nothing large is imported twice, and prints those that survive.
+With `--ranks 2` tests are run once more on those that survive on one rank, for what only ranks say
+to each other.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import ast
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -55,6 +58,10 @@ ELSEWHERE = ("scatter_forward()", "scatter_reverse(InsertMode.add)", "destroy()"
 OTHERS = "comm.size > 1"
 """What hangs on this, and the condition, are left alone: it is what a rank says to others, and here
 there is one, which has nobody to say it to."""
+MUTANT = "SIGNORINI_CR_MUTANT"
+"""Number and file of the mutant that a process under mpirun, which has this for a plugin of pytest,
+is to load."""
+ARGUMENTS = ["-qx", "-p", "no:cacheprovider", "-k", SLOW]
 Mutant = tuple[int, str, Callable[[], None]]
 """Line, what is changed, and the change."""
 
@@ -166,7 +173,7 @@ def end_of(mutated: Mutated | None, tests: list[str], seconds: float) -> str:
             sys.meta_path.insert(0, mutated)
         import pytest
 
-        os._exit(pytest.main(["-qx", "-p", "no:cacheprovider", "-k", SLOW, *tests]))
+        os._exit(pytest.main([*ARGUMENTS, *tests]))
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         pid, status = os.waitpid(child, os.WNOHANG)
@@ -178,6 +185,32 @@ def end_of(mutated: Mutated | None, tests: list[str], seconds: float) -> str:
     return "timeout"
 
 
+def end_on(ranks: int, path: Path, index: int, tests: list[str], seconds: float) -> str:
+    """The same on several ranks, which are started anew; a mutant below 0 is none."""
+    found = os.pathsep.join([str(ROOT / "tests"), str(ROOT)])
+    surroundings = {**os.environ, "PYTHONPATH": found, MUTANT: f"{index} {path}"}
+    command = ["mpirun", "-n", str(ranks), sys.executable, "-m", "pytest", "-p", "mutants"]
+    with subprocess.Popen(
+        [*command, *ARGUMENTS, *tests],
+        env=surroundings,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as started:
+        try:
+            return "failed" if started.wait(seconds) else "passed"
+        except subprocess.TimeoutExpired:
+            os.killpg(started.pid, signal.SIGKILL)
+            return "timeout"
+
+
+def plug_in(words: str) -> None:
+    """Let this process load a mutant."""
+    index, path = words.split(maxsplit=1)
+    if int(index) >= 0:
+        sys.meta_path.insert(0, load(Path(path), int(index)))
+
+
 def main() -> None:
     """Draw mutants, run the tests on each, print those that none of them fails on."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -186,6 +219,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", metavar="FILE:LINE", nargs="*", help="the mutants of these lines")
     parser.add_argument("--tests", nargs="*", help="what to run instead of the street's tests")
+    parser.add_argument(
+        "--ranks", type=int, default=1, help="for a second try of those that survive"
+    )
     parser.add_argument("--all", action="store_true", help="print those that are noticed as well")
     arguments = parser.parse_args()
     at = PACKAGE / arguments.what
@@ -197,6 +233,11 @@ def main() -> None:
     if end_of(None, tests, 3600) != "passed":
         sys.exit("the tests fail as it is")
     limit = 30 + 5 * (time.monotonic() - began)
+    if arguments.ranks > 1:
+        began = time.monotonic()
+        if end_on(arguments.ranks, files[0], -1, tests, 3600) != "passed":
+            sys.exit(f"the tests fail as it is on {arguments.ranks} ranks")
+        limit_on_ranks = 30 + 5 * (time.monotonic() - began)
     pool = [
         (path, i, f"{path.relative_to(ROOT)}:{line}: {what}")
         for path in files
@@ -209,6 +250,8 @@ def main() -> None:
     ends: Counter[str] = Counter()
     for path, index, what in drawn[: arguments.count]:
         end = end_of(load(path, index), tests, limit)
+        if end == "passed" and arguments.ranks > 1:
+            end = end_on(arguments.ranks, path, index, tests, limit_on_ranks)
         ends[end] += 1
         if end == "passed" or arguments.all:
             print(f"{end}: {what}", flush=True)
@@ -218,3 +261,5 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+elif MUTANT in os.environ:
+    plug_in(os.environ[MUTANT])
