@@ -33,7 +33,7 @@ TESTS = {
     " estimate/test_sharpness_pinned.py estimate/test_sharpness.py estimate/test_tensors.py"
     " test_force.py test_means.py",
     "vi": "vi fem/test_conditions.py",
-    "multigrid": "multigrid",
+    "multigrid": "multigrid vi/test_steps_pinned.py",
 }
 """What is run on the mutants of a street."""
 SLOW = "not waving and not need_two_sweeps and not rates"
