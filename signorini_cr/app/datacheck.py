@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from dolfinx.mesh import compute_midpoints, entities_to_geometry
@@ -16,48 +16,65 @@ from ..mesh.domain import Domain
 from .expressions import Expression
 from .reference import EXPRESSIONS
 
+
+class Datum(NamedTuple):
+    """Where an expression stands in a problem file; as a text, its key.
+
+    Attributes:
+        section: "data", "exact", "boundary", "material", "time" or "quantities".
+        name: What the section is about; None where there is one such section only.
+        key: The key there.
+        entry: Row and column, of an entry of a tensor.
+    """
+
+    section: str
+    name: str | None
+    key: str
+    entry: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        """Write it as messages do."""
+        own = self.section if self.name is None else f"{self.section}.{self.name}"
+        return f"{own}.{self.key}" + "".join(f"[{i}]" for i in self.entry)
+
+    @property
+    def is_kappa(self) -> bool:
+        """Whether it is all of κ; an entry of a tensor is not."""
+        return self.key == "coefficient" and self.section != "boundary" and not self.entry
+
+
 Weights = Mapping[str, str | None]
-"""Where weights are used: the part or material by key, None for all of the domain."""
+"""Where weights are used: the part or material by the quantity, None for all of the domain."""
 
 
-def _used_on(key: str, domain: Domain, weights: Weights) -> int | None:
+def _used_on(datum: Datum, domain: Domain, weights: Weights) -> int | None:
     """Find the part of the boundary that an expression is used on, or None for the domain."""
-    if key in weights:
-        return domain.parts.get(weights[key] or "")
-    section, name, *_ = key.split(".", 2)
-    if section == "boundary":
+    section, name, key, _ = datum
+    if section == "quantities" and name is not None:
+        return domain.parts.get(weights[name] or "")
+    if section == "boundary" and name is not None:
         return domain.parts[name]
-    told = EXPRESSIONS.get(bare(key))  # none for [material.NAME]
+    told = EXPRESSIONS.get(f"{section}.{key}") if name is None else None
     return domain.parts[told.used_on] if told is not None and told.used_on else None
 
 
-def _used_in(key: str, expressions: Collection[str], domain: Domain, weights: Weights) -> BoolArray:
+def _used_in(datum: Datum, data: Collection[Datum], domain: Domain, weights: Weights) -> BoolArray:
     """Find the local cells in which a datum that is used on no part of the boundary is used."""
-    section, name, *_ = bare(key).split(".", 2)
-    bared = {bare(each) for each in expressions}
+    section, name, key, _ = datum
     tdim, materials = domain.mesh.topology.dim, domain.materials
     used = np.ones(domain.mesh.topology.index_map(tdim).size_local, dtype=bool)
-    material = name if section == "material" else weights.get(key)
-    if material is not None:
-        return materials.where(material)[: len(used)]
-    for other in materials.numbers:
-        if section == "data" and f"material.{other}.{name}" in bared:
-            used &= ~materials.where(other)[: len(used)]
+    if section == "quantities" and name is not None:
+        name = weights[name]
+    if name is not None:
+        return materials.where(name)[: len(used)]
+    if section == "data":
+        for other in {each.name for each in data if each[::2] == ("material", key)}:
+            used &= ~materials.where(str(other))[: len(used)]
     return used
 
 
-def bare(key: str) -> str:
-    """Return the key of a datum that one of its entries belongs to."""
-    return key.partition("[")[0]
-
-
-def is_kappa(key: str) -> bool:
-    """Tell whether a key is that of κ; an entry of a tensor is not."""
-    return key.endswith(".coefficient") and not key.startswith("boundary.")
-
-
 def check_values(
-    expressions: Mapping[str, Expression],
+    expressions: Mapping[Datum, Expression],
     domain: Domain,
     weights: Weights = MappingProxyType({}),
     time: float | None = None,
@@ -65,7 +82,7 @@ def check_values(
     """Insist on finite data, and on a positive coefficient; collective.
 
     Args:
-        expressions: The data by key, ``data.f`` … ``exact.u``.
+        expressions: The data, by where they stand.
         domain: They are evaluated at vertices and midpoints of its cells or, where they belong to
             a part of the boundary, of that part's facets.
         weights: Where those that are weights are used.
@@ -78,15 +95,19 @@ def check_values(
     size = max(domain.mesh.comm.allgather(float(np.abs(x).max(initial=0.0))))
     digits = 11 - math.ceil(math.log10(size))
     bad: tuple[Any, ...] = (math.inf,)
-    for number, (key, expression) in enumerate(expressions.items()):
-        part = _used_on(key, domain, weights)
-        which = _used_in(key, expressions, domain, weights) if part is None else domain.facets(part)
+    for number, (datum, expression) in enumerate(expressions.items()):
+        part = _used_on(datum, domain, weights)
+        which: BoolArray | Int32Array
+        if part is None:
+            which = _used_in(datum, expressions, domain, weights)
+        else:
+            which = domain.facets(part)
         points = _points(domain, domain.mesh.topology.dim - (part is not None), which, digits)
         values = expression.numpy(points)
         wrong = ~np.isfinite(values)
-        if is_kappa(key):
+        if datum.is_kappa:
             wrong |= values <= 0
-        elif key.endswith((".reaction", ".coefficient")):
+        elif datum.key in ("reaction", "coefficient") and not datum.entry:
             wrong |= values < 0
         if wrong.any():
             found = np.column_stack([points[:, :2], values])[wrong]
@@ -96,19 +117,17 @@ def check_values(
     bad = min(domain.mesh.comm.allgather(bad), key=lambda found: found[:3])
     if len(bad) == 1:
         return
-    key = list(expressions)[bad[0]]
+    datum = list(expressions)[bad[0]]
     when = ""
-    if time is not None and expressions[key].depends_on_time:
+    if time is not None and expressions[datum].depends_on_time:
         when = f", at the time {time:g}"
-    message = f"{key}: the value at {_point(bad[1:3])} is {bad[3]:g}"
+    message = f"{datum}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
-        what = "above 0" if is_kappa(key) else "0 or more"
-        there = "there" if key.startswith("material.") else "everywhere"
-        raise InputError(f"{message}; the {key.rpartition('.')[2]} must be {what} {there}{when}")
-    part, named = (
-        _used_on(key, domain, weights),
-        {value: name for name, value in domain.parts.items()},
-    )
+        what = "above 0" if datum.is_kappa else "0 or more"
+        there = "there" if datum.section == "material" else "everywhere"
+        raise InputError(f"{message}; the {datum.key} must be {what} {there}{when}")
+    part = _used_on(datum, domain, weights)
+    named = {value: name for name, value in domain.parts.items()}
     where = "in the domain" if part is None else f"on the {named[part]} part"
     raise InputError(
         f"{message}; it must be finite everywhere {where}"

@@ -37,7 +37,7 @@ from ..output.units import Units
 from ..quantities import Quantity
 from ..rounding import counted
 from ..solution import Solution
-from .datacheck import bare, check_values, is_kappa
+from .datacheck import Datum, check_values
 from .expressions import Expression, check_name, parse
 from .formula import Clock, Node
 from .readers import (
@@ -45,6 +45,7 @@ from .readers import (
     array,
     get,
     insist_known,
+    insist_on_name,
     number,
     one_of,
     parse_toml,
@@ -138,7 +139,7 @@ class ProblemFile:
         parts: The parts of the boundary that have sections.
         materials: The materials.
         problem: The data as functions of x, which give UFL.
-        expressions: The data that were written in the file, by key (``data.f`` …).
+        expressions: The data that were written in the file, by where they stand.
         mode: "uniform" or "adaptive".
         levels: Number of meshes, the coarsest included.
         adaptive: What adaptive refinement goes by: arguments of `solve_adaptive` by name.
@@ -154,7 +155,7 @@ class ProblemFile:
     parts: tuple[str, ...]
     materials: tuple[str, ...]
     problem: Problem
-    expressions: Mapping[str, Expression]
+    expressions: Mapping[Datum, Expression]
     mode: str
     levels: int
     adaptive: Mapping[str, Any]
@@ -192,7 +193,7 @@ class ProblemFile:
         if self.mode == "uniform":
             _few_enough(self.levels, cells, topology.dim)
         self._insist_on_places(domain)
-        weights = {f"quantities.{name}.weight": q.place for name, q in self.quantities.items()}
+        weights = {name: quantity.place for name, quantity in self.quantities.items()}
         first = None
         if self.time is not None:  # no step looks at what the data are at the time 0
             first = self.time.clock.value = self.time.end / self.time.steps
@@ -307,7 +308,7 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
     quantities = _quantities(sections["quantities"], parts, materials)
     expressions = _expressions(sections, parts, materials, clock)
     for name, quantity in quantities.items():
-        if (weight := expressions.get(f"quantities.{name}.weight")) is not None:
+        if (weight := expressions.get(Datum("quantities", name, "weight"))) is not None:
             quantities[name] = quantity._replace(weight=_data(weight))
     refine = sections["refine"]
     mode = get(refine, "refine", "mode", one_of(MODES), "uniform")
@@ -349,6 +350,7 @@ def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         raise InputError(f"boundary: sections [{PART}] are needed, found {shown(parts)}")
     for name, part in parts.items():
         section = f"boundary.{name}"
+        insist_on_name("boundary", name)
         insist_known(part, section, allowed(PART), KEYS)
         needed = f"one of {', '.join(TYPES)}"
         kind = get(part, section, "type", one_of(tuple(TYPES)), needed=needed)
@@ -367,6 +369,7 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     if not isinstance(found, dict) or not all(isinstance(each, dict) for each in found.values()):
         raise InputError(f"material: sections [{MATERIAL}] are needed, found {shown(found)}")
     for name, material in found.items():
+        insist_on_name("material", name)
         insist_known(material, f"material.{name}", allowed(MATERIAL), KEYS)
     return found
 
@@ -379,6 +382,7 @@ def _quantities(
     found: dict[str, Quantity] = {}
     for name, value in table.items():
         key = f"quantities.{name}"
+        insist_on_name("quantities", name)
         kinds = [kind for kind in QUANTITIES if isinstance(value, dict) and kind in value]
         if isinstance(value, dict):
             insist_known(value, key, allowed(QUANTITY))
@@ -600,7 +604,7 @@ def _expressions(
     parts: Mapping[str, Mapping[str, Any]],
     materials: Mapping[str, Mapping[str, Any]],
     clock: Clock | None,
-) -> dict[str, Expression]:
+) -> dict[Datum, Expression]:
     """Read [define] and what may be an expression in other sections."""
     names: dict[str, Expression] = {}
     define = sections["define"]
@@ -613,54 +617,49 @@ def _expressions(
             checked = check_name(name)
         later = [other for other in define if other not in names]
         names[checked] = _expression(f"define.{name}", value, names, later)
-    tables = {
-        **{name: (name, sections[name]) for name in ("data", "exact")},
-        **{f"boundary.{name}": (PART, table) for name, table in parts.items()},
-        **{f"material.{name}": (MATERIAL, table) for name, table in materials.items()},
-        "time": ("time", sections["time"]),
-        **{f"quantities.{name}": (QUANTITY, each) for name, each in sections["quantities"].items()},
-    }
-    given = {
-        f"{section}.{key}": value
-        for section, (like, table) in tables.items()
-        for key, value in table.items()
-        if f"{like}.{key}" in EXPRESSIONS
-    }
+    tables: list[tuple[str, str | None, Mapping[str, Any]]] = [
+        *((name, None, sections[name]) for name in ("data", "exact")),
+        *(("boundary", name, table) for name, table in parts.items()),
+        *(("material", name, table) for name, table in materials.items()),
+        ("time", None, sections["time"]),
+        *(("quantities", name, each) for name, each in sections["quantities"].items()),
+    ]
     result = {}
-    for key, value in _by_entries(given).items():
-        expression = _expression(key, value, names, ())
-        if expression.is_condition:
-            raise InputError(f"{key}: a number is needed, but this is a condition")
-        result[key] = expression
+    for section, own, table in tables:
+        like = section if own is None else f"{section}.NAME"
+        for key, value in table.items():
+            if f"{like}.{key}" not in EXPRESSIONS:
+                continue
+            for datum, given in _by_entries(Datum(section, own, key), value).items():
+                expression = _expression(str(datum), given, names, ())
+                if expression.is_condition:
+                    raise InputError(f"{datum}: a number is needed, but this is a condition")
+                result[datum] = expression
     return result
 
 
-def _by_entries(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Name the entries of a tensor one by one, as ``data.coefficient[0][1]``; keep all else."""
-    found: dict[str, Any] = {}
-    for key, value in given.items():
-        if not (isinstance(value, list) and is_kappa(key)):
-            found[key] = value
-            continue
-        if len(value) != 2 or not all(isinstance(row, list) and len(row) == 2 for row in value):
-            raise InputError(
-                f"{key}: an expression, or a tensor [[xx, xy], [xy, yy]] of expressions, is needed,"
-                f" found {shown(value)}"
-            )
-        found |= {f"{key}[{i}][{j}]": value[i][j] for i, j in ENTRIES}
-    return found
+def _by_entries(datum: Datum, value: Any) -> dict[Datum, Any]:
+    """Part a tensor into its entries, as ``data.coefficient[0][1]``; keep all else."""
+    if not (isinstance(value, list) and datum.is_kappa):
+        return {datum: value}
+    if len(value) != 2 or not all(isinstance(row, list) and len(row) == 2 for row in value):
+        raise InputError(
+            f"{datum}: an expression, or a tensor [[xx, xy], [xy, yy]] of expressions, is needed,"
+            f" found {shown(value)}"
+        )
+    return {datum._replace(entry=(i, j)): value[i][j] for i, j in ENTRIES}
 
 
 def _time(
     sections: Mapping[str, Mapping[str, Any]],
-    expressions: Mapping[str, Expression],
+    expressions: Mapping[Datum, Expression],
     clock: Clock,
 ) -> Time:
     """Read [time], and what goes with it."""
     table = sections["time"]
-    if "exact.u" in expressions:
+    if Datum("exact", None, "u") in expressions:
         raise InputError("exact.u: a problem in time has none")
-    initial = expressions.get("time.initial")
+    initial = expressions.get(Datum("time", None, "initial"))
     if initial is not None and initial.depends_on_time:
         raise InputError("time.initial: this must not depend on t")
     return Time(
@@ -730,30 +729,31 @@ def _expression(
 
 
 def _problem(
-    expressions: Mapping[str, Expression],
+    expressions: Mapping[Datum, Expression],
     parts: Mapping[str, Mapping[str, Any]],
     materials: Mapping[str, Mapping[str, Any]],
 ) -> Problem:
-    def own(section: str) -> dict[str, Any]:
+    def own(section: str, name: str | None = None) -> dict[str, Any]:
         """Take the data of a section, by key."""
         found: dict[str, Any] = {}
-        for key, expression in expressions.items():
-            home, _, name = bare(key).rpartition(".")
-            if home == section and key == bare(key):
-                found[name] = _data(expression)
-            elif home == section:
-                entries = (expressions[f"{home}.{name}[{i}][{j}]"] for i, j in ENTRIES)
-                found[name] = _tensor(list(entries))
+        for datum, expression in expressions.items():
+            if datum[:2] != (section, name):
+                continue
+            if not datum.entry:
+                found[datum.key] = _data(expression)
+            elif datum.entry == ENTRIES[-1]:
+                entries = [expressions[datum._replace(entry=each)] for each in ENTRIES]
+                found[datum.key] = _tensor(entries)
         return found
 
     return Problem(
         **own("data"),
         exact=own("exact").get("u"),
         conditions={
-            name: KINDS[part["type"]](**own(f"boundary.{name}")) for name, part in parts.items()
+            name: KINDS[part["type"]](**own("boundary", name)) for name, part in parts.items()
         },
         materials={
-            name: Material(**own(f"material.{name}"), capacity=_own_capacity(name, material))
+            name: Material(**own("material", name), capacity=_own_capacity(name, material))
             for name, material in materials.items()
         },
     )

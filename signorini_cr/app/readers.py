@@ -16,7 +16,9 @@ from ..errors import InputError, meant
 from ..reading import read_regular
 
 MOST_CHARACTERS = 40
-"""In a name or a unit."""
+"""In a unit, or what stands in the place of x, y or u."""
+MOST_IN_NAME = 80
+"""Characters of what a part, a material or a quantity is called."""
 MOST_IN_TITLE = 200
 """Characters."""
 MOST_BYTES = 16_000_000
@@ -168,6 +170,15 @@ def word(key: str, value: Any) -> str:
             f"{key}: 1 to {MOST_CHARACTERS} characters on one line are needed, found {shown(value)}"
         )
     return value.strip()
+
+
+def insist_on_name(section: str, name: str) -> None:
+    """Insist on a name of a part, a material or a quantity that fits into tables and pictures."""
+    if not name or name != name.strip() or len(name) > MOST_IN_NAME or not name.isprintable():
+        raise InputError(
+            f"{section}: a name has 1 to {MOST_IN_NAME} characters on one line, and no blanks at"
+            f" its ends, found {shown(name)}"
+        )
 
 
 def title(key: str, value: Any) -> str:

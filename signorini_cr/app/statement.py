@@ -18,6 +18,8 @@ from .screen import WIDTH
 
 INDENT = 11
 _SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c", "capacity": "capacity"}
+ROWS = ("domain", "equation", "time", "exact.u", "where")
+"""What rows are called that are about no part and no material."""
 LONGEST = 90
 """Characters of an expression; what is longer is cut."""
 
@@ -44,11 +46,13 @@ def statement(case: ProblemFile, domain: Domain) -> dict[str, str]:
     for name, material in materials.items():
         data = [f"{_SIGNS[key]} = {_short(material[key])}" for key in _SIGNS if key in material]
         number = _cells(domain, name)
-        rows[name] = f"{', '.join(data) or 'no data of its own'}; {counted(number, 'cell')}"
+        called = f"material.{name}" if name in ROWS else name
+        rows[called] = f"{', '.join(data) or 'no data of its own'}; {counted(number, 'cell')}"
     for name, (kind, given) in _conditions(said).items():
         condition = kind.in_words({key: _short(v) for key, v in given.items()}, exact, kappa)
         if there := _facets(domain, name):
-            rows[name] = f"{condition}; {there}{unit}"
+            called = f"boundary.{name}" if name in (*ROWS, *rows) else name
+            rows[called] = f"{condition}; {there}{unit}"
     if case.time is not None:
         words = f"t from 0 to {case.time.end:g}{case.units.after('time')} in"
         words += f" {counted(case.time.steps, 'step')} of {case.time.scheme}"

@@ -1,5 +1,6 @@
 """Problem files: what they say is what one gets, and what they leave out has its default."""
 
+import json
 import re
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from mpi4py import MPI
 
 from signorini_cr.app.problemfile import ProblemFile, load
 from signorini_cr.app.reference import KEYS
+from signorini_cr.app.statement import statement
 from signorini_cr.errors import InputError
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
@@ -112,8 +114,9 @@ def test_everything_is_taken_over(read) -> None:
     assert (case.problem.g, case.problem.obstacle) == (3.0, -1.5)
     assert case.problem.f((2.0, 0.0)) == 5.0  # any coordinates will do
     points = np.array([[0.25, 0.0], [0.75, 0.0]])
-    assert np.allclose(case.expressions["data.dirichlet"].numpy(points), [0.5, 1.0])
-    assert np.allclose(case.expressions["exact.u"].numpy([[1.0, 2.0]]), 2 * np.sin(1.0))
+    expressions = {str(datum): expression for datum, expression in case.expressions.items()}
+    assert np.allclose(expressions["data.dirichlet"].numpy(points), [0.5, 1.0])
+    assert np.allclose(expressions["exact.u"].numpy([[1.0, 2.0]]), 2 * np.sin(1.0))
 
 
 PARTS = """
@@ -158,6 +161,81 @@ def test_parts_with_names_of_ones_own(read) -> None:
     assert solution.errors is not None and max(solution.errors) < 1e-7
     assert solution.contact.force == pytest.approx(0.5, rel=1e-6)
     assert solution.contact.active.all()
+
+
+NAMED = """
+[domain]
+vertices = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
+boundary = ["FLOOR", "FIX", "FREE", "ROB"]
+size = 0.5
+[boundary."FLOOR"]
+type = "contact"
+obstacle = "-0.5 + 0.1*x"
+[boundary."FIX"]
+type = "dirichlet"
+value = "0.2*y"
+[boundary."FREE"]
+type = "neumann"
+g = "0.5*x"
+[boundary."ROB"]
+type = "robin"
+coefficient = "1 + y"
+external = 0.2
+[material."EAST"]
+polygon = [[0, 0], [1, 0], [1, 1], [0, 1]]
+coefficient = "1 + x"
+f = -2
+[material."WEST"]
+polygon = [[-1, 0], [0, 0], [0, 1], [-1, 1]]
+coefficient = [["2", "0"], ["0", "1 - x"]]
+reaction = "-x"
+[quantities]
+"FORCE" = { force = "FLOOR", weight = "1 - x" }
+"MEAN" = { mean = "EAST" }
+[data]
+f = -3
+coefficient = "0.5 - x"
+"""
+ODD = {
+    "dots": ("a", "a.b", ".", "..", "a.", "a..b", ".a", "x.f"),
+    "brackets": ("a[0]", "a[0][1]", "a", "[", "]", "a[1][1].coefficient", "b", "c[0]"),
+    "words of the file": (
+        "data.f", "coefficient", "u.coefficient", "domain", "time", "boundary", "where", "material",
+    ),
+    "marks": ("a,b", 'a"b', "a|b", "<b>", "$x$", "$\\q{$", "ä ß ж", "%"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_names_are_of_no_matter(kind: str, read) -> None:
+    """What is solved, and asked for, is what it is with plain names."""
+    plain = ("FLOOR", "FIX", "FREE", "ROB", "EAST", "WEST", "FORCE", "MEAN")
+    found = []
+    for names in (plain, ODD[kind]):
+        text = NAMED
+        for before, after in zip(plain, names, strict=True):
+            text = text.replace(f'"{before}"', json.dumps(after, ensure_ascii=False))
+        case = read(text)
+        domain = case.mesh()
+        assert case.check(domain) == []
+        solution = solve(case.problem, domain)
+        record = level_record(solution, None, case.quantities)
+        intervals = record["quantities"].values()
+        rows = statement(case, domain)
+        found.append([solution.energy, *(v[k] for v in intervals for k in ("lower", "upper"))])
+        assert solution.energy == pytest.approx(found[0][0], rel=1e-13)
+        assert found[-1] == pytest.approx(found[0], rel=1e-9)
+        assert len(rows) == len(plain), "a row for each part and material, domain and equation"
+
+
+@pytest.mark.parametrize(
+    "name", ["", " a", "a ", "a\nb", "a\u001b[31m", "\u202ea", "a\u0000", 81 * "a"]
+)
+@pytest.mark.parametrize("of", ["FLOOR", "EAST", "FORCE"])
+def test_names_that_nobody_can_read_are_refused(name: str, of: str, read) -> None:
+    text = NAMED.replace(f'"{of}"', json.dumps(name))
+    with pytest.raises(InputError, match=r": a name has 1 to 80 characters on one line"):
+        read(text)
 
 
 def test_the_deck_is_in_balance() -> None:
