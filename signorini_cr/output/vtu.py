@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import binascii
 import errno
+import fcntl
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +26,7 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray
 from ..compat import cell_nodes
-from ..errors import on_root, raise_together
+from ..errors import InputError, on_root, raise_together
 from ..fem.space import facet_corners, facet_entities, vertex_values
 from .files import disk_errors
 
@@ -163,23 +165,32 @@ def _write(
             file.write((head + TAIL).encode())
             _reserve(file.fileno(), file.tell())
 
+    def fill() -> None:
+        with disk_errors(path), path.open("r+b", buffering=0) as file:
+            for start, (place, data) in zip(starts.tolist(), encoded, strict=True):
+                _put(file.fileno(), data, start + place)
+
     on_root(comm, begin)
     complaint: str | None = None
-
-    def attempt(action: Callable[..., Any], *args: object) -> Any:
-        """Keep what goes wrong, on this rank alone perhaps, while the others go on."""
-        nonlocal complaint
-        try:
-            return action(*args)
-        except MPI.Exception as error:
-            complaint = complaint or f"cannot write {path.name}: {error}"
-
-    file = attempt(MPI.File.Open, comm, str(path), MPI.MODE_WRONLY)
+    try:
+        fill()
+    except InputError as error:  # on this rank alone, perhaps
+        complaint = str(error)
     raise_together(comm, complaint)
-    for start, (place, data) in zip(starts, encoded, strict=True):
-        attempt(file.Write_at_all, start + place, data)
-    attempt(file.Close)
-    raise_together(comm, complaint)
+
+
+def _put(file: int, data: bytes, at: int) -> None:
+    """Write bytes of a file that others write at other places of."""
+    if not data:  # for a lock that would be all there is
+        return
+    with suppress(OSError):
+        # Not to wait for anyone: a network's file system then sends these bytes and no others,
+        # where it might send blocks as it had known them. Closing the file lets go.
+        fcntl.lockf(file, fcntl.LOCK_EX, len(data), at)
+    left = memoryview(data)
+    while left:
+        written = os.pwrite(file, left, at)
+        left, at = left[written:], at + written
 
 
 def _encoded(

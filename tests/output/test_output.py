@@ -310,15 +310,21 @@ def test_a_folder_that_cannot_be_written_is_found_out_first(shared_tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "place", "function"),
-    [("report.json", Path, "write_text"), ("solution.vtu", os, "posix_fallocate")],
+    [
+        ("report.json", Path, "write_text"),
+        ("solution.vtu", os, "posix_fallocate"),
+        ("solution.vtu", os, "pwrite"),
+    ],
 )
 def test_a_full_disk_is_told_in_words(
     name, place, function, finished, shared_tmp_path, monkeypatch
 ):
+    """Whichever rank sees it."""
+
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    if WORLD.rank == 0:
+    if WORLD.rank == (WORLD.size - 1 if function == "pwrite" else 0):
         monkeypatch.setattr(place, function, full)
     solution, report = finished
     with pytest.raises(InputError, match=f"cannot write {name}: No space left"):

@@ -249,6 +249,17 @@ def test_a_function_of_ones_own_is_written_as_it_is(dim, read, shared_tmp_path):
     assert spread > 1e-3
 
 
+def test_a_path_as_long_as_the_system_takes(shared_tmp_path):
+    folder = shared_tmp_path.joinpath(*[100 * "x"] * 5)
+    if WORLD.rank == 0:
+        folder.mkdir(parents=True)
+    u = on_a_slope(2).u
+    write_vtu(u, folder / "u.vtu")
+    write_vtu(u, shared_tmp_path / "u.vtu")
+    if WORLD.rank == 0:
+        assert (folder / "u.vtu").read_bytes() == (shared_tmp_path / "u.vtu").read_bytes()
+
+
 def test_ranks_share_letters_whatever_each_of_them_has():
     """Base64 has four letters for three bytes, and a rank may have one byte or none."""
     random = np.random.default_rng(1)
