@@ -62,7 +62,7 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
         What `build` returns.
 
     Raises:
-        InputError: There is no folder to compile in.
+        InputError: There is no folder to compile in, or no compiler that works.
     """
     began = time.time() - 0.1  # the clock that files are dated by may lag a little
     while True:
@@ -76,6 +76,7 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
             if comm.bcast(comm.rank == 0 and _waited_in_vain(str(error)), root=0):
                 continue
             if not _moved(comm):
+                _tell_of_compiler(comm, error)
                 raise
         except (KeyboardInterrupt, SystemExit):
             if comm.rank == 0:
@@ -124,6 +125,26 @@ def _moved(comm: MPI.Comm) -> bool:
     _elsewhere, words = found
     tell(f"{words}: they are compiled for this run only")
     return True
+
+
+def _tell_of_compiler(comm: MPI.Comm, error: BaseException | None) -> None:
+    """Raise InputError if it is the compiler that has failed on rank 0; collective."""
+    words = None
+    while comm.rank == 0 and words is None and error is not None:
+        if found := _FAILED.search(str(error)):
+            words = _ARGUMENTS.sub(r"\1", found[1].rstrip("."))
+        error = error.__cause__ or error.__context__
+    if (words := comm.bcast(words)) is not None:
+        raise InputError(
+            f"forms cannot be compiled: {words}; a C compiler that works is needed, and CC may"
+            " name it"
+        )
+
+
+_FAILED = re.compile(r"(?:Compile|Link|Platform)Error: (.*)")
+"""What cffi says where a command has failed."""
+_ARGUMENTS = re.compile(r"'\['([^']+)'.*\]'")
+"""A command with its arguments, as some versions of setuptools tell them."""
 
 
 def _fault(folder: Path) -> str | None:

@@ -189,6 +189,16 @@ def test_where_the_compiler_has_no_room(monkeypatch: pytest.MonkeyPatch) -> None
         make(7.25)
 
 
+@pytest.mark.parametrize("compiler", ["false", "/nowhere/gcc"])
+def test_a_compiler_that_fails_is_told_in_words(
+    compiler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", compiler)
+    words = rf"forms cannot be compiled: .*{compiler}.*; a C compiler that works is needed"
+    with pytest.raises(InputError, match=words):
+        make(7.75)
+
+
 @pytest.mark.serial
 def test_temporary_folders_of_runs_that_were_killed_go(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

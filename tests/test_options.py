@@ -98,6 +98,20 @@ def test_a_misspelt_option_of_the_command_is_told(tmp_path):
 
 
 @pytest.mark.serial
+def test_options_that_petsc_cannot_start_with(tmp_path, monkeypatch):
+    """From the command line and from the environment: its words, and a message of ours."""
+    (tmp_path / "some.opt").write_bytes(bytes(range(256)))
+    words = "solve", ROOT / "meshes" / "s1.toml", "--out", tmp_path / "out"
+    runs = [command(*words, "-options_file", tmp_path / "some.opt", cwd=tmp_path)]
+    monkeypatch.setenv("PETSC_OPTIONS", "-options_file /nowhere")
+    runs += [command(*words, cwd=tmp_path)]
+    for done in runs:
+        assert done.returncode == 2 and "Traceback" not in done.stderr
+        assert "signorini-cr: PETSc cannot start, error code" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.serial
 def test_a_misspelt_option_is_told(tmp_path):
     result = run(tmp_path, "-signorini_snes_monitr")
     assert result.returncode == 0

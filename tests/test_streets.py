@@ -21,6 +21,7 @@ FLOORS = (
         "options",
         "garbage",
         "memory",
+        "temporary",
         "reading",
         "shown",
         "rounding",

@@ -104,6 +104,12 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         elif ran_out_of_memory(error):
             status = NOT_CONVERGED
             screen.complain(f"{args.file}: {NO_MEMORY}")
+        elif type(error).__module__ == "petsc4py.PETSc":
+            status = BAD_INPUT
+            screen.complain(
+                f"PETSc cannot start, {error}: what it says stands above; it has options from the"
+                " command line, from PETSC_OPTIONS and from files called .petscrc"
+            )
         else:
             raise
         if launched()[1] > 1:  # the others would wait for it, and it for them when MPI ends
@@ -155,7 +161,7 @@ def _end_all(comm: Any, status: int) -> int:
 
 
 def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
-    from ..errors import NotConverged, naming
+    from ..errors import InputError, NotConverged, naming
     from ..memory import most_memory
     from ..output import report as output
     from ..output.files import check_writable
@@ -171,6 +177,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         solve_case(args, screen, comm, folder, records)
         return DONE
     except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, InputError) and records:  # a full disk; data that a finer mesh hits
+            raise NotConverged(f"{error}\n{what_is_kept(records, folder)}") from error
         if not ran_out_of_memory(error):
             error.add_note(what_is_kept(records, folder) if records else "")
             raise

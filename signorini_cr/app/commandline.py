@@ -26,8 +26,9 @@ PETSC_NOTE = (
 )
 EXIT_NOTE = (
     "Exit status: 0 solved, every level converged; 2 bad input, nothing written; 3 not converged,"
-    " out of memory, or stopped by a limit; 130 interrupted; 143 terminated. Report and tables of a"
-    " level, or step, are kept as soon as it is finished, whatever ends the run then."
+    " stopped by a limit, or out of memory or, after the first level, disk; 130 interrupted; 143"
+    " terminated. Report and tables of a level, or step, are kept as soon as it is finished,"
+    " whatever ends the run then."
 )
 
 
@@ -37,6 +38,12 @@ KEYS_OF = {
     **dict.fromkeys(("size", "mesh"), "domain"),
 }
 """Keys of problem files that are no options, and their sections."""
+
+
+OPTIONS_READ = ("-options_file", "-options_file_yaml")
+"""PETSc's options that name files which are read."""
+OPTIONS_WRITTEN = ("-history", "-log_trace", "-info")
+"""The same of files which are written, beside viewers; what stands behind a colon is no file."""
 
 
 class UsageError(Exception):
@@ -109,10 +116,25 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
     for word in rest:
         _unknown(word, commands[args.command])
     for option, value in pairwise(petsc):
-        if option == "-options_file" and not Path(value).is_file():
-            parser.error(f"-options_file {value}: there is no such file")
+        if (complaint := _unusable(option, value)) is not None:
+            parser.error(f"{option} {value}: {complaint}")
     args.petsc, args.words = petsc, list(argv)
     return args
+
+
+def _unusable(option: str, value: str) -> str | None:
+    """Say what keeps PETSc from the file that an option names, if it does: some are its end."""
+    if option in OPTIONS_READ:
+        if not os.path.lexists(value):
+            return "there is no such file"
+        return None if Path(value).is_file() else "this is no file"
+    name, *rest = value.split(":")
+    if option not in OPTIONS_WRITTEN:  # a viewer, perhaps: kind:file:format
+        name = rest[0] if rest else ""
+    folder = Path(name).parent
+    if not name or name.startswith("-") or os.access(folder, os.W_OK):
+        return None
+    return f"{folder} is no folder that can be written to"
 
 
 def _parser() -> tuple[_Parser, dict[str, _Parser]]:

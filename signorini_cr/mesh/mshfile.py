@@ -247,8 +247,11 @@ def load(path: Path) -> MshFile:
     """
     try:
         data = read_regular(path, MOST_BYTES)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}") from error
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # a name may hold what none can
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"cannot be read: {reason}") from error
     try:
         return _Reader(data).read()
     except _Damaged as fault:

@@ -383,6 +383,10 @@ BAD: dict[str, tuple[str, list[str]]] = {
         with_("size", 'mesh = "a.msh"\nsize'),
         ["domain: both mesh and vertices are given"],
     ),
+    "mesh that no file can be": (
+        '[domain]\nmesh = "a\\u0000b"\n[data]\nf = 1\n',
+        ["domain.mesh: a\\x00b: cannot be read: ", "null"],
+    ),
     "neither": ("[domain]\nsize = 1\n[data]\n", ["domain: neither vertices nor mesh"]),
     "unknown name": (
         with_("1 + r", "1 + rr"),
@@ -674,6 +678,9 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "FILE", "--max-dofs", "9"], ["max_dofs is a key of [refine]"]),
         (["check", "FILE", "--levels", "2"], ["no option --levels"]),
         (["solve", "FILE", "-options_file", "none"], ["-options_file none", "no such file"]),
+        (["solve", "FILE", "-options_file", "/dev/zero"], ["-options_file", "this is no file"]),
+        (["solve", "FILE", "-history", "/proc/no/it"], ["/proc/no is no folder that can be wr"]),
+        (["solve", "FILE", "-log_view", ":/proc/no/it"], ["/proc/no is no folder that can be"]),
         (["solve", "none.toml"], ["none.toml: there is no such file"]),
         (["solve", "."], ["folder; a problem file (TOML) is needed"]),
         (["solve", "FILE", "--out", "FILE/out"], ["--out: cannot write", "not a folder"]),
