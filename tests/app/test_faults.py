@@ -255,9 +255,7 @@ def test_what_a_killed_run_leaves_the_next_one_removes(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [alien]
 
 
-def test_a_disk_that_fills_up_keeps_the_levels_before(
-    shared_tmp_path, monkeypatch, capfd
-) -> None:
+def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypatch, capfd) -> None:
     from signorini_cr.output import report as output
 
     (shared_tmp_path / "case.toml").write_text(kills.CASE.replace("9", "3"))
