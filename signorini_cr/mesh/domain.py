@@ -45,7 +45,7 @@ from .materials import Materials
 from .materials import numbered as numbered_materials
 from .partition import by_position
 from .polygon import check_labels, check_loops, circle, coordinates, cut
-from .thin import too_thin
+from .valid import folded, too_thin
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 PARTS = {"contact": CONTACT, "dirichlet": DIRICHLET, "neumann": NEUMANN}
@@ -236,7 +236,8 @@ class Domain:
             **others: The same for further parts, by names of your own.
 
         Raises:
-            InputError: The mesh is of another kind; or the tags lie elsewhere, contradict one
+            InputError: The mesh is of another kind, or folded, or has cells that are 10⁶ times as
+                long as high; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
         others = {**{str(value): value for value in parts}, **others}
@@ -248,6 +249,7 @@ class Domain:
         wanted = _wanted(given, inner, needed)
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
         exterior = _exterior(mesh)
+        raise_together(mesh.comm, folded(mesh))
         values = _values(mesh, facet_tags, exterior, wanted, inner)
         known = {int(value) for numbers in wanted.values() for value in numbers}
         there = _insist_on(mesh, facet_tags, exterior, wanted, needed)

@@ -22,7 +22,7 @@ from . import mshfile
 from .lines import arranged, sorted_out
 from .mshfile import KINDS, MshFile
 from .planar import overlap, pieces
-from .thin import too_thin
+from .valid import too_thin
 
 _MOST_TRIANGLES = 2e7
 _MOST_FACETS = 1e5  # on the boundary

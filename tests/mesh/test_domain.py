@@ -17,7 +17,7 @@ from signorini_cr.errors import InputError, NotConverged, on_root, raise_togethe
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.partition import bisect
-from signorini_cr.mesh.thin import thinness
+from signorini_cr.mesh.valid import thinness
 
 COMM = MPI.COMM_WORLD
 RECTANGLE = [[-1, 0], [1, 0], [1, 1], [-1, 1]]
@@ -658,6 +658,19 @@ def test_own_cells_that_are_too_thin(squeezed: float, told: str, dim: int) -> No
     said = fails_alike(lambda: Domain.from_tags(mesh, tags))
     assert said.startswith(f"the {('triangle', 'tetrahedron')[dim - 2]} at (")
     assert told in said
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_own_meshes_that_are_folded(dim: int) -> None:
+    """A vertex is drawn out of the mesh: some of its cells come to lie over others."""
+    make = dolfinx.mesh.create_unit_square if dim == 2 else dolfinx.mesh.create_unit_cube
+    mesh = make(COMM, *[4] * dim)
+    tags = dolfinx.mesh.meshtags(mesh, dim - 1, np.array([], dtype=np.int32), 1)
+    with pytest.raises(InputError, match="no exterior facet is tagged"):  # after all else
+        Domain.from_tags(mesh, tags)
+    x = mesh.geometry.x
+    x[np.isclose(x[:, :dim], 0.25).all(axis=1), :dim] = 9.0
+    assert "both lie on the same side of it" in fails_alike(Domain.from_tags, mesh, tags)
 
 
 def test_a_polygon_that_is_too_narrow() -> None:
