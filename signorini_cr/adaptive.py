@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .arrays import BoolArray, FloatArray
-from .errors import InputError, NotConverged
+from .errors import InputError, NotConverged, insist_on_count
 from .fem.problem import Problem
 from .levels import LevelMonitor, check_arguments, solve_sequence
 from .limits import Limits
@@ -203,8 +203,10 @@ def _by_shares(
     """Make such a step from what is said of where the error is; for ``runs`` see `Limits.admit`."""
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
-    if levels is not None and levels < 1:
-        raise InputError(f"levels is {levels}; it must be 1 or more")
+    if levels is not None:
+        insist_on_count("levels", levels)
+    if not tolerance >= 0.0:
+        raise InputError(f"tolerance is {tolerance}; it must be 0 or more")
 
     def step(solution: Solution, shares: Shares) -> Refined | None:
         last = levels is not None and solution.level.number + 1 >= levels

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from numbers import Integral
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -58,6 +59,18 @@ def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], nee
     """
     if not isinstance(value, kinds):
         raise InputError(f"{name} is of the type {type(value).__name__}: {needed} is needed")
+
+
+def insist_on_count(name: str, value: object) -> None:
+    """Refuse what is no whole number of 1 or more.
+
+    Args:
+        name: What the argument is called.
+        value: What was given for it.
+    """
+    insist_on_kind(name, value, Integral, "a whole number")
+    if isinstance(value, Integral) and value < 1:
+        raise InputError(f"{name} is {value}; it must be 1 or more")
 
 
 def meant(

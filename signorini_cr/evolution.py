@@ -27,7 +27,7 @@ from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
 from .data.moments import Rule, Volume
 from .diffusion import Diffusion
-from .errors import InputError
+from .errors import InputError, insist_on_count
 from .fem.conditions import Data
 from .fem.problem import Problem, as_expression
 from .levels import LevelMonitor, Start, check_arguments, solve_level
@@ -316,8 +316,9 @@ def solve_in_time(
     """
     if not (end > 0.0 and np.isfinite(end)):
         raise InputError(f"end is {end}; it must be a time after 0")
-    if steps < 1:
-        raise InputError(f"steps is {steps}; it must be 1 or more")
+    insist_on_count("steps", steps)
+    if not np.isfinite(steps / end):
+        raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
     if scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
     if not (time is None or hasattr(time, "value")):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dolfinx import fem
 
 from .diffusion import Diffusion
-from .errors import InputError, NotConverged, insist_on_kind
+from .errors import InputError, NotConverged, insist_on_count, insist_on_kind
 from .fem.conditions import facets_of
 from .fem.physics import Physics
 from .fem.problem import Problem
@@ -93,8 +93,7 @@ def solve_levels(
             the memory there is, or into ``max_time``.
     """
     check_arguments(problem, domain)
-    if levels < 1:
-        raise InputError(f"levels is {levels}; it must be 1 or more")
+    insist_on_count("levels", levels)
     if levels > 1:
         check_refinable(domain.mesh)
 

@@ -133,6 +133,12 @@ def test_refusals():
         list(solve_adaptive(exact.S1.problem, domain, fraction=0.0))
     with pytest.raises(InputError, match="levels is 0"):
         list(solve_adaptive(exact.S1.problem, domain, levels=0))
+    for wrong in (-1.0, float("nan")):
+        with pytest.raises(InputError, match=f"tolerance is {wrong}; it must be 0 or more"):
+            list(solve_adaptive(exact.S1.problem, domain, tolerance=wrong))
+    for how in (solve_adaptive, solve_levels):
+        with pytest.raises(InputError, match="levels is of the type float: a whole number is"):
+            list(how(exact.S1.problem, domain, levels=1.5))
 
 
 def test_cells_that_rounding_would_spoil_end_the_sequence():

@@ -327,6 +327,8 @@ def test_what_goes_on_for_long_stands_still():
     [
         ({"end": 0.0}, "end is 0.0"),
         ({"steps": 0}, "steps is 0"),
+        ({"steps": 2.5}, "steps is of the type float: a whole number is needed"),
+        ({"end": 1e-320}, "end is 1e-320; 2 steps would be too short"),
         ({"scheme": "crank"}, "one of euler, bdf2"),
         ({"capacity": -1.0}, "capacity is -1.0; it must be a number above 0"),
         ({"capacity": lambda x: x[0]}, "capacity is <function .*>; it must be a number above 0"),

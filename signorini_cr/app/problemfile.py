@@ -662,9 +662,13 @@ def _time(
     initial = expressions.get(Datum("time", None, "initial"))
     if initial is not None and initial.depends_on_time:
         raise InputError("time.initial: this must not depend on t")
+    end = get(table, "time", "end", positive, needed="a number above 0, the last time,")
+    steps = _steps(get(table, "time", "steps", whole, needed="a whole number, of steps,"))
+    if not math.isfinite(steps / end):
+        raise InputError(f"time.end: {end:g} is too little for numbers to tell steps apart")
     return Time(
-        end=get(table, "time", "end", positive, needed="a number above 0, the last time,"),
-        steps=_steps(get(table, "time", "steps", whole, needed="a whole number, of steps,")),
+        end=end,
+        steps=steps,
         scheme=get(table, "time", "scheme", one_of(SCHEMES), "euler"),
         initial=0.0 if initial is None else _data(initial),
         capacity=get(table, "time", "capacity", _capacity, 1.0),

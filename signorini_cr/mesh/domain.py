@@ -240,6 +240,8 @@ class Domain:
                 long as high; or the tags lie elsewhere, contradict one
                 another, are not all there, or leave Γ0 or Γ1 empty.
         """
+        insist_on_kind("mesh", mesh, Mesh, "a dolfinx Mesh")
+        insist_on_kind("facet_tags", facet_tags, MeshTags, "dolfinx MeshTags")
         others = {**{str(value): value for value in parts}, **others}
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
         inner = numbered(others)

@@ -330,8 +330,11 @@ def _read(
     for each in needed:
         if not sum(map(len, found[each])):
             there = ", ".join(name or f"(unnamed, {tag})" for tag, name in names) or "none"
+            known = any(name.strip().lower() == each.lower() for _, name in names)
             raise InputError(
-                f"no physical curve is named {each!r}; the physical curves there are: {there}"
+                f"the physical curve {each!r} has no line in the file: those on it have to be saved"
+                if known
+                else f"no physical curve is named {each!r}; the physical curves there are: {there}"
             )
     facets = np.concatenate([part for key in parts for part in found[key]])
     labels = np.repeat(list(parts.values()), [sum(map(len, found[key])) for key in parts])

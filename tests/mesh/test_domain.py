@@ -606,6 +606,12 @@ def test_own_tags_that_do_not_fit():
     assert "inside the domain" in fails_alike(lambda: Domain.from_tags(mesh, wall))
 
 
+def test_own_meshes_that_are_none():
+    mesh = dolfinx.mesh.create_unit_square(COMM, 2, 2)
+    assert "facet_tags is of the type NoneType" in fails_alike(Domain.from_tags, mesh, None)
+    assert "mesh is of the type str" in fails_alike(Domain.from_tags, "mesh.msh", None)
+
+
 def test_own_quadrilaterals():
     mesh = dolfinx.mesh.create_unit_square(
         COMM, 2, 2, cell_type=dolfinx.mesh.CellType.quadrilateral

@@ -142,6 +142,13 @@ def test_what_no_mesh_can_be(name: str, tmp_path: Path) -> None:
         read(path, PARTS, USUAL)
 
 
+def test_curves_that_no_line_is_of_are_told(tmp_path: Path) -> None:
+    """Names are saved with or without what they are names of."""
+    path = written(tmp_path / "mesh.msh", SQUARE, ["1 2 3", "1 3 4"], [])
+    with pytest.raises(InputError, match="the physical curve 'contact' has no line in the file"):
+        read(path, PARTS, USUAL)
+
+
 def test_slits_and_pieces_that_touch_are_meshes(tmp_path: Path) -> None:
     """A square with a slit from its middle to the right, the points on it twice."""
     points = ["0 0", "1 0", "1 0.5", "1 1", "0 1", "0.5 0.5", "1 0.5"]
