@@ -45,10 +45,10 @@ DATA: tuple[dict[str, Any], ...] = (
 """Few, as each formula is compiled and stays loaded; there are meshes enough."""
 GROWTH = 50_000.0
 """Bytes a solve from which on it is a leak: what a solve holds is some megabytes. Matplotlib keeps
-about 20 kB a picture, of which its caches of text are a part."""
+about 20 kB a picture, of which its caches of text are a part; with `--undrawn` it is not there."""
 
 
-def round_of(number: int, folder: Path) -> None:
+def round_of(number: int, folder: Path, drawn: bool) -> None:
     """Solve on a few meshes, look at all there is to see of them, and forget them; collective."""
     random = np.random.default_rng(number)
     width, height = random.uniform(1, 2, size=2)
@@ -62,7 +62,8 @@ def round_of(number: int, folder: Path) -> None:
     for solution, draw in zip(steps(problem, domain, levels=LEVELS), DRAWN, strict=True):
         assert solution.certificate.reason is None
         records.append(level_record(solution, records[-1] if records else None))
-        draw(solution, folder / "one.png")
+        if drawn:
+            draw(solution, folder / "one.png")
     report = make_report("Endurance", "CR", WORLD, records)
     write_output(folder, report, solution, pictures=False)
 
@@ -79,13 +80,14 @@ def main() -> None:
     """Solve, and say what is held."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=1000, help="how many solves")
+    parser.add_argument("--undrawn", action="store_true", help="without pictures")
     arguments = parser.parse_args()
     rounds, began = arguments.count // LEVELS, time.monotonic()
     looks = [max(rounds * part // 10, 1) for part in (1, 3, 5, 7, 10)]
     found: dict[int, int] = {}
     with tempfile.TemporaryDirectory() as folder:
         for number in range(1, rounds + 1):
-            round_of(number, Path(WORLD.bcast(folder)))
+            round_of(number, Path(WORLD.bcast(folder)), not arguments.undrawn)
             if number in looks:
                 solves, spent = LEVELS * number, time.monotonic() - began
                 found[solves] = max(WORLD.allgather(held()))
