@@ -20,7 +20,7 @@ from scipy.sparse import csc_array
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
-from ..mesh.domain import DIRICHLET, Domain
+from ..mesh.domain import DIRICHLET, Domain, Refinement
 from .space import facet_entities, largest, shared_sum
 from .space import measures as simplex_measures
 
@@ -219,20 +219,26 @@ class Cells:
         Args:
             may: Tells so of boxes by least and largest coordinates, shapes (gdim, n); shape (n,).
         """
-        mesh, way = self.domain.mesh, list[tuple[Mesh, IndexArray | Int32Array]]()
+        mesh, way = self.domain.mesh, list[tuple[Mesh, Refinement]]()
         for step in reversed(self.domain.descent):
             coarse = step.mesh()
             if coarse is None or step.exchange is not None:
                 break
-            way.append((mesh, step.parent))
+            way.append((mesh, step))
             mesh = coarse
-        found = _search(mesh, np.arange(len(compat.cell_nodes(mesh))), may)
-        for fine, parent in reversed(way):
-            inside = np.zeros(len(compat.cell_nodes(mesh)), dtype=bool)
-            inside[found] = True
-            found = _search(fine, np.flatnonzero(inside[parent]), may)
-            mesh = fine
-        return found[found < self.number]
+        # ghost cells are left behind by the first step
+        owned = mesh.topology.index_map(mesh.topology.dim).size_local
+        found = _search(mesh, np.arange(owned), may)
+        for fine, step in reversed(way):
+            if step.pattern is None:
+                inside = np.zeros(len(compat.cell_nodes(mesh)), dtype=bool)
+                inside[found] = True
+                children = np.flatnonzero(inside[step.parent])
+            else:
+                number = len(step.pattern)
+                children = (number * found[:, None] + np.arange(number)).ravel()
+            found, mesh = _search(fine, children, may), fine
+        return found
 
     def corners(self, part: slice) -> tuple[FloatArray, FloatArray]:
         """Find stretched vertices and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""

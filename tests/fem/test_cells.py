@@ -4,13 +4,22 @@ import gc
 
 import numpy as np
 import pytest
-from dolfinx.mesh import entities_to_geometry
+from dolfinx.mesh import (
+    GhostMode,
+    compute_midpoints,
+    create_unit_square,
+    entities_to_geometry,
+    exterior_facet_indices,
+    meshtags,
+)
 from helpers import SQUARE, corners
+from mpi4py import MPI
 
 from signorini_cr.fem.cells import Cells, at_points
 from signorini_cr.fem.space import function_space
 from signorini_cr.mesh import balance as balancing
 from signorini_cr.mesh.balance import balance
+from signorini_cr.mesh.domain import Domain
 from signorini_cr.mesh.refinement import refine, refine_marked
 
 
@@ -33,11 +42,20 @@ def crossed(low, high):
     return (low[0] + 2 * low[1] <= 0.83) & (high[0] + 2 * high[1] >= 0.83)
 
 
-@pytest.mark.parametrize("how", ["uniform", "marked", "forgotten", "moved"])
+def with_ghosts():
+    """The unit square; each rank knows the cells of others beside its own."""
+    mesh = create_unit_square(MPI.COMM_WORLD, 6, 6, ghost_mode=GhostMode.shared_facet)
+    mesh.topology.create_connectivity(1, 2)
+    facets = exterior_facet_indices(mesh.topology)
+    below = compute_midpoints(mesh, 1, facets)[:, 1] < 1e-9
+    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, np.where(below, 1, 2).astype(np.int32)))
+
+
+@pytest.mark.parametrize("how", ["uniform", "marked", "forgotten", "moved", "ghosts"])
 def test_search(how, monkeypatch):
     """What is found by way of coarser cells is what is found in all; few of these are looked at."""
     monkeypatch.setattr(balancing, "LIMIT", 0.0)
-    meshes = [SQUARE.mesh(0.2)]
+    meshes = [with_ghosts() if how == "ghosts" else SQUARE.mesh(0.2)]
     for _ in range(4):
         coarse = meshes[-1]
         if how == "marked":
@@ -63,7 +81,7 @@ def test_search(how, monkeypatch):
     expected = np.flatnonzero(may(*cells.extents(slice(None))))
     assert found.tolist() == expected.tolist()
     assert cells.comm.allreduce(len(found)) > 0
-    if how in ("uniform", "marked"):
+    if how in ("uniform", "marked", "ghosts"):
         assert looked_at < seen / 2
 
 
