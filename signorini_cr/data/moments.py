@@ -24,7 +24,7 @@ from ufl.core.expr import Expr
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array
-from ..fem.cells import BoundaryFacets, Cells, at_points
+from ..fem.cells import BoundaryFacets, Cells, points_of
 from ..fem.conditions import Condition, as_number, may_change
 from ..fem.physics import Imposed
 from ..fem.problem import Forms
@@ -397,7 +397,7 @@ class Coefficient:
             if boxes.corners is None:
                 return np.where(np.isnan(excess), np.inf, excess)
             hats = self.rule.hats
-            x = at_points(boxes.corners, hats).reshape(len(boxes.low), -1)
+            x = points_of(boxes.corners, hats).reshape(len(boxes.low), -1)
             cells = None if boxes.cells is None else np.tile(boxes.cells, hats.shape[1])
             there = values(self.deviation.expression, Boxes(x, x, cells=cells, domain=boxes.domain))
             excess = np.fmin(excess, self._by_points(there.reshape(hats.shape[1], len(r)), r))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..compat import cell_nodes
-from ..fem.cells import BoundaryFacets, Cells, at_points, corner_points
+from ..fem.cells import BoundaryFacets, Cells, corner_points, points_of
 from .jets import Boxes
 
 Levels = Callable[["Pieces"], FloatArray]
@@ -338,7 +338,7 @@ class Pieces:
 
     def points(self, cells: Cells, hats: FloatArray) -> Boxes:
         """Find the points with some barycentric coordinates, shape (d + 1, q), piece by piece."""
-        points = at_points(self.corners, hats)
+        points = points_of(self.corners, hats)
         flat = points.reshape(len(points), -1)
         return self._boxes(flat, flat, np.tile(self.parent, hats.shape[1]), cells, None)
 

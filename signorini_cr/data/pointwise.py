@@ -70,9 +70,13 @@ class Samples:
 
     @cached_property
     def x(self) -> FloatArray:
-        """Coordinates, shape (n, q, 3)."""
+        """Coordinates, shape (n, q, 3); exact where all corners have them, as in `points_of`."""
         mesh = self.domain.mesh
-        return np.asarray(self.hats @ mesh.geometry.x[cell_nodes(mesh)[self.cells]])
+        corners = mesh.geometry.x[cell_nodes(mesh)[self.cells]]
+        counted = np.expand_dims((self.hats != 0.0).any(axis=-2), -1)  # a facet's are not all
+        low = np.where(counted, corners, np.inf).min(axis=1, keepdims=True)
+        high = np.where(counted, corners, -np.inf).max(axis=1, keepdims=True)
+        return np.clip(self.hats @ corners, low, high)
 
     @cached_property
     def normals(self) -> FloatArray:

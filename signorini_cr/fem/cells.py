@@ -89,6 +89,23 @@ def at_points(ends: FloatArray, hats: FloatArray) -> FloatArray:
     return np.asarray(hats.T @ np.moveaxis(ends, 0, -2))
 
 
+def points_of(corners: FloatArray, hats: FloatArray) -> FloatArray:
+    """Find the same points of some simplices; what their corners have in common is exact.
+
+    A condition on a coordinate may hold with equality on all of a facet: there rounding of the
+    coordinate must not decide.
+
+    Args:
+        corners: Shape (d + 1, gdim, n).
+        hats: Barycentric coordinates of the points, shape (d + 1, q).
+
+    Returns:
+        Shape (gdim, q, n).
+    """
+    low, high = (np.expand_dims(x, 1) for x in (corners.min(axis=0), corners.max(axis=0)))
+    return np.clip(at_points(corners, hats), low, high)
+
+
 def poincare(tdim: int) -> float:
     """Return C with ‖w − w_T‖_T ≤ C h_T ‖∇w‖_T for all w ∈ H¹(T).
 

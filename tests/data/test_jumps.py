@@ -14,7 +14,17 @@ from dolfinx.mesh import (
 from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 
-from signorini_cr import Domain, Polygon, Problem, solve
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Domain,
+    Neumann,
+    Polygon,
+    Problem,
+    Robin,
+    solve,
+    solve_levels,
+)
 from signorini_cr.compat import cell_nodes
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.jets import Boxes, Enclosure, lowered
@@ -197,6 +207,59 @@ def test_data_that_differ_on_a_null_set(datum):
     low, high = solution.certificate.energy
     assert error <= solution.certificate.bound_energy_norm
     assert low <= -1 / 6 <= high
+
+
+HOLD = {
+    "<=": lambda x, a: ufl.le(x[0], a),
+    "==": lambda x, a: ufl.eq(x[0], a),
+    "not >": lambda x, a: ufl.Not(ufl.gt(x[0], a)),
+    "max": lambda x, a: ufl.eq(ufl.max_value(x[0] - a, 0.0), 0.0),
+    "sign": lambda x, a: ufl.eq(ufl.sign(x[0] - a), 0.0),
+}
+"""Conditions that hold where x is a, on all of an edge."""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("a", [0.1, 1 / 3, 0.7, 3.7])
+@pytest.mark.parametrize("name", HOLD)
+def test_data_that_differ_on_an_edge(name, a):
+    """Rounding of a point's x must not decide: a datum that is 1 on the edge is the number 1.
+
+    The problem that a weight and the data on the edge belong to is u = −0.1 − 1.4 y + 1.5 y², whose
+    integral over it is −0.3; with g = 0.5 there J is that of the number 0.5.
+    """
+    names = ("floor", "right", "top", "left")
+    polygon = Polygon([[a, 0], [a + 1, 0], [a + 1, 1], [a, 1]], names, names=names)
+
+    def there(value):
+        return lambda x: ufl.conditional(HOLD[name](x, a), value, 0.0)
+
+    def solved(kind, value, levels=1):
+        sides = {"right": Neumann(0.0), "top": Dirichlet(0.0), "floor": Contact(-0.1)}
+        own = {
+            "neumann": lambda: Neumann(value),
+            "robin": lambda: Robin(coefficient=value, external=value),
+            "contact": lambda: Contact(-5.0, g=value),
+        }[kind]()
+        problem = Problem(f=-3.0, conditions={**sides, "left": own})
+        *_, finest = solve_levels(problem, polygon.mesh(0.25, MPI.COMM_SELF), levels)
+        return finest
+
+    plain = solved("neumann", 0.0)
+    value, low, high = plain.integral("left", there(1.0))
+    assert low <= -0.3 <= high and high - low < 0.2
+    assert value == pytest.approx(plain.integral("left", 1.0)[0], rel=1e-12)
+    zero, low, high = plain.integral("left", lambda x: 1.0 - there(1.0)(x))
+    assert zero == 0.0 and low <= 0.0 <= high and high - low < 0.2
+    for kind in ("neumann", "contact"):
+        number, datum = (solved(kind, each) for each in (0.5, there(0.5)))
+        assert datum.energy == pytest.approx(number.energy, rel=1e-10)
+        assert datum.certificate.energy == pytest.approx(number.certificate.energy, rel=1e-6)
+        assert datum.certificate.bound_h1 == pytest.approx(number.certificate.bound_h1, rel=1e-6)
+    # b is compiled, and what u_h solves may be otherwise; bounds hold
+    low, high = solved("robin", there(0.5), 2).certificate.energy
+    least, most = solved("robin", 0.5, 4).certificate.energy
+    assert max(low, least) <= min(high, most)
 
 
 @pytest.mark.serial
