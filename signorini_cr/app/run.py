@@ -24,6 +24,7 @@ from ..output.checkpoint import NAME as RESTART
 from ..output.checkpoint import read_checkpoint
 from ..output.files import write_files, write_text
 from ..output.page import run_page
+from ..output.tables import short
 from ..output.units import GLUE
 from ..restart import Restart
 from ..rounding import at_most, known
@@ -34,6 +35,8 @@ from .screen import Screen
 
 SURE = 3
 """So many bounds tell at which rate they fall."""
+OFF = 1e-3
+"""Part of an error by which it may be wrong."""
 FAR = 10
 """So many times the unknowns that there may be are out of reach."""
 
@@ -195,6 +198,21 @@ def out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None:
     return (
         f"refine.tolerance: at this rate the tolerance {tolerance:g} takes about"
         f" {10.0 ** min(digits, 300.0):.0e} unknowns; max_dofs is {most}"
+    )
+
+
+def no_solution(record: output.Record) -> str | None:
+    """Say so where an error is above the bound that is certain: what is compared with is wrong.
+
+    An error is integrated by quadrature, and may be a little off.
+    """
+    error, bound = record["error_h1"], record["bound_h1"]
+    if error is None or bound is None or error <= bound * (1.0 + OFF):
+        return None
+    return (
+        f"exact.u: this is not the solution, as the error of {short(error)} is above the certified"
+        f" bound of {at_most(bound)}; where it has a kink, or the coefficient jumps, what is"
+        " derived from it leaves out what flows there"
     )
 
 

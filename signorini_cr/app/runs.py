@@ -17,7 +17,15 @@ from ..restart import Restart
 from ..solution import Solution
 from . import problemfile
 from .problemfile import ProblemFile
-from .run import Run, above_tolerance, out_of_reach, step_of_solver, stopped, tell_of_tolerance
+from .run import (
+    Run,
+    above_tolerance,
+    no_solution,
+    out_of_reach,
+    step_of_solver,
+    stopped,
+    tell_of_tolerance,
+)
 from .screen import Screen, wrapped
 from .signals import keep
 from .statement import folded, statement
@@ -72,7 +80,7 @@ def _solve_levels(run: Run) -> None:
         _tell(record, kept[0], screen)
     finest: Solution | None = None
     failure: NotConverged | None = None
-    warned = False
+    warned = doubted = False
     try:
         for solution in _solutions(run, restart):
             if solution.level.number < len(kept):  # the one that it goes on from
@@ -91,6 +99,9 @@ def _solve_levels(run: Run) -> None:
                 taken = solution.iterations.preconditioner
                 screen.line(wrapped(taken, "  linear systems: "))
             _tell(record, kept[0], screen)
+            if not doubted and (doubt := no_solution(record)) is not None:
+                screen.warn(f"{run.args.file}: {doubt}")
+                doubted = True
             if not warned and (doubt := out_of_reach(run.case, kept)) is not None:
                 screen.warn(f"{run.args.file}: {doubt}")
                 warned = True

@@ -604,6 +604,19 @@ def test_what_has_no_end_is_not_read(kind: str, write, monkeypatch) -> None:
             assert ("domain.mesh" in said) is (kind == "mesh")
 
 
+@pytest.mark.parametrize(
+    "u, wrong", [("max(x - 0.3, 0)", True), ("abs(x - 0.5)", True), ("x**2 - y**2", False)]
+)
+def test_an_error_above_the_bound_is_told(u: str, wrong: bool, write) -> None:
+    """Where `exact.u` is not the solution of what is derived from it, by what flows at kinks."""
+    text = CASE[: CASE.index("[data]")] + f'[data]\nobstacle = -99\n[exact]\nu = "{u}"\n'
+    status, _, err = run("solve", write(text), "--levels", "2", "--out", "out")
+    assert status == cli.DONE
+    if COMM.rank == 0:
+        words = "exact.u: this is not the solution, as the error of "
+        assert " ".join(err.split()).count(words) == wrong
+
+
 def test_curves_with_names_of_ones_own(write) -> None:
     """What holds the mesh is known by its sections: here a loss, or nothing."""
     write(msh(LINES + _TRIANGLES, "bed").replace("dirichlet", "air"), "own.msh")
