@@ -344,7 +344,11 @@ def _read(
         of_cells, without = _of_materials(file, materials)
         raw = raw._replace(materials=of_cells, others=without)
     _check_names(triangles, facets, others, tuple(parts))
-    _check_facets(raw, {label: name for name, label in parts.items()})
+    try:
+        _check_facets(raw, {label: name for name, label in parts.items()})
+    except InputError:
+        _check_twins(raw)  # of which the others are told
+        raise
     return raw
 
 
@@ -452,6 +456,17 @@ def _check_cells(file: MshFile) -> None:
     used = np.concatenate([block.nodes.ravel() for block in file.blocks])
     if np.ptp(file.points[np.searchsorted(file.tags, used), 2]) > 0:
         raise InputError("the mesh does not lie in the x-y plane: z takes several values")
+
+
+def _check_twins(raw: Triangulation) -> None:
+    """Insist on triangles that are there once."""
+    order, counts = np.unique(np.sort(raw.triangles), axis=0, return_counts=True)
+    if counts.max() > 1:
+        x, y = raw.points[order[counts.argmax(), 0]]
+        raise InputError(
+            f"triangles are there twice, as the one at ({x:g}, {y:g}): so gmsh's format 2 has"
+            " those of two physical surfaces, where format 4 has them once"
+        )
 
 
 def _check_facets(raw: Triangulation, names: Mapping[int, str]) -> None:

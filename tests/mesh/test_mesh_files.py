@@ -95,7 +95,9 @@ FILES = {  # points, triangles (from 1), what is said of it; contact from 1 to 2
         ["0 0", "1 0", "1 1", "0.9 0.2"], ["1 2 3", "1 3 4"],
         "triangles overlap at the facet from",
     ),
-    "the same triangle twice": (SQUARE, ["1 2 3", "1 2 3"], "is labelled|overlap"),
+    "the same triangle twice": (
+        SQUARE, ["1 2 3", "1 2 3"], r"triangles are there twice, as the one at \(0, 0\)",
+    ),
     "a hanging node": (
         [*SQUARE, "0.5 0.5", "1 2"], ["1 2 3", "1 5 4", "5 3 4", "4 3 6"],
         "ends in that from",
