@@ -8,9 +8,12 @@ computing them all.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from petsc4py import PETSc
 
+from ..arrays import FloatArray, IndexArray
 from ..fem.space import shared_sum
 from .parents import Layout
 
@@ -25,8 +28,8 @@ def empty_matrix(dofs: Layout) -> PETSc.Mat:
     local, d = owned + dofs.index_map.num_ghosts, dofs.cells.shape[1] - 1
     cells = dofs.cells[: dofs.mesh.topology.index_map(d).size_local]
     inside = d * np.bincount(cells.ravel(), minlength=local).astype(np.float64)
-    outside = np.zeros(local)  # in columns that the row's rank does not own
     if comm.size > 1:
+        outside = np.zeros(local)  # in columns that the row's rank does not own
         owner = np.full(local, comm.rank)
         owner[owned:] = dofs.index_map.owners
         there = cells[np.unique(np.flatnonzero(cells.ravel() >= owned) // (d + 1))]
@@ -34,13 +37,16 @@ def empty_matrix(dofs: Layout) -> PETSc.Mat:
         np.add.at(outside, there, apart.sum(axis=2))
         inside = shared_sum(comm, dofs.index_map, inside - outside)
         shared_sum(comm, dofs.index_map, outside)
-    elsewhere = dofs.index_map.size_global - owned
-    most = (1.0 + inside, owned), (outside, elsewhere)  # PETSc refuses more than that
-    lengths = [
-        np.repeat(block * np.minimum(n[:owned], columns), block).astype(PETSc.IntType)
-        for n, columns in most
-    ]
-    nnz = lengths if comm.size > 1 else lengths[0]
+
+    def lengths(entries: FloatArray, columns: int) -> IndexArray:
+        """Count for each unknown; PETSc refuses more than there are columns."""
+        of_nodes = block * np.minimum(entries[:owned], columns).astype(PETSc.IntType)
+        return of_nodes if block == 1 else np.repeat(of_nodes, block)
+
+    here = lengths(1.0 + inside, owned)
+    nnz: Any = here
+    if comm.size > 1:
+        nnz = here, lengths(outside, dofs.index_map.size_global - owned)
     matrix = PETSc.Mat().createAIJ((dofs.size, dofs.size), block, nnz=nnz, comm=comm)
     # PETSc does not set it on ranks without rows, and these alone would then wait for an answer
     # when the matrix is assembled
