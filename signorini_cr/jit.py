@@ -137,7 +137,7 @@ def _tell_of_compiler(comm: MPI.Comm, error: BaseException | None) -> None:
     if (words := comm.bcast(words)) is not None:
         raise InputError(
             f"forms cannot be compiled: {words}; a C compiler that works is needed, and CC may"
-            " name it"
+            " name it; numbers in forms must be finite"
         )
 
 

@@ -284,8 +284,13 @@ def _wanted(
     wanted = {}
     for name, own in given.items():
         usual = [parts[name]] if own is None and name in needed else []
-        numbers = np.asarray(usual if own is None else own, dtype=np.int32)
-        wanted[name] = np.unique(np.atleast_1d(numbers))
+        numbers = np.atleast_1d(np.asarray(usual if own is None else own))
+        known = np.iinfo(np.int32)
+        if numbers.size and not (
+            numbers.dtype.kind in "iu" and known.min <= numbers.min() <= numbers.max() <= known.max
+        ):
+            raise InputError(f"{name} is {own!r}: facet values are whole numbers of 32 bits")
+        wanted[name] = np.unique(numbers.astype(np.int32))
     for a, b in itertools.combinations(wanted, 2):
         if len(both := np.intersect1d(wanted[a], wanted[b])):
             raise InputError(

@@ -147,7 +147,7 @@ def triangulate(
             np.repeat(labels, [len(ends) for ends in found]),
         )
     if (narrow := too_thin(raw.points[raw.triangles])) is not None:
-        raise InputError(f"the polygon is too narrow, or its edges are too different: {narrow}")
+        raise InputError(f"the polygon is too narrow, too small or too uneven: {narrow}")
     raw = raw._replace(points=raw.points + away)
     if not polygons:
         return raw

@@ -16,6 +16,10 @@ A gradient on such a cell is the difference of two that are as many times larger
 matrix has the square of that, of which rounding leaves four digits here, and none from 10⁸ on.
 """
 
+SMALLEST = 1e-30
+"""Lengths that are possible: of shorter ones, and of the finer meshes' made of them, products as
+the certificate's would be lost."""
+
 
 def thinness(corners: FloatArray) -> FloatArray:
     """Compute how many times as long as their least height cells are, inf without any.
@@ -39,12 +43,19 @@ def thinness(corners: FloatArray) -> FloatArray:
 
 
 def too_thin(corners: FloatArray) -> str | None:
-    """Say which cell is thinner than `THINNEST`, and where, if any is.
+    """Say which cell is thinner than `THINNEST`, or shorter than `SMALLEST`, if any is.
 
     Args:
         corners: Of triangles or tetrahedra, shape (n, d + 1, d).
     """
     found = thinness(corners)
+    length = np.abs(corners[:, 1:] - corners[:, :1]).max(axis=(1, 2))
+    if len(small := np.flatnonzero(length < SMALLEST)) and length[small[0]] > 0.0:
+        return (
+            f"the cell at ({', '.join(f'{x:g}' for x in corners[small[0], 0])}) is"
+            f" {length[small[0]]:.2g} long: lengths from {SMALLEST:g} on are possible, in other"
+            " units perhaps"
+        )
     bad = np.flatnonzero(~(found <= THINNEST))
     if not len(bad):
         return None

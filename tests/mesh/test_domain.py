@@ -667,6 +667,26 @@ def test_own_cells_that_are_too_thin(squeezed: float, told: str, dim: int) -> No
 
 
 @pytest.mark.parametrize("dim", [2, 3])
+def test_own_meshes_that_are_too_small(dim: int) -> None:
+    """Products of lengths would be 0, and intervals of means wrong, from some 1e-42 on."""
+    make = dolfinx.mesh.create_unit_square if dim == 2 else dolfinx.mesh.create_unit_cube
+    mesh = make(COMM, *[2] * dim)
+    mesh.geometry.x[:] *= 1e-40
+    tags = dolfinx.mesh.meshtags(mesh, dim - 1, np.array([], dtype=np.int32), 1)
+    assert "is 5e-41 long: lengths from 1e-30 on" in fails_alike(Domain.from_tags, mesh, tags)
+    polygon = Polygon([(0, 0), (1e-40, 0), (0, 1e-40)], ["contact", "dirichlet", "neumann"])
+    assert "lengths from 1e-30 on are possible" in fails_alike(polygon.mesh, 1e-40)
+
+
+@pytest.mark.parametrize("wrong", [1.5, "1", True, 2**40, float("nan"), [1, 2.5]])
+def test_own_facet_values_that_are_none(wrong) -> None:
+    mesh = dolfinx.mesh.create_unit_square(COMM, 2, 2)
+    tags = dolfinx.mesh.meshtags(mesh, 1, np.array([], dtype=np.int32), 1)
+    said = fails_alike(lambda: Domain.from_tags(mesh, tags, contact=wrong))
+    assert said == f"contact is {wrong!r}: facet values are whole numbers of 32 bits"
+
+
+@pytest.mark.parametrize("dim", [2, 3])
 def test_own_meshes_that_are_folded(dim: int) -> None:
     """A vertex is drawn out of the mesh: some of its cells come to lie over others."""
     make = dolfinx.mesh.create_unit_square if dim == 2 else dolfinx.mesh.create_unit_cube
