@@ -206,6 +206,7 @@ ODD = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ODD)
 def test_names_are_of_no_matter(kind: str, read) -> None:
     """What is solved, and asked for, is what it is with plain names."""
