@@ -11,17 +11,13 @@ process already has, does not count.
 from __future__ import annotations
 
 import argparse
-import gc
-import time
 from statistics import median
 
-from harness import keep_memory
-from mpi4py import MPI
+from cases import comm, timed
+from harness import in_turns, keep_memory
 
 from signorini_cr import exact
 from signorini_cr.mesh.refinement import refine
-
-COMM = MPI.COMM_WORLD
 
 
 def main() -> None:
@@ -34,21 +30,13 @@ def main() -> None:
     domain = exact.S1.structured(23)
     while 4 * 1.5 * domain.mesh.topology.index_map(2).size_global < arguments.dofs:
         domain, _ = refine(domain)
-    seconds = []
-    for _ in range(1 + arguments.repeats):
-        gc.collect()
-        COMM.Barrier()
-        began = time.perf_counter()
-        fine, _ = refine(domain)
-        COMM.Barrier()
-        seconds.append(time.perf_counter() - began)
-        cells = fine.mesh.topology.index_map(2).size_global
-        del fine
-    if COMM.rank == 0:
-        counted = seconds[1:]
+    cells = 4 * domain.mesh.topology.index_map(2).size_global
+    runs = in_turns({"refine": lambda: timed(lambda: refine(domain))}, arguments.repeats)
+    seconds = runs["refine"]
+    if comm.rank == 0:
         print(
-            f"{COMM.size} ranks, {cells} cells: median {median(counted):.3f} s,"
-            f" least {min(counted):.3f} s"
+            f"{comm.size} ranks, {cells} cells: median {median(seconds):.3f} s,"
+            f" least {min(seconds):.3f} s"
         )
 
 

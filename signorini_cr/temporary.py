@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-from pathlib import Path
 
 ROOM = 2_000_000
 """Bytes that compiling a form takes, at most."""
@@ -40,19 +39,14 @@ def choose() -> str | None:
         OSError: There is none; the message is for the user.
     """
     named = [place for name in VARIABLES if (place := os.environ.get(name))]
-    found: dict[str, str] = {}
+    faults: list[str] = []
     for place in (*named, *USUAL):
         if (words := fault(place)) is None:
             break
-        found.setdefault(place, words)
+        faults.append(f"temporary files cannot be kept in {place} ({words})")
     else:
-        first, words = next(iter(found.items()))
-        raise OSError(
-            f"temporary files cannot be kept in {first} ({words}), nor in another usual place;"
-            " TMPDIR may name a folder"
-        )
-    if not found:
+        raise OSError(f"{faults[0]}, nor in another usual place; TMPDIR may name a folder")
+    if not faults:
         return None
     os.environ["TMPDIR"] = tempfile.tempdir = place
-    first, words = next(iter(found.items()))
-    return f"temporary files cannot be kept in {first} ({words}): {Path(place)} takes them"
+    return f"{faults[0]}: {place} takes them"

@@ -68,8 +68,10 @@ def _used_in(datum: Datum, data: Collection[Datum], domain: Domain, weights: Wei
     if name is not None:
         return materials.where(name)[: len(used)]
     if section == "data":
-        for other in {each.name for each in data if each[::2] == ("material", key)}:
-            used &= ~materials.where(str(other))[: len(used)]
+        own = {each.name for each in data if each.section == "material" and each.key == key}
+        for other in materials.numbers:
+            if other in own:
+                used &= ~materials.where(other)[: len(used)]
     return used
 
 

@@ -52,20 +52,19 @@ def too_thin(corners: FloatArray) -> str | None:
     length = np.abs(corners[:, 1:] - corners[:, :1]).max(axis=(1, 2))
     if len(small := np.flatnonzero(length < SMALLEST)) and length[small[0]] > 0.0:
         return (
-            f"the cell at ({', '.join(f'{x:g}' for x in corners[small[0], 0])}) is"
-            f" {length[small[0]]:.2g} long: lengths from {SMALLEST:g} on are possible, in other"
-            " units perhaps"
+            f"the cell at {_place(corners[small[0], 0])} is {length[small[0]]:.2g} long: lengths"
+            f" from {SMALLEST:g} on are possible, in other units perhaps"
         )
     bad = np.flatnonzero(~(found <= THINNEST))
     if not len(bad):
         return None
-    ratio, place = found[bad[0]], ", ".join(f"{x:g}" for x in corners[bad[0], 0])
+    ratio, place = found[bad[0]], _place(corners[bad[0], 0])
     kind = "triangle" if corners.shape[2] == 2 else "tetrahedron"
     # rounding may leave a little where there is nothing
     if ratio > 1e13:
-        return f"the {kind} at ({place}) has no {'area' if kind == 'triangle' else 'volume'}"
+        return f"the {kind} at {place} has no {'area' if kind == 'triangle' else 'volume'}"
     return (
-        f"the {kind} at ({place}) is {ratio:.2g} times as long as it is high: up to"
+        f"the {kind} at {place} is {ratio:.2g} times as long as it is high: up to"
         f" {THINNEST:.0e} times is possible"
     )
 
@@ -99,8 +98,12 @@ def folded(mesh: Mesh) -> str | None:
     bad = np.flatnonzero(np.abs(sides.array[: of_facets.size_local]) > 1.5).astype(np.int32)
     if not len(bad):
         return None
-    place = ", ".join(f"{x:g}" for x in compute_midpoints(mesh, d - 1, bad[:1])[0, :d])
-    return f"cells overlap at the facet around ({place}): both lie on the same side of it"
+    place = _place(compute_midpoints(mesh, d - 1, bad[:1])[0, :d])
+    return f"cells overlap at the facet around {place}: both lie on the same side of it"
+
+
+def _place(x: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in x) + ")"
 
 
 def _determinants(spans: FloatArray) -> FloatArray:

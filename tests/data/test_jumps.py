@@ -11,7 +11,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
-from helpers import HELD_ABOVE, SQUARE
+from helpers import HELD_ABOVE, SIDES, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -228,8 +228,7 @@ def test_data_that_differ_on_an_edge(name, a):
     The problem that a weight and the data on the edge belong to is u = −0.1 − 1.4 y + 1.5 y², whose
     integral over it is −0.3; with g = 0.5 there J is that of the number 0.5.
     """
-    names = ("floor", "right", "top", "left")
-    polygon = Polygon([[a, 0], [a + 1, 0], [a + 1, 1], [a, 1]], names, names=names)
+    polygon = Polygon(np.add(SQUARE.vertices, [a, 0.0]), SIDES, names=SIDES)
 
     def there(value):
         return lambda x: ufl.conditional(HOLD[name](x, a), value, 0.0)

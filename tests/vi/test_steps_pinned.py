@@ -22,12 +22,13 @@ from petsc4py import PETSc
 
 sys.path[:0] = [str(Path(__file__).parent.parent)]
 
+from helpers import SQUARE  # noqa: E402
+
 from signorini_cr import (  # noqa: E402
     Contact,
     Dirichlet,
     Domain,
     Neumann,
-    Polygon,
     Problem,
     Robin,
     exact,
@@ -41,12 +42,11 @@ from signorini_cr.options import PREFIX  # noqa: E402
 pytestmark = pytest.mark.slow
 
 WORLD = MPI.COMM_WORLD
-EDGES = ("floor", "right", "top", "left")
 
 
 def square(n: int = 6, height: float = 1.0) -> Domain:
     """(0, 1)², squashed, all edges parts of their own."""
-    domain = structured(Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], EDGES, names=EDGES), n)
+    domain = structured(SQUARE, n)
     domain.mesh.geometry.x[:, 1] *= height
     return domain
 
