@@ -39,6 +39,10 @@ PASSED_ON = 0.3
 """Seconds for mpirun to pass on what a rank has printed, before that rank ends them all: MPICH's
 drops what it has not read by then."""
 
+LAST = 5.0
+"""Seconds for rank 0 to tell what keeps all from beginning, before one that has begun sooner ends
+and mpirun ends the others."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; collective under mpirun.
@@ -79,13 +83,14 @@ def room_for_recursion() -> Iterator[None]:
 def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
     """Start PETSc and do what the command says; whatever goes wrong becomes a message."""
     if (complaint := too_little()) is not None:
-        screen.complain(f"{args.file}: {complaint}")
-        return NOT_CONVERGED
+        return _refuse(screen, f"{args.file}: {complaint}", NOT_CONVERGED)
+    if sys.flags.optimize > 1:
+        words = "Python runs without docstrings (-OO, PYTHONOPTIMIZE=2), which compiling takes"
+        return _refuse(screen, words, BAD_INPUT)
     try:
         elsewhere = temporary.choose()
     except OSError as error:
-        screen.complain(str(error))
-        return BAD_INPUT
+        return _refuse(screen, str(error), BAD_INPUT)
     try:
         start_petsc(args.petsc)
         from mpi4py import MPI
@@ -150,6 +155,14 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
             traceback.print_exc()
             print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
         return _end_all(comm, FAULT)
+
+
+def _refuse(screen: Screen, words: str, status: int) -> int:
+    """Tell why MPI is not even begun; rank 0 is the first to leave, which ends the others."""
+    screen.complain(words)
+    if not screen.root:
+        time.sleep(LAST)
+    return status
 
 
 def _end_all(comm: Any, status: int) -> int:

@@ -137,6 +137,18 @@ def test_where_few_files_may_be_open_one_message_tells(most: int, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_without_docstrings_one_message_tells(ranks: int, tmp_path: Path) -> None:
+    """`python3 -OO`, in which the parser that compiling takes has no grammar."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = helpers.command(*argv, ranks=ranks, PYTHONOPTIMIZE="2")
+    assert done.returncode == cli.BAD_INPUT, done.stderr
+    assert done.stderr.count("Python runs without docstrings") == 1
+    assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
+
+
 PLACES = """import os, sys
 from signorini_cr import temporary
 os.environ.update(TMPDIR="/proc/nowhere")
