@@ -109,17 +109,16 @@ class VolumeMoments:
         if f.number is not None:
             return cls(np.full(n, f.number), None, None, f.number == 0.0)
         values = f.at(cells)
-        mean, variance = np.empty(n), np.empty(n)
         tests = np.concatenate([rule.hats, rule.bumps])
         tests = (tests - (tests @ rule.weights)[:, None]) * rule.weights
+        tests, variance = np.vstack([rule.weights, tests]), np.empty(n)
         rows = np.empty((len(tests), n))
         for part in blocks(n):
-            here = values[part]
-            mean[part] = here @ rule.weights
-            rows[:, part] = tests @ here.T
+            rows[:, part] = tests @ values[part].T
+            off = values[part] - rows[0, part, None]
             with np.errstate(over="ignore"):  # such data are refused where the load is known
-                variance[part] = (here - mean[part, None]) ** 2 @ rule.weights
-        return cls(mean, rows, variance)
+                variance[part] = np.square(off, out=off) @ rule.weights
+        return cls(rows[0], rows[1:], variance)
 
     def refined(self, f: Volume, cells: Cells, cut: Cut) -> VolumeMoments:
         """Return the same, with f integrated piece by piece where cells are cut."""

@@ -158,13 +158,19 @@ class System:
         data, V = self._data, self._data.V
         on_dirichlet, self.u_D = _imposed(data.fixed, V)
         floors, ceilings = ([b for b in data.bounds if b.sign == sign] for sign in (1, -1))
-        has_floor, floor = _imposed(floors, V)
-        has_ceiling, ceiling = _imposed(ceilings, V)
         self._read_contact(data.bounds)
-        # Where the two parts meet in a P1 vertex the Dirichlet value holds
-        bounded = (has_floor | has_ceiling) & ~on_dirichlet
-        self.lower = np.where(has_floor & bounded, floor.x.array, PETSc.NINFINITY)
-        self.upper = np.where(has_ceiling & bounded, -ceiling.x.array, PETSc.INFINITY)
+        bounded = np.zeros_like(on_dirichlet)
+        self.lower, self.upper = (
+            np.full(len(bounded), infinite) for infinite in (PETSc.NINFINITY, PETSc.INFINITY)
+        )
+        for bound, imposed, sign in (self.lower, floors, 1.0), (self.upper, ceilings, -1.0):
+            if not imposed:
+                continue
+            there, values = _imposed(imposed, V)
+            # Where the two parts meet in a P1 vertex the Dirichlet value holds
+            dofs = np.flatnonzero(there & ~on_dirichlet)
+            bound[dofs] = sign * values.x.array[dofs]
+            bounded[dofs] = True
         self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
         self._take_offset()
         self._part_bounds(np.flatnonzero(bounded))
@@ -254,12 +260,17 @@ class System:
 
     def _trivial(self) -> list[FloatArray]:
         """Multiply A by the most trivial start, and by that without its constant; collective."""
-        products, start, product = [], self.A.createVecRight(), self.A.createVecLeft()
+        comm, products = self._data.V.mesh.comm, []
+        start, product = self.A.createVecRight(), self.A.createVecLeft()
         dirichlet = self.owned_dirichlet
         for number in dict.fromkeys((self._middle(), -self.offset)):
+            on_bounds = np.clip(number, self.bounds.lower, self.bounds.upper)
             start.array[:] = number
+            start.array[self.bounded] = on_bounds
             start.array[dirichlet] = self.u_D.x.array[dirichlet]
-            start.array[self.bounded] = np.clip(number, self.bounds.lower, self.bounds.upper)
+            if number == 0.0 and not comm.allreduce(bool(on_bounds.any()), op=MPI.LOR):
+                products.append(start.array_r.copy())  # 0 but for Γ0, whose rows are the identity's
+                continue
             self.A.mult(start, product)
             products.append(product.array_r.copy())
         release(start, product)
@@ -278,13 +289,16 @@ class System:
             trivial: As `_trivial` has it.
         """
         comm, b = self._data.V.mesh.comm, self.b[: self.A.getLocalSize()[0]]
+        residuals = [each - b for each in trivial]
         with np.errstate(over="ignore", invalid="ignore"):
-            squares = np.array([np.sum((each - b) ** 2) for each in trivial])
+            squares = np.array([each @ each for each in residuals])
         norms = np.sqrt(summed(comm, squares))
         scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
         if not np.isfinite(norms).all():
             raise InputError("data: so large that their squares overflow; choose other units")
-        largest = max(float(np.abs(each - b).max(initial=0.0)) for each in trivial)
+        largest = max(
+            float(max(each.max(initial=0.0), -each.min(initial=0.0))) for each in residuals
+        )
         if 0.0 < max(comm.allgather(largest)) < TINY:
             raise InputError("data: so small that their squares are lost; choose other units")
         return scale
