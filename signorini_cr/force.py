@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -174,18 +173,10 @@ def _harmonic(
         free: Parts of Γ1 on which it is neither: there is no contact.
         value: What it is there, 1 or a weight.
     """
-    problem = forms.problem
     found: dict[str, Condition] = {}
     for each in forms.conditions:
         if (each.fixed is not None or each.bounds) and each not in free:
             found[each.part] = Dirichlet(value if each in chosen else 0.0)
         else:
             found[each.part] = Robin(0.0, coefficient=0.0 if each.loss is None else each.loss)
-    return Problem(
-        f=0.0,
-        coefficient=problem.coefficient,
-        reaction=problem.reaction,
-        conditions=found,
-        materials={name: replace(each, f=None) for name, each in problem.materials.items()},
-        quadrature_degree=problem.quadrature_degree,
-    )
+    return forms.problem.linear(0.0, found)

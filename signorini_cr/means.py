@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from dolfinx import fem
@@ -19,7 +18,7 @@ from .estimate.settled import Settled, in_p1, left_by
 from .estimate.weights import scalar
 from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
-from .fem.problem import Forms, Material, Problem
+from .fem.problem import Forms, Problem
 from .fem.space import function_space, shared_sum
 from .mesh.domain import Domain, named
 
@@ -155,7 +154,6 @@ def _dual(forms: Forms, where: str | None, weight: Data, held: Sequence[Conditio
 
     On Γ1 e is free, and so is z, but for the parts that are held.
     """
-    problem = forms.problem
     conditions: dict[str, Condition] = {}
     for each in forms.conditions:
         if each.fixed is not None or each in held:
@@ -163,17 +161,9 @@ def _dual(forms: Forms, where: str | None, weight: Data, held: Sequence[Conditio
         else:
             g, b = weight if each.part == where else 0.0, 0.0 if each.loss is None else each.loss
             conditions[each.part] = Robin(g, coefficient=b)
-    materials = {name: replace(each, f=None) for name, each in problem.materials.items()}
-    if where is not None and where not in conditions:
-        materials[where] = replace(materials.get(where, Material()), f=weight)
-    return Problem(
-        f=weight if where is None else 0.0,
-        coefficient=problem.coefficient,
-        reaction=problem.reaction,
-        conditions=conditions,
-        materials=materials,
-        quadrature_degree=problem.quadrature_degree,
-    )
+    if where is None:
+        return forms.problem.linear(weight, conditions)
+    return forms.problem.linear(0.0, conditions, {} if where in conditions else {where: weight})
 
 
 def _paired(z: Dual, made: Made, cells: Cells, where: str | None, width: float) -> Pairing:

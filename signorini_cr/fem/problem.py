@@ -11,8 +11,9 @@ have conditions of their own (see `conditions`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any
 
 import basix.ufl
@@ -143,6 +144,34 @@ class Problem:
             degree = getattr(self, name)
             if not isinstance(degree, int | np.integer) or degree < 0:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
+
+    def linear(
+        self,
+        f: Data,
+        conditions: Mapping[str, Condition],
+        own: Mapping[str, Data] = MappingProxyType({}),
+    ) -> Problem:
+        """Make the problem with the same κ and c, but with other loads and conditions.
+
+        Args:
+            f: Its volume load.
+            conditions: What holds on parts of the boundary, all of them.
+            own: The volume loads of materials that have their own, by name.
+        """
+        materials = {name: replace(each, f=None) for name, each in self.materials.items()}
+        for name, load in own.items():
+            materials[name] = replace(materials.get(name, Material()), f=load)
+        unused = Problem()
+        return replace(
+            self,
+            f=f,
+            g=unused.g,
+            obstacle=unused.obstacle,
+            dirichlet=unused.dirichlet,
+            conditions=conditions,
+            materials=materials,
+            exact=None,
+        )
 
 
 def as_expression(data: Data, x: Expr, called: str = "data") -> Expr:
@@ -317,8 +346,10 @@ class Forms:
             None if problem.exact is None else as_expression(problem.exact, self.x, "exact")
         )
         # UFL can't differentiate a number
-        level = self.exact is None or as_number(self.exact) is not None or problem.form is not None
-        flux = None if level else self.kappa * ufl.grad(self.exact)
+        constant = (
+            self.exact is None or as_number(self.exact) is not None or problem.form is not None
+        )
+        flux = None if constant else self.kappa * ufl.grad(self.exact)
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
         self.asked = None if flux is None else simplified(-ufl.div(flux))
