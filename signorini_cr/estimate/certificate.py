@@ -311,9 +311,9 @@ class _Known:
     flux: Flux
     w: FloatArray
     size: float
-    left: float
-    unsure: float
-    carried: float
+    left: float = 0.0
+    unsure: float = 0.0
+    carried: float = 0.0
 
 
 def _equilibrated(solution: Found, base: Found) -> _Known:
@@ -345,54 +345,64 @@ def _equilibrated(solution: Found, base: Found) -> _Known:
     _insist(next((each.reason for each in (segments, *squares) if each.reason), None))
     # y is to have the means that f − c u_h and g − b u_h have now
     flux.left += cells.volume * (certain.load.mean - rest.mean)
-    change = _given_to_loss(flux, segments, segments.through - edge.shares.sum(axis=0))
-    flux.excess[edge.side.local, edge.side.cells] += change
-    np.add.at(flux.left, edge.side.cells, change)
-    left, carried = _closed(level, cells, kappa, c.low, flux, size)
-    fixed = sum(len(cells.sides[each.number].dofs) for each in data.forms.fixed)
-    unsure = _of_means(level, cells, kappa, c, certain, segments, size) if left < np.inf else 0.0
-    if np.isposinf(left) or (not cells.total(fixed)[0] and left + unsure > DEAR * size):
-        # nothing but contact holds u, or nothing firm does: a weak b or c is a dear way out
-        missed = _missed(cells, certain, segments)
-        by_contact = _carried_to_contact(cells, kappa, c.low, flux, contact, missed)
-        if by_contact < left + unsure or np.isposinf(left):
-            left, unsure = by_contact, 0.0
-        else:
-            flux.carried = None
+    _give_means(flux, segments, segments.through - edge.shares.sum(axis=0))
+    known = _Known(level, cells, kappa, c, b, square, squares, certain, segments, flux, w, size)
+    _close(known, contact, sum(len(cells.sides[each.number].dofs) for each in data.forms.fixed))
     if kappa.values is not None:
         kappa.enclose(cells, flux.steepness, field_squares(cells, flux.excess), size)
-    known = level, cells, kappa, c, b, square, squares, certain, segments, flux, w
-    return _Known(*known, size, left, unsure, carried)
+    return known
 
 
-def _given_to_loss(flux: Flux, segments: Segments, change: FloatArray) -> FloatArray:
-    """Let b take up by how much integrals of g − b u_h change, where that is cheaper; collective.
+def _give_means(flux: Flux, segments: Segments, change: FloatArray) -> None:
+    """Change the integrals of y·n, but where it is cheaper that b takes the change up; collective.
 
     Where b is large, what the scheme's own rule misses of b u_ext would be large in y.
-
-    Returns:
-        What y is to change by.
     """
     taken = np.where(segments.given, change, 0.0)
     if segments.cells.comm.allreduce(bool(taken.any()), op=MPI.LOR):
         flux.shed = taken if flux.shed is None else flux.shed + taken
-    return np.asarray(change - taken)
+    side, change = segments.facets, change - taken
+    flux.excess[side.local, side.cells] += change
+    np.add.at(flux.left, side.cells, change)
 
 
-def _closed(
-    level: Level, cells: Cells, kappa: Coefficient, c: FloatArray, flux: Flux, size: float
-) -> tuple[float, float]:
+def _close(known: _Known, contact: BoundaryFacets, fixed: int) -> None:
+    """See to what is left of −div y = f: `left`, `unsure` and `carried`; collective.
+
+    Args:
+        known: All else.
+        contact: Γ1, in the order of `Flux.contact`.
+        fixed: How many facets Γ0 has, seen from this rank's cells.
+    """
+    cells, flux, c = known.cells, known.flux, known.c.low
+    known.left, known.carried = _balanced(known)
+    known.unsure = _of_means(known) if known.left < np.inf else 0.0
+    dear = known.left + known.unsure > DEAR * known.size
+    if not (np.isposinf(known.left) or (dear and not cells.total(fixed)[0])):
+        return
+    # nothing but contact holds u, or nothing firm does: a weak b or c is a dear way out
+    by_contact = _carried_to_contact(
+        cells, known.kappa, c, flux, contact, _missed(cells, known.certain, known.segments)
+    )
+    if by_contact < known.left + known.unsure or np.isposinf(known.left):
+        known.left, known.unsure = by_contact, 0.0
+    else:
+        flux.carried = None
+
+
+def _balanced(known: _Known) -> tuple[float, float]:
     """Balance y where no reaction takes up what is left of the equation; collective.
 
     Returns:
         `_Known.left`, infinite where nothing holds u, and `_Known.carried`.
     """
+    cells, flux, kappa, c = known.cells, known.flux, known.kappa, known.c.low
     if flux.taken_up is not None and not c.ndim:
         return 0.0, 0.0
-    left = unbalanced(level, cells, flux.unbalanced, kappa.least, size, c)
-    carried = balance(cells, flux, kappa.low, size, left)
+    left = unbalanced(known.level, cells, flux.unbalanced, kappa.least, known.size, c)
+    carried = balance(cells, flux, kappa.low, known.size, left)
     if carried:
-        left = unbalanced(level, cells, flux.unbalanced, kappa.least, size, c)
+        left = unbalanced(known.level, cells, flux.unbalanced, kappa.least, known.size, c)
     return left, carried
 
 
@@ -535,31 +545,11 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
     Raises:
         _NoBound: With the reason.
     """
-    cells, kappa, segments = known.cells, known.kappa, known.segments
-    totals, load = sums.totals, known.certain.load
-    totals.loose = integrate_edge(
-        cells, kappa, known.w, load, segments, known.flux, v, sums, known.c.low
-    )
-    totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
-    totals.energy_slack += more_energy
-    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
-    of_edge = segments.measure @ (segments.weights @ (segments.values * on_edge))
-    totals.energy -= float(of_edge)
-    if known.square is not None:
-        totals.energy -= 0.5 * float(cells.volume @ known.square.load.mean)
-        own = cells.volume * np.abs(known.square.load.mean) * 1e-14
-        if known.square.missed is not None:
-            own += known.square.missed
-        totals.energy_slack += 0.5 * float(np.sum(own))
-    lost, unsure = half(known.squares)
-    totals.energy -= lost
-    totals.energy_slack += unsure
-    totals.contact = float(np.sum(v.contact))
-    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
-    totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
+    cells, kappa = known.cells, known.kappa
+    _complete(known, v, sums)
     hidden, hidden_energy = _hidden(known, v, sums)
-    rounding = _rounding(cells, kappa, known.c.high, known.w, load, known.flux)
-    total = totals.over_ranks(cells)
+    rounding = _rounding(cells, kappa, known.c.high, known.w, known.certain.load, known.flux)
+    total = sums.totals.over_ranks(cells)
 
     ball = _Ball.of(total, known.left, hidden, rounding)
     _insist(v.reason or (ADRIFT if np.isposinf(known.left) else None))
@@ -584,6 +574,30 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
         indicators=sums.indicators,
         _made=_made(known, v, ball, lift),
     )
+
+
+def _complete(known: _Known, v: Companion, sums: Sums) -> None:
+    """Add to what was integrated over cells what facets, ℓ, and c and b that vary have of it."""
+    cells, kappa, segments, totals = known.cells, known.kappa, known.segments, sums.totals
+    load = known.certain.load
+    integrate_edge(cells, kappa, known.w, load, segments, known.flux, v, sums, known.c.low)
+    totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
+    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
+    lost, unsure = half(known.squares)
+    totals.energy -= lost + float(
+        segments.measure @ (segments.weights @ (segments.values * on_edge))
+    )
+    totals.energy_slack += more_energy + unsure
+    if known.square is not None:
+        means = known.square.load.mean
+        own = 1e-14 * cells.volume * np.abs(means)
+        if known.square.missed is not None:
+            own += known.square.missed
+        totals.energy -= 0.5 * float(cells.volume @ means)
+        totals.energy_slack += 0.5 * float(np.sum(own))
+    totals.contact = float(np.sum(v.contact))
+    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
+    totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -743,20 +757,20 @@ def _rounding(
     """
     largest = None if flux.beyond is None else flux.beyond.largest(cells)
     total = 0.0
-    for part in blocks(cells.number):
-        low, high = pick(kappa.low, part), pick(kappa.high, part)
-        values = np.maximum(w[:, part].max(axis=0), -w[:, part].min(axis=0))
-        trace = cells.trace(part)
+    for block in blocks(cells.number):
+        low, high = pick(kappa.low, block), pick(kappa.high, block)
+        values = np.maximum(w[:, block].max(axis=0), -w[:, block].min(axis=0))
+        trace = cells.trace(block)
         square = high * trace * values**2
-        of_load = np.abs(load.mean[part])
+        of_load = np.abs(load.mean[block])
         if load.variance is not None:
-            of_load += np.sqrt(load.variance[part])
-        square += cells.diameter2[part] * cells.volume[part] * of_load**2 / low
-        square += pick(reaction, part) * cells.volume[part] * values**2
+            of_load += np.sqrt(load.variance[block])
+        square += cells.diameter2[block] * cells.volume[block] * of_load**2 / low
+        square += pick(reaction, block) * cells.volume[block] * values**2
         if largest is not None:
-            square += trace * largest[part] ** 2 / low
+            square += trace * largest[block] ** 2 / low
         if cells.stretch is not None:  # it is as good as κ's eigenvalues are near to one another
-            square *= (kappa.most[part] / kappa.least[part]) ** 2
+            square *= (kappa.most[block] / kappa.least[block]) ** 2
         total += float(np.sum(square))
     return float(ROUNDING * np.sqrt(cells.total(total)[0]))
 
@@ -775,17 +789,17 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     square, change = 0.0, 0.0
     if certain.missed is not None and certain.rough is not None:
         missed = certain.missed
-        for part in blocks(cells.number):
-            by_slope = rough = mean_to_norm(cells, kappa.low, NOTHING, part) * certain.rough[part]
+        for block in blocks(cells.number):
+            by_slope = rough = mean_to_norm(cells, kappa.low, NOTHING, block) * certain.rough[block]
             if reacts(known.c.low):
-                rough = mean_to_norm(cells, kappa.low, known.c.low, part) * certain.rough[part]
-            means = np.abs(sum_rows(v.vertices[cells.vertices[:, part]])) / (cells.tdim + 1)
+                rough = mean_to_norm(cells, kappa.low, known.c.low, block) * certain.rough[block]
+            means = np.abs(sum_rows(v.vertices[cells.vertices[:, block]])) / (cells.tdim + 1)
             if cells.tdim == 2:
-                means += sum_rows(np.abs(v.bumps[cells.facets[:, part]])) / 3
+                means += sum_rows(np.abs(v.bumps[cells.facets[:, block]])) / 3
             if v.bubbles is not None:
-                means += np.abs(v.bubbles[part]) / 60
-            steep = np.sqrt(np.maximum(sums.steepness[part], 0.0))
-            change += float(means @ missed[part] + by_slope @ steep)
+                means += np.abs(v.bubbles[block]) / 60
+            steep = np.sqrt(np.maximum(sums.steepness[block], 0.0))
+            change += float(means @ missed[block] + by_slope @ steep)
             square += float(rough @ rough)
         if v.cusps is not None:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
@@ -804,20 +818,13 @@ def _misses(cells: Cells, certain: Certain, segments: Segments) -> bool:
     return any(cells.total(certain.missed is not None, bool(segments.missed.any())))
 
 
-def _of_means(
-    level: Level,
-    cells: Cells,
-    kappa: Coefficient,
-    c: Reaction,
-    certain: Certain,
-    segments: Segments,
-    size: float,
-) -> float:
+def _of_means(known: _Known) -> float:
     """Bound what quadrature may have missed of integrals of f and g, see `_missed`; collective."""
+    cells, certain, segments = known.cells, known.certain, known.segments
     if not _misses(cells, certain, segments):
         return 0.0
     missed = _missed(cells, certain, segments)
-    return unbalanced(level, cells, missed, kappa.least, size, c.low)
+    return unbalanced(known.level, cells, missed, known.kappa.least, known.size, known.c.low)
 
 
 def _missed(cells: Cells, certain: Certain, segments: Segments) -> FloatArray:

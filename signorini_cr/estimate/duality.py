@@ -55,8 +55,8 @@ def integrate(
     sums = Sums.empty(cells.number, reacts(reaction))
     most = reaction if most is None else most
     gap = _Gap(cells, kappa, w, load, flux, v, reaction, most, sums)
-    for part in blocks(cells.number):
-        gap.add(part)
+    for block in blocks(cells.number):
+        gap.add(block)
     return sums
 
 
@@ -103,30 +103,30 @@ class _Gap:
     most: FloatArray
     sums: Sums
 
-    def add(self, part: slice) -> None:
+    def add(self, block: slice) -> None:
         """Add what a range of cells has of the gap."""
-        height = self.v.bumps[self.cells.facets[:, part]] if self.cells.tdim == 2 else None
-        products = self._products(part, height)
-        self._add_fields(part, products)
-        moment = self._moment(part, height)
+        height = self.v.bumps[self.cells.facets[:, block]] if self.cells.tdim == 2 else None
+        products = self._products(block, height)
+        self._add_fields(block, products)
+        moment = self._moment(block, height)
         if moment is not None:
-            self._add_oscillation(part, products.pp, moment)
-        self._add_zeroth(part, height)
-        self._add_energy(part, products.vv, moment, height)
+            self._add_oscillation(block, products.pp, moment)
+        self._add_zeroth(block, height)
+        self._add_energy(block, products.vv, moment, height)
 
-    def _products(self, part: slice, height: FloatArray | None) -> _Products:
+    def _products(self, block: slice, height: FloatArray | None) -> _Products:
         """Integrate the products of p, b and ∇v, exactly where κ and y allow for it."""
         cells, kappa, flux, v, w = self.cells, self.kappa, self.flux, self.v, self.w
         if kappa.values is None and flux.beyond is None:
             missed = np.zeros(3)
-            found = _Products(*_exact(cells, kappa, part, flux, v, w, height), *missed)
+            found = _Products(*_exact(cells, kappa, block, flux, v, w, height), *missed)
         else:
-            found = _Products(*_by_quadrature(cells, kappa, part, flux, v, w))
+            found = _Products(*_by_quadrature(cells, kappa, block, flux, v, w))
         if kappa.tensor is None:
             return found
         square, cross = found.pp + found.bb, 2.0 * found.pb
         gap = square - cross, square + cross
-        vv, far, near, energy = _of_tensor(cells, kappa, part, flux, v, w, gap)
+        vv, far, near, energy = _of_tensor(cells, kappa, block, flux, v, w, gap)
         return replace(
             found,
             vv=vv,
@@ -135,13 +135,13 @@ class _Gap:
             energy=found.energy + energy,
         )
 
-    def _add_fields(self, part: slice, found: _Products) -> None:
+    def _add_fields(self, block: slice, found: _Products) -> None:
         """Begin the cells' shares with p and b."""
         sums, totals = self.sums, self.sums.totals
         square = found.pp + found.bb
-        sums.indicators[part], sums.steepness[part] = square, found.vv
-        sums.middle[part] = found.near + (square + 2.0 * found.pb)
-        sums.across[part] = found.far + (square - 2.0 * found.pb)
+        sums.indicators[block], sums.steepness[block] = square, found.vv
+        sums.middle[block] = found.near + (square + 2.0 * found.pb)
+        sums.across[block] = found.far + (square - 2.0 * found.pb)
         totals.flux += float(np.sum(found.pp))
         totals.companion += float(np.sum(found.bb))
         totals.cross += float(np.sum(found.pb))
@@ -149,48 +149,48 @@ class _Gap:
         totals.near += float(np.sum(found.near))
         totals.energy_slack += float(np.sum(found.energy))
 
-    def _moment(self, part: slice, height: FloatArray | None) -> FloatArray | None:
+    def _moment(self, block: slice, height: FloatArray | None) -> FloatArray | None:
         """Compute means of (f − f_T)(v − u_h), shape (n,); None for f constant on each cell."""
         if self.load.hats is None or self.load.bumps is None:
             return None
-        moment = dot_rows(self.load.hats[:, part], self.v.excess[:, part])
+        moment = dot_rows(self.load.hats[:, block], self.v.excess[:, block])
         if height is not None:
-            moment += dot_rows(self.load.bumps[:, part], height)
+            moment += dot_rows(self.load.bumps[:, block], height)
         return moment
 
     # what f has beyond its means
 
-    def _add_oscillation(self, part: slice, pp: FloatArray, moment: FloatArray) -> None:
+    def _add_oscillation(self, block: slice, pp: FloatArray, moment: FloatArray) -> None:
         """Add σ, or where that is dear and c is large, what c takes up instead.
 
         Args:
-            part: Which cells.
+            block: Which cells.
             pp: ∫_T |p|², shape (n,).
             moment: Means of (f − f_T)(v − u_h), shape (n,).
         """
         cells, sums, reaction = self.cells, self.sums, self.reaction
-        load, volume = self.load, cells.volume[part]
+        load, volume = self.load, cells.volume[block]
         left = load.variance if self.flux.beyond is None else load.rest
         assert left is not None and load.variance is not None
-        square = poincare(cells.tdim) ** 2 * cells.diameter2[part] * volume * left[part]
-        share = square / pick(self.kappa.low, part)
-        taken = taken_up(cells, load, self.kappa.low, part, reaction)
+        square = poincare(cells.tdim) ** 2 * cells.diameter2[block] * volume * left[block]
+        share = square / pick(self.kappa.low, block)
+        taken = taken_up(cells, load, self.kappa.low, block, reaction)
         if taken is not None and sums.zeroth is not None:
-            whole = volume * load.variance[part]
-            np.divide(whole, pick(reaction, part), out=share, where=taken)
+            whole = volume * load.variance[block]
+            np.divide(whole, pick(reaction, block), out=share, where=taken)
             square = np.where(taken, 0.0, square)
-            sums.zeroth[part] = np.where(taken, share, 0.0)
-        sums.indicators[part] += share
+            sums.zeroth[block] = np.where(taken, share, 0.0)
+        sums.indicators[block] += share
         sums.totals.load += float(np.sum(share))
         work = volume * moment
         if self.flux.beyond is not None:
             if taken is not None:
                 sums.totals.load_companion += float(np.sum(work[taken]))
                 share = np.where(taken, 0.0, share)
-            _add_by_size(sums, part, share)
+            _add_by_size(sums, block, share)
             return
         sums.totals.load_companion += float(np.sum(work))
-        against, slack = self._against(part, pp, square, share)
+        against, slack = self._against(block, pp, square, share)
         if taken is not None:
             against, slack, work, share = (
                 np.where(taken, 0.0, each) for each in (against, slack, work, share)
@@ -198,44 +198,44 @@ class _Gap:
         sums.totals.load_flux += float(np.sum(against))
         sums.totals.slack += float(np.sum(slack))
         against += slack
-        sums.middle[part] += share + 2.0 * (against + work)
-        sums.across[part] += share + 2.0 * (against - work)
+        sums.middle[block] += share + 2.0 * (against + work)
+        sums.across[block] += share + 2.0 * (against - work)
 
     def _against(
-        self, part: slice, pp: FloatArray, square: FloatArray, weighted: FloatArray
+        self, block: slice, pp: FloatArray, square: FloatArray, weighted: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Compute ∫_T κ^{-1/2}σ·p, and bound how far that is off, shapes (n,).
 
         Args:
-            part: Which cells.
+            block: Which cells.
             pp: ∫_T |p|², shape (n,).
             square: Bound of ‖σ‖²_T, shape (n,).
             weighted: Bound of ‖κ^{-1/2}σ‖²_T, shape (n,).
         """
         cells, load = self.cells, self.load
-        P = self.flux.excess[:, part]
+        P = self.flux.excess[:, block]
         if cells.tdim == 2 and load.hats is not None and load.bumps is not None:
-            hats, bumps = load.hats[:, part], load.bumps[:, part]
-            against = _against_potential(cells, P, sum_rows(P), hats, bumps, part)
-            against /= pick(self.kappa.mean, part)
+            hats, bumps = load.hats[:, block], load.bumps[:, block]
+            against = _against_potential(cells, P, sum_rows(P), hats, bumps, block)
+            against /= pick(self.kappa.mean, block)
             slack = np.zeros_like(against)
         else:
             against, slack = np.zeros_like(pp), np.sqrt(weighted * pp)
         if self.kappa.varies:
             # κ⁻¹ − κ_T⁻¹ times y = (y − κ_T∇u_h) + κ_T∇u_h is no gradient: bound it
-            slack += np.sqrt(square) * _twist(cells, self.kappa, part, P, self.w[:, part])
+            slack += np.sqrt(square) * _twist(cells, self.kappa, block, P, self.w[:, block])
         return against, slack
 
     # terms without gradients
 
-    def _add_zeroth(self, part: slice, height: FloatArray | None) -> None:
+    def _add_zeroth(self, block: slice, height: FloatArray | None) -> None:
         """Add c‖v − u_h‖², what c takes up, and to the energy ½ c (v − u_h)² − ½ c u_h²."""
-        sums, totals, c, W = self.sums, self.sums.totals, self.v.excess[:, part], self.w[:, part]
+        sums, totals, c, W = self.sums, self.sums.totals, self.v.excess[:, block], self.w[:, block]
         if sums.zeroth is None or sums.apart is None:
             return
         d = self.cells.tdim
-        mass = pick(self.reaction, part) * self.cells.volume[part]
-        apart = pick(self.most, part) * self.cells.volume[part] * distance(c, height)
+        mass = pick(self.reaction, block) * self.cells.volume[block]
+        apart = pick(self.most, block) * self.cells.volume[block] * distance(c, height)
         totals.energy += 0.5 * float(np.sum(apart))
         if self.most is self.reaction:
             size = sum_rows(W) ** 2 + dot_rows(W, W)
@@ -243,58 +243,58 @@ class _Gap:
             totals.energy -= own
             totals.energy_slack += EPS * own
         else:
-            less = pick(self.most - self.reaction, part) * self.cells.volume[part]
+            less = pick(self.most - self.reaction, block) * self.cells.volume[block]
             totals.energy_slack += 0.5 * float(np.sum(less * distance(c, height)))
         totals.companion += float(np.sum(apart))
-        sums.apart[part] = apart
-        sums.zeroth[part] += apart
-        sums.indicators[part] += apart
+        sums.apart[block] = apart
+        sums.zeroth[block] += apart
+        sums.indicators[block] += apart
         if self.flux.taken_up is not None:
-            rest = np.where(self.flux.taken_up[part], self.flux.left[part], 0.0)
+            rest = np.where(self.flux.taken_up[block], self.flux.left[block], 0.0)
             given = np.divide(rest**2, mass, out=np.zeros_like(rest), where=rest != 0.0)
             means = sum_rows(c) / (d + 1)
             if height is not None:
                 means += sum_rows(height) / 3
             totals.load += float(np.sum(given))
             totals.load_companion += float(rest @ means)
-            sums.zeroth[part] += given
-            sums.indicators[part] += given
+            sums.zeroth[block] += given
+            sums.indicators[block] += given
 
     # the energy
 
     def _add_energy(
-        self, part: slice, vv: FloatArray, moment: FloatArray | None, height: FloatArray | None
+        self, block: slice, vv: FloatArray, moment: FloatArray | None, height: FloatArray | None
     ) -> None:
         """Add ½∫ κ|∇v|² − ∫ (f − c u_h) v.
 
         Args:
-            part: Which cells.
+            block: Which cells.
             vv: ∫_T κ|∇v|², shape (n,).
             moment: Means of (f − f_T)(v − u_h), shape (n,); None where f is constant on each cell.
             height: Heights of v's bumps, shape (3, n); None where it has none.
         """
         cells, load, totals = self.cells, self.load, self.sums.totals
-        d, volume, W = cells.tdim, cells.volume[part], self.w[:, part]
-        fv = load.mean[part] * (sum_rows(self.v.excess[:, part]) + sum_rows(W)) / (d + 1)
+        d, volume, W = cells.tdim, cells.volume[block], self.w[:, block]
+        fv = load.mean[block] * (sum_rows(self.v.excess[:, block]) + sum_rows(W)) / (d + 1)
         if height is not None:
-            fv += load.mean[part] * sum_rows(height) / 3
+            fv += load.mean[block] * sum_rows(height) / 3
         if self.v.bubbles is not None:
-            fv += load.mean[part] * self.v.bubbles[part] / 60
+            fv += load.mean[block] * self.v.bubbles[block] / 60
         if moment is not None and load.hats is not None:
-            hats = load.hats[:, part]
+            hats = load.hats[:, block]
             fv += dot_rows(hats, W)
             fv += moment
             if self.v.thirds is not None:
-                third = local_thirds(cells, self.v.thirds, part)
+                third = local_thirds(cells, self.v.thirds, block)
                 rise = 12.0 / 180.0 * np.stack([hats[j] - hats[k] for j, k in cells.others])
                 fv += dot_rows(third, rise)
                 # ∫_T c_F² = |T|/840, for what f has beyond its affine part
                 size = sum_rows(np.abs(third)) / np.sqrt(840.0)
                 if self.v.bubbles is not None:
-                    size += np.abs(self.v.bubbles[part]) / np.sqrt(2520.0)
+                    size += np.abs(self.v.bubbles[block]) / np.sqrt(2520.0)
                 left = load.variance if self.flux.beyond is None else load.rest
                 assert left is not None
-                totals.energy_slack += float(np.sum(volume * np.sqrt(left[part]) * size))
+                totals.energy_slack += float(np.sum(volume * np.sqrt(left[block]) * size))
         totals.energy += float(np.sum(0.5 * vv - volume * fv))
 
 
@@ -346,7 +346,7 @@ def integrate_edge(
     v: Companion,
     sums: Sums,
     reaction: FloatArray = NOTHING,
-) -> float:
+) -> None:
     """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
 
     σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
@@ -363,9 +363,6 @@ def integrate_edge(
         v: v.
         sums: What to add to.
         reaction: c, shape (cells,) or ().
-
-    Returns:
-        This rank's share of the square of what goes into ω.
     """
     at, sizes = edge.oscillation(flux.beyond is not None)
     low = pick(kappa.low, at)
@@ -380,11 +377,12 @@ def integrate_edge(
         jump = apart(cells, w, edge, v.vertices, v.bumps)
         sums.totals.load_companion += float(np.sum(taken * jump))
     if cells.tdim != 2:
-        return sums.totals.neumann
+        sums.totals.loose = sums.totals.neumann
+        return
     if flux.beyond is not None:
         sums.totals.load += sums.totals.neumann
         _add_by_size(sums, at, squares)
-        return 0.0
+        return
     # σ has been counted for f: ‖σ_f + σ_g‖² is at most ‖σ_f‖² and this more
     of_f = _size_of_oscillation(cells, kappa, load, at, reaction)
     more = (2.0 * of_f * sizes + sizes**2) / low
@@ -397,7 +395,6 @@ def integrate_edge(
         sums.totals.slack += float(np.sum(slack))
         for row in (sums.middle, sums.across):
             row[at] += 2.0 * slack
-    return 0.0
 
 
 def _size_of_oscillation(
@@ -540,41 +537,41 @@ def _twist(
 def _exact(
     cells: Cells,
     kappa: Coefficient,
-    part: slice,
+    block: slice,
     flux: Flux,
     v: Companion,
     w: FloatArray,
     height: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Integrate |p|², |b|², p·b and κ|∇v|² over T for constant κ, shapes (cells in the part,).
+    """Integrate |p|², |b|², p·b and κ|∇v|² over T for constant κ, shapes (cells in the block,).
 
     Args:
         cells: The mesh.
         kappa: The coefficient.
-        part: Which cells.
+        block: Which cells.
         flux: y.
         v: v.
         w: u_h at the cells' vertices, shape (d + 1, cells).
         height: Heights of v's bumps, shape (3, n); None where it has none.
     """
-    d, k, P = cells.tdim, pick(kappa.mean, part), flux.excess[:, part]
-    s, c = sum_rows(P), v.excess[:, part]
+    d, k, P = cells.tdim, pick(kappa.mean, block), flux.excess[:, block]
+    s, c = sum_rows(P), v.excess[:, block]
     if height is not None:
         c = c - 4 / 3 * height
     # the mean of ∇(v − u_h) is Σ c_i ∇λ_i
-    slopes, means = cells.apply(c, part), sum_rows(c)
-    bb, along = dot_rows(c, slopes), dot_rows(w[:, part], slopes)
+    slopes, means = cells.apply(c, block), sum_rows(c)
+    bb, along = dot_rows(c, slopes), dot_rows(w[:, block], slopes)
     if height is not None:
-        bb += bend_squares(cells, height, part)
+        bb += bend_squares(cells, height, block)
         means -= 2 / 3 * sum_rows(height)
     # ∫ p·∇φ = −∫ φ div p + Σ flux_i (mean of φ on facet i), with φ = v − u_h
     pb = (s * means / (d + 1) - dot_rows(P, c)) / d
-    vv = flux.steepness[part] + 2.0 * along + bb
-    return field_squares(cells, P, part) / k, k * bb, pb, k * vv
+    vv = flux.steepness[block] + 2.0 * along + bb
+    return field_squares(cells, P, block) / k, k * bb, pb, k * vv
 
 
 def _by_quadrature(
-    cells: Cells, kappa: Coefficient, part: slice, flux: Flux, v: Companion, w: FloatArray
+    cells: Cells, kappa: Coefficient, block: slice, flux: Flux, v: Companion, w: FloatArray
 ) -> tuple[FloatArray, ...]:
     """Integrate the same for any κ and any y, and bound what that misses.
 
@@ -583,9 +580,11 @@ def _by_quadrature(
     """
     values, cut, mean = kappa.values, kappa.cut, kappa.mean
     if values is None or cut is None:
-        exact = ((pick(mean, part), weight, hat) for hat, weight in zip(*quadrature(), strict=True))
-        rows = _at_points(cells, mean, part, flux, v, w, exact)
-        return *rows[:4], *np.zeros((3, part.stop - part.start))
+        exact = (
+            (pick(mean, block), weight, hat) for hat, weight in zip(*quadrature(), strict=True)
+        )
+        rows = _at_points(cells, mean, block, flux, v, w, exact)
+        return *rows[:4], *np.zeros((3, block.stop - block.start))
     largest = (3 if flux.beyond is None else 6) ** 2 if cells.tdim == 2 else (cells.tdim + 1) ** 2
 
     def integrals(
@@ -595,7 +594,7 @@ def _by_quadrature(
         rows = _at_points(cells, mean, where, flux, v, w, points)
         return _with_slack(rows, errors, cells.tdim, largest)
 
-    return tuple(_over_pieces(kappa, part, integrals))
+    return tuple(_over_pieces(kappa, block, integrals))
 
 
 Integrals = Callable[[slice | IndexArray, FloatArray, FloatArray, FloatArray], FloatArray]
@@ -603,18 +602,18 @@ Integrals = Callable[[slice | IndexArray, FloatArray, FloatArray, FloatArray], F
 barycentric coordinates: rows of what is integrated, a piece's as if it were the cell."""
 
 
-def _over_pieces(kappa: Coefficient, part: slice, integrals: Integrals) -> FloatArray:
+def _over_pieces(kappa: Coefficient, block: slice, integrals: Integrals) -> FloatArray:
     """Integrate over a range of cells, those that are cut piece by piece, shape (rows, n)."""
     values, cut, rule = kappa.values, kappa.cut, kappa.rule
     assert values is not None and cut is not None
-    rows = integrals(part, cut.errors[:, part], values[:, part], rule.hats.T)
-    first, last = np.searchsorted(cut.pieces.parent, (part.start, part.stop))
+    rows = integrals(block, cut.errors[:, block], values[:, block], rule.hats.T)
+    first, last = np.searchsorted(cut.pieces.parent, (block.start, block.stop))
     if first < last:
         pieces = cut.pieces[np.arange(first, last)]
         hats = at_points(pieces.hats, rule.hats).swapaxes(0, 1)
         known = cut.errors_inside[:, first:last], kappa.inside[:, first:last]
         there = integrals(pieces.parent, *known, hats) * pieces.part
-        which, place = np.unique(pieces.parent - part.start, return_inverse=True)
+        which, place = np.unique(pieces.parent - block.start, return_inverse=True)
         rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
     return rows
 
@@ -622,7 +621,7 @@ def _over_pieces(kappa: Coefficient, part: slice, integrals: Integrals) -> Float
 def _of_tensor(
     cells: Cells,
     kappa: Coefficient,
-    part: slice,
+    block: slice,
     flux: Flux,
     v: Companion,
     w: FloatArray,
@@ -637,7 +636,7 @@ def _of_tensor(
     Args:
         cells: The mesh.
         kappa: The coefficient.
-        part: Which cells.
+        block: Which cells.
         flux: y.
         v: v.
         w: u_h at the cells' vertices, shape (d + 1, cells).
@@ -647,26 +646,26 @@ def _of_tensor(
         ∫_T κ|∇v|² by the rule; what the gap has beyond that of κ_T; and what the rule may have
         missed of ½∫_T κ|∇v|².
     """
-    d, k, volume = cells.tdim, pick(kappa.mean, part)[:, None], cells.volume[part]
-    P, slopes, theta = flux.excess[:, part], v.slopes(cells, part), kappa.spread[part]
-    s, (corners, gradients) = sum_rows(P), cells.corners(part)
-    own = np.einsum("in,ink->nk", w[:, part], gradients)
-    off, rule = kappa.apart(cells, part), kappa.rule
+    d, k, volume = cells.tdim, pick(kappa.mean, block)[:, None], cells.volume[block]
+    P, slopes, theta = flux.excess[:, block], v.slopes(cells, block), kappa.spread[block]
+    s, (corners, gradients) = sum_rows(P), cells.corners(block)
+    own = np.einsum("in,ink->nk", w[:, block], gradients)
+    off, rule = kappa.apart(cells, block), kappa.rule
     squares, steep = np.zeros((2, 2, len(volume)))
     vv = np.zeros(len(volume))
     for tensor, weight, hat in zip(off, rule.weights, rule.hats.T[:, :, None], strict=True):
         Q = hat * s - P
         if flux.beyond is not None:
-            Q += flux.beyond.through(cells, part, hat)
+            Q += flux.beyond.through(cells, block, hat)
         y = np.einsum("in,ink->nk", Q, corners) / (d * volume)[:, None] + k * own
-        change = np.einsum("in,ink->nk", np.broadcast_to(slopes(hat), w[:, part].shape), gradients)
+        change = np.einsum("in,ink->nk", np.broadcast_to(slopes(hat), w[:, block].shape), gradients)
         for i, slope in enumerate((own + change, own - change)):
             flow = k * slope + np.einsum("nij,nj->ni", tensor, slope)
             squares[i] += weight * ((y - flow) ** 2).sum(axis=1)
             steep[i] += weight * (slope**2).sum(axis=1)
             if i == 0:
                 vv += weight * (flow * slope).sum(axis=1)
-    rough, mean = kappa.rough[part], k[:, 0]
+    rough, mean = kappa.rough[block], k[:, 0]
     found = np.sqrt(volume / mean * squares) + 2.0 * rough * np.sqrt(volume * mean * steep)
     far, near = found**2 / (1.0 - theta) - np.stack(gap)
     return volume * vv, far, near, rough * mean * volume * steep[0]
@@ -699,8 +698,8 @@ class Within(NamedTuple):
             return None
         work = _tensor_within if kappa.tensor is not None else _within
         pull, (unsure, mean) = np.empty((cells.tdim + 1, cells.number)), np.empty((2, cells.number))
-        for part in blocks(cells.number):
-            pull[:, part], unsure[part], mean[part] = work(cells, kappa, part, v, w)
+        for block in blocks(cells.number):
+            pull[:, block], unsure[block], mean[block] = work(cells, kappa, block, v, w)
         return cls(pull, unsure, mean)
 
 
@@ -708,7 +707,7 @@ Row = tuple[FloatArray, FloatArray, FloatArray]
 """What `Within` has of some cells: pull, unsure, mean."""
 
 
-def _within(cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray) -> Row:
+def _within(cells: Cells, kappa: Coefficient, block: slice, v: Companion, w: FloatArray) -> Row:
     """Integrate by quadrature on cells, or on their pieces, and bound what that misses."""
     weights = kappa.rule.weights
 
@@ -726,29 +725,29 @@ def _within(cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: Floa
         mean = weights @ there + 2.0 * W + strip
         return np.stack([*cells.apply(total, where), unsure, mean])
 
-    *pull, unsure, mean = _over_pieces(kappa, part, integrals)
+    *pull, unsure, mean = _over_pieces(kappa, block, integrals)
     return np.array(pull), unsure, mean
 
 
 def _tensor_within(
-    cells: Cells, kappa: Coefficient, part: slice, v: Companion, w: FloatArray
+    cells: Cells, kappa: Coefficient, block: slice, v: Companion, w: FloatArray
 ) -> Row:
     """Integrate the same of a tensor, which is within ϱ κ_T of what the rule is exact for."""
-    k, volume, slopes = pick(kappa.mean, part), cells.volume[part], v.slopes(cells, part)
-    _, gradients = cells.corners(part)
+    k, volume, slopes = pick(kappa.mean, block), cells.volume[block], v.slopes(cells, block)
+    _, gradients = cells.corners(block)
     total, steep = np.zeros((len(volume), cells.tdim)), np.zeros_like(volume)
     rule, off = kappa.rule, np.zeros((len(volume), cells.tdim, cells.tdim))
     for tensor, weight, hat in zip(
-        kappa.apart(cells, part), rule.weights, rule.hats.T[:, :, None], strict=True
+        kappa.apart(cells, block), rule.weights, rule.hats.T[:, :, None], strict=True
     ):
-        slope = np.einsum("in,ink->nk", w[:, part] + slopes(hat), gradients)
+        slope = np.einsum("in,ink->nk", w[:, block] + slopes(hat), gradients)
         total += weight * (k[:, None] * slope + np.einsum("nij,nj->ni", tensor, slope))
         steep += weight * (slope**2).sum(axis=1)
         off += weight * tensor
     pull = volume * np.einsum("ink,nk->in", gradients, total)
-    missed = 2.0 * kappa.rough[part] * k
+    missed = 2.0 * kappa.rough[block] * k
     mean = k + missed + np.linalg.norm(off, axis=(1, 2))
-    return pull, missed * volume * np.sqrt(steep), np.fmin(mean, pick(kappa.high, part))
+    return pull, missed * volume * np.sqrt(steep), np.fmin(mean, pick(kappa.high, block))
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:
@@ -837,16 +836,16 @@ def _against_potential(
     s: FloatArray,
     hats: FloatArray,
     bumps: FloatArray,
-    part: slice,
+    block: slice,
 ) -> FloatArray:
-    """Compute ∫_T (f − f_T) φ, ∇φ = y − κ_T∇u_h, for d = 2, shape (cells in the part,).
+    """Compute ∫_T (f − f_T) φ, ∇φ = y − κ_T∇u_h, for d = 2, shape (cells in the block,).
 
     2d |T| φ = Σ P_i |x − X_i|² up to a constant, and for x = Σ λ_i X_i with L_ij = |X_i − X_j|²
     |x − X_i|² = Σ_j λ_j L_ij − Σ_{j<k} λ_j λ_k L_jk.
     """
     total = np.zeros_like(s)
     quarter = s / 4
-    for (i, j), length in zip(cells.pairs, cells.lengths[:, part], strict=True):
+    for (i, j), length in zip(cells.pairs, cells.lengths[:, block], strict=True):
         here = hats[j] * P[i]
         here += hats[i] * P[j]
         here -= quarter * bumps[3 - i - j]
