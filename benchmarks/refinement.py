@@ -65,7 +65,7 @@ def main() -> None:
     names = ["ranks", "facets", "cells made", "refinement, s", "all meshes before, s"]
     lines = [head(names)]
     for (ranks, way), found in in_turns(processes, TURNS, warm=0).items():
-        refined, solved = (sum((each[k] for each in found), []) for k in (1, 2))
+        refined, solved = ([s for each in found for s in each[k]] for k in (1, 2))
         cells = [
             f"{found[0][0]:,}",
             *(f"{median(s):.3f} ({min(s):.3f})" for s in (refined, solved)),

@@ -261,7 +261,7 @@ def solve_level(
                 row_sums=system.row_sums,
                 masses=system.masses,
                 rounding=system.data_rounding,
-                rounded=system.data_rounded,
+                rounded=system.data_rounded(),
                 loads=system.chi[system.bounded],
                 offset=system.offset,
                 windows=system.windows,

@@ -227,7 +227,7 @@ def not_negative(key: str, value: Any) -> float:
     return result
 
 
-def part(key: str, value: Any) -> float:
+def fraction(key: str, value: Any) -> float:
     """Insist on a number above 0 and not above 1."""
     result = positive(key, value)
     if result > 1:

@@ -10,7 +10,7 @@ from ..adaptive import solve_adaptive
 from ..fem.conditions import Condition, Contact, Dirichlet, Neumann, Robin
 from ..means import DOMAIN
 from .formula import CONSTANTS, FUNCTIONS, VARIABLES
-from .readers import MOST_CHARACTERS, not_negative, part, whole
+from .readers import MOST_CHARACTERS, fraction, not_negative, whole
 
 
 class Key(NamedTuple):
@@ -176,7 +176,7 @@ KEYS = (
         ends=True),
     Key("refine", "fraction", "a number above 0, at most 1", USUAL["fraction"],
         "Adaptive: the part of the squared bound that the cells to be refined hold. Less takes "
-        "more meshes, and fewer cells for the same bound.", "fraction = 0.3", part),
+        "more meshes, and fewer cells for the same bound.", "fraction = 0.3", fraction),
     Key("time", "end", "a number above 0", "", "The last time; the first is 0. Needed.",
         "end = 36000"),
     Key("time", "steps", "a whole number above 0", "", "Steps of equal length. Needed.",

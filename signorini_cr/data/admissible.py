@@ -338,11 +338,11 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
         middle = start[segment] + s[1][:, None] * way[segment]
         for i in np.flatnonzero(np.abs(u).max(axis=0) > HUGE * largest):
             complaints.append(_pole_message(key, u_D.mesh, middle[i]))
-        level, short = np.maximum(scale, _noise(intervals.e)), width < shortest
+        rounding, short = np.maximum(scale, _noise(intervals.e)), width < shortest
         height = np.abs(u[2] - u[0])
-        for i in np.flatnonzero(short & (height > np.maximum(level, roughest))):
+        for i in np.flatnonzero(short & (height > np.maximum(rounding, roughest))):
             complaints.append(_jump_message(key, u_D.mesh, middle[i], u[0, i], u[2, i]))
-        rest = replace(intervals, roughest=roughest).picked(~short & (rough > level))
+        rest = replace(intervals, roughest=roughest).picked(~short & (rough > rounding))
         cuts = rest.cuts
         x = start[rest.segment] + cuts[:, :, None] * way[rest.segment]
         found = u_D.at(x.swapaxes(0, 1), cells[rest.segment], error)

@@ -101,8 +101,8 @@ def cut(
     pending = np.arange(n)
     if not local:
         low, high = np.empty((2, cells.domain.mesh.geometry.dim, n))
-        for part in blocks(n):
-            low[:, part], high[:, part] = cells.extents(part)
+        for block in blocks(n):
+            low[:, block], high[:, block] = cells.extents(block)
         top = int(np.log2(max(total / GROUPS, 1.0)) / 2)
         slanted = (high - low).prod(axis=0) > 2.0 * SLANTED * cells.volume
         if cells.tdim == 2 and 2 * comm.allreduce(np.count_nonzero(slanted)) > total:
@@ -396,12 +396,12 @@ def _groups(low: FloatArray, high: FloatArray, level: int) -> tuple[Boxes, Float
         The boxes, upper bounds of half the extents of their cells, and each cell's box.
     """
     exponent, place = np.empty(low.shape, np.int64), np.empty(low.shape, np.int64)
-    for part in blocks(low.shape[1]):
-        least, most = low[:, part], high[:, part]
+    for block in blocks(low.shape[1]):
+        least, most = low[:, block], high[:, block]
         # a power of two may have been rounded up
         power = np.frexp((most - least) * (1 - _FEW))[1]
-        exponent[:, part] = power
-        place[:, part] = np.floor(0.5 * (least + most) / np.ldexp(1.0, power + level))
+        exponent[:, block] = power
+        place[:, block] = np.floor(0.5 * (least + most) / np.ldexp(1.0, power + level))
     numbers = _numbers([*exponent, *place])
     count = int(numbers.max(initial=-1)) + 1
     one = np.empty(count, dtype=np.intp)
@@ -424,10 +424,10 @@ def _numbers(rows: list[Int64Array]) -> IndexArray:
         if span * width >= 1 << 62:
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             span = len(key)
-        for part in blocks(len(key)):
-            here = key[part]
+        for block in blocks(len(key)):
+            here = key[block]
             here *= width
-            here += row[part]
+            here += row[block]
             here -= first
         span *= width
     if span > 8 * len(key) + 1000:

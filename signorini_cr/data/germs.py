@@ -303,8 +303,8 @@ def allowance(
         offset = corners[..., which] - point[:, None]
         reach = away[:, which].max(axis=0) * (1 + NARROW)
         tip = away[:, which].argmin(axis=0)
-        gap = away[tip, which]
-        exact = gap <= NARROW * (size[which] + np.linalg.norm(point))
+        distance = away[tip, which]
+        exact = distance <= NARROW * (size[which] + np.linalg.norm(point))
         measure = _measures(corners[..., which])
         directions, angle = _sectors(offset, tip, exact)
         germ = bound(expression, point, directions, reach)

@@ -68,14 +68,14 @@ class VolumeMoments:
         assert self.variance is not None and self.hats is not None
         return np.maximum(self.variance - 12.0 * dot_rows(self.hats, self.hats), 0.0)
 
-    def shares(self, cells: Cells, part: slice) -> FloatArray:
+    def shares(self, cells: Cells, block: slice) -> FloatArray:
         """Compute ∫_T f ψ_i for the Crouzeix-Raviart ψ_i = 1 − d λ_i, shape (d + 1, n)."""
         d = cells.tdim
-        out = np.empty((d + 1, part.stop - part.start))
-        out[:] = self.mean[part] / (d + 1)
+        out = np.empty((d + 1, block.stop - block.start))
+        out[:] = self.mean[block] / (d + 1)
         if self.hats is not None:
-            out -= d * self.hats[:, part]
-        out *= cells.volume[part]
+            out -= d * self.hats[:, block]
+        out *= cells.volume[block]
         return out
 
     def less(self, c: float | FloatArray, w: FloatArray) -> VolumeMoments:
@@ -113,11 +113,11 @@ class VolumeMoments:
         tests = (tests - (tests @ rule.weights)[:, None]) * rule.weights
         tests, variance = np.vstack([rule.weights, tests]), np.empty(n)
         rows = np.empty((len(tests), n))
-        for part in blocks(n):
-            rows[:, part] = tests @ values[part].T
-            off = values[part] - rows[0, part, None]
+        for block in blocks(n):
+            rows[:, block] = tests @ values[block].T
+            off = values[block] - rows[0, block, None]
             with np.errstate(over="ignore"):  # such data are refused where the load is known
-                variance[part] = np.square(off, out=off) @ rule.weights
+                variance[block] = np.square(off, out=off) @ rule.weights
         return cls(rows[0], rows[1:], variance)
 
     def refined(self, f: Volume, cells: Cells, cut: Cut) -> VolumeMoments:
@@ -226,21 +226,21 @@ class Certain:
 
 
 def mean_to_norm(
-    cells: Cells, low: FloatArray, reaction: FloatArray, part: slice | None = None
+    cells: Cells, low: FloatArray, reaction: FloatArray, block: slice | None = None
 ) -> FloatArray:
-    """Find C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the part,).
+    """Find C with ‖e − e_T‖_T ≤ C times e's energy norm on T, shape (cells in the block,).
 
     Args:
         cells: The mesh.
         low: Lower bound of κ, shape (cells,) or ().
         reaction: c, shape (cells,) or ().
-        part: Which cells; None for all.
+        block: Which cells; None for all.
     """
-    part = slice(0, cells.number) if part is None else part
-    by_slope = poincare(cells.tdim) * np.sqrt(cells.diameter2[part] / pick(low, part))
+    block = slice(0, cells.number) if block is None else block
+    by_slope = poincare(cells.tdim) * np.sqrt(cells.diameter2[block] / pick(low, block))
     if not reacts(reaction):
         return by_slope
-    c = pick(reaction, part)
+    c = pick(reaction, block)
     inverse = np.divide(1.0, c, out=np.full_like(by_slope, np.inf), where=c > 0.0)
     return np.minimum(by_slope, np.sqrt(inverse))
 
@@ -464,23 +464,23 @@ class Segments:
                 place, measure * (found[0].weights @ lost), minlength=len(through)
             )
         return cls(
-            cells,
-            facets,
-            BoundaryFacets.joined([each.side for each in found], cells.tdim),
-            place,
-            hats,
-            found[0].weights,
-            measure,
-            values,
-            through,
-            rows(lambda each: each.missed),
-            rows(lambda each: each.rough),
-            loss,
-            np.concatenate([each.bounded for each in found]),
-            low,
-            next((each.reason for each in found if each.reason), None),
-            rows(lambda each: each.of_loss) if varying else None,
-            np.repeat([edge.varies for edge in edges], np.diff(first)) if varying else None,
+            cells=cells,
+            facets=facets,
+            side=BoundaryFacets.joined([each.side for each in found], cells.tdim),
+            place=place,
+            hats=hats,
+            weights=found[0].weights,
+            measure=measure,
+            values=values,
+            through=through,
+            missed=rows(lambda each: each.missed),
+            rough=rows(lambda each: each.rough),
+            loss=loss,
+            bounded=np.concatenate([each.bounded for each in found]),
+            low=low,
+            reason=next((each.reason for each in found if each.reason), None),
+            between=rows(lambda each: each.of_loss) if varying else None,
+            varies=np.repeat([e.varies for e in edges], np.diff(first)) if varying else None,
         )
 
     @classmethod
@@ -547,22 +547,24 @@ class Segments:
             return np.bincount(at, measure * amounts, minlength=n).astype(np.float64)
 
         return cls(
-            cells,
-            facets,
-            BoundaryFacets(facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]),
-            at,
-            at_points(pieces.hats, hats.T).swapaxes(0, 1),
-            weights,
-            measure,
-            values,
-            total(weights @ values),
-            2.0 * total(inside[0]),
-            2.0 * np.sqrt(total(inside[1])),
-            edge.loss,
-            np.full(n, edge.bounded),
-            low,
-            reasons[0] if reasons else None,
-            edge.between(pieces, cells) if edge.varies else None,
+            cells=cells,
+            facets=facets,
+            side=BoundaryFacets(
+                facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]
+            ),
+            place=at,
+            hats=at_points(pieces.hats, hats.T).swapaxes(0, 1),
+            weights=weights,
+            measure=measure,
+            values=values,
+            through=total(weights @ values),
+            missed=2.0 * total(inside[0]),
+            rough=2.0 * np.sqrt(total(inside[1])),
+            loss=edge.loss,
+            bounded=np.full(n, edge.bounded),
+            low=low,
+            reason=reasons[0] if reasons else None,
+            between=edge.between(pieces, cells) if edge.varies else None,
         )
 
     @property
@@ -589,7 +591,7 @@ class Segments:
 
     @property
     def steady(self) -> FloatArray:
-        """B where it is constant on the facet, 0 where it may not be, shape (facets,)."""
+        """The b that is constant on its facet, 0 where it may not be, shape (facets,)."""
         return self.loss if self.varies is None else np.where(self.varies, 0.0, self.loss)
 
     @cached_property
@@ -784,8 +786,8 @@ def chi(load: VolumeMoments, edges: Sequence[NeumannMoments], cells: Cells) -> F
     if load.vanishes and all(edge.g.vanishes for edge in edges):
         return np.zeros(len(cells.exterior))
     values = np.empty((cells.tdim + 1, cells.number))
-    for part in blocks(cells.number):
-        values[:, part] = load.shares(cells, part)
+    for block in blocks(cells.number):
+        values[:, block] = load.shares(cells, block)
     for edge in edges:
         if edge.g.vanishes:
             continue

@@ -173,15 +173,15 @@ class Tensor:
             rows = ufl.as_vector(self.entries)
             self._compiled[rule.degree] = compat.compile_expression(rows, rule.points, self._mesh)
 
-    def at(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
+    def at(self, domain: Domain, rule: Rule, block: slice) -> FloatArray:
         """Evaluate the symmetric part at points of some owned cells, shape (cells, q, d, d)."""
-        found = self.as_given(domain, rule, part)
+        found = self.as_given(domain, rule, block)
         return np.asarray(0.5 * (found + found.transpose(0, 1, 3, 2)))
 
-    def as_given(self, domain: Domain, rule: Rule, part: slice) -> FloatArray:
+    def as_given(self, domain: Domain, rule: Rule, block: slice) -> FloatArray:
         """Evaluate the same with what is not symmetric."""
         self.prepare(rule)
-        which = np.arange(part.start, part.stop, dtype=np.int32)
+        which = np.arange(block.start, block.stop, dtype=np.int32)
         found = compat.bound(self._compiled[rule.degree], domain.own).eval(domain.mesh, which)
         return np.asarray(found.reshape(len(which), len(rule.weights), self._d, self._d))
 
@@ -307,12 +307,12 @@ class Coefficient:
         stretched = np.abs(stretch) @ sizes.T.reshape(-1, d, d) @ np.abs(stretch)
         return np.asarray(np.linalg.norm(stretched, axis=(1, 2)) / self.mean)
 
-    def apart(self, cells: Cells, part: slice) -> FloatArray:
+    def apart(self, cells: Cells, block: slice) -> FloatArray:
         """Compute κ − κ_T with lengths stretched, at the rule's points, shape (q, cells, d, d)."""
         assert self.tensor is not None and cells.stretch is not None
-        stretch = cells.stretch[part]
-        found = stretch[:, None] @ self.tensor.at(cells.domain, self.rule, part) @ stretch[:, None]
-        return found.transpose(1, 0, 2, 3) - self.mean[part, None, None] * np.eye(cells.tdim)
+        stretch = cells.stretch[block]
+        found = stretch[:, None] @ self.tensor.at(cells.domain, self.rule, block) @ stretch[:, None]
+        return found.transpose(1, 0, 2, 3) - self.mean[block, None, None] * np.eye(cells.tdim)
 
     def _of_scalar(self, kappa: Volume, cells: Cells) -> None:
         fine = kappa.exact_for(KAPPA_DEGREE)

@@ -233,10 +233,10 @@ class Deviation:
             near = cells.search(lambda low, high: self._may_be_even(Boxes(low, high)))
         else:
             parts = blocks(found.shape[1])
-            here = [self._may_be_even(whole[part].hulls(cells)) for part in parts]
+            here = [self._may_be_even(whole[block].hulls(cells)) for block in parts]
             near = np.flatnonzero(np.concatenate([*here, np.empty(0, dtype=bool)]))
-        for part in blocks(len(near)):
-            which = near[part]
+        for block in blocks(len(near)):
+            which = near[block]
             some = Pieces.of_cells(cells, which) if whole is None else whole[which]
             even = self._may_be_even(some.points(cells, hats)).reshape(len(found), len(which))
             if even.any():

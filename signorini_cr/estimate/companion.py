@@ -341,14 +341,14 @@ def _moving(functional: Functional, floors: Floors) -> FloatArray | None:
     return (cells.tdim + 1) * cells.over_vertices(squares)
 
 
-def bend_squares(cells: Cells, height: FloatArray, part: slice) -> FloatArray:
+def bend_squares(cells: Cells, height: FloatArray, block: slice) -> FloatArray:
     """Compute what ‖∇φ‖²_T of φ = Σ height_i b_i has beyond that of its mean; d = 2, shape (n,).
 
     The mean of ∇b_i is −4/3 ∇λ_i.
     """
     out = np.zeros(height.shape[1])
     squares = 3.0 * height**2
-    for (i, j), s in zip(cells.pairs, cells.stiffness[:, part], strict=True):
+    for (i, j), s in zip(cells.pairs, cells.stiffness[:, block], strict=True):
         apart = height[i] - height[j]
         apart *= apart
         apart += squares[3 - i - j]

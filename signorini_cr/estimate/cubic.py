@@ -98,17 +98,17 @@ def _fitted(cells: Cells, kappa: FloatArray, v: Companion) -> tuple[FloatArray, 
     """
     hats, weights = quadrature()
     matrix, pull = np.zeros((4, 4, cells.number)), np.zeros((4, cells.number))
-    for part in blocks(cells.number):
-        slopes, signs = v.slopes(cells, part), cells.ways[:, part]
+    for block in blocks(cells.number):
+        slopes, signs = v.slopes(cells, block), cells.ways[:, block]
         for hat, weight in zip(hats[:, :, None], weights, strict=True):
             off = slopes(hat)
             each = [third_slopes(cells, signs * row[:, None], hat) for row in np.eye(3)]
             each.append(np.broadcast_to(bubble_slopes(hat), off.shape))
             for i, own in enumerate(each):
-                flow = weight * pick(kappa, part) * cells.apply(own, part)
-                pull[i, part] -= dot_rows(flow, off)
+                flow = weight * pick(kappa, block) * cells.apply(own, block)
+                pull[i, block] -= dot_rows(flow, off)
                 for j, other in enumerate(each):
-                    matrix[i, j, part] += dot_rows(flow, other)
+                    matrix[i, j, block] += dot_rows(flow, other)
     alone, joint = matrix[3, 3], matrix[:3, 3]
     reduced = matrix[:3, :3] - joint[:, None] * joint / alone
     heights = best_heights(cells, reduced, pull[:3] - joint * pull[3] / alone, ~cells.exterior)

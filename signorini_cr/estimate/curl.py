@@ -112,20 +112,20 @@ def _pull(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> FloatArr
     """
     hats, weights = quadrature()
     pull = np.zeros((3, cells.number))
-    for part in blocks(cells.number):
-        k, P, volume = pick(kappa, part), flux.excess[:, part], cells.volume[part]
-        slopes = v.slopes(cells, part)
-        opposite = dict(zip(cells.pairs, cells.lengths[:, part], strict=True))
+    for block in blocks(cells.number):
+        k, P, volume = pick(kappa, block), flux.excess[:, block], cells.volume[block]
+        slopes = v.slopes(cells, block)
+        opposite = dict(zip(cells.pairs, cells.lengths[:, block], strict=True))
         lengths = [opposite[1, 2], opposite[0, 2], opposite[0, 1]]
         for hat, weight in zip(hats[:, :, None], weights, strict=True):
-            Q = hat * P.sum(axis=0) - P - k * cells.apply(slopes(hat), part)
+            Q = hat * P.sum(axis=0) - P - k * cells.apply(slopes(hat), block)
             if flux.beyond is not None:
-                Q += flux.beyond.through(cells, part, hat)
+                Q += flux.beyond.through(cells, block, hat)
             along = [
                 (Q[a] - Q[b]) * lengths[m] + Q[m] * (lengths[a] - lengths[b])
                 for m, a, b in ((0, 2, 1), (1, 0, 2), (2, 1, 0))
             ]
-            scale = -0.5 * weight * cells.turns[part] / (k * volume)
+            scale = -0.5 * weight * cells.turns[block] / (k * volume)
             for i, (a, b) in enumerate(cells.others):
-                pull[i, part] += scale * (hat[a] * along[b] + hat[b] * along[a])
+                pull[i, block] += scale * (hat[a] * along[b] + hat[b] * along[a])
     return pull

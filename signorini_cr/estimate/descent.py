@@ -43,16 +43,16 @@ def descend(
         change = image(way)
         length = square / float(cells.total(way[owned] @ change[owned])[0])
         fall += length * square
-        for part in blocks(len(down)):
-            numbers[part] += length * way[part]
-            change[part] *= length
-            down[part] -= change[part]
-            np.divide(down[part], diagonal[part], out=change[part])
+        for block in blocks(len(down)):
+            numbers[block] += length * way[block]
+            change[block] *= length
+            down[block] -= change[block]
+            np.divide(down[block], diagonal[block], out=change[block])
         straight = change
         before, square = square, float(cells.total(down[owned] @ straight[owned])[0])
-        for part in blocks(len(down)):
-            way[part] *= square / before
-            way[part] += straight[part]
+        for block in blocks(len(down)):
+            way[block] *= square / before
+            way[block] += straight[block]
     return fall, square
 
 

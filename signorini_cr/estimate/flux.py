@@ -100,13 +100,13 @@ def equilibrate(
     d = cells.tdim
     excess = np.empty((d + 1, cells.number))
     fluxes, steepness = np.empty_like(excess), np.empty(cells.number)
-    for part in blocks(cells.number):
-        shares = load.shares(cells, part)
-        np.negative(shares, out=excess[:, part])
-        slopes = cells.apply(w[:, part], part)
-        steepness[part] = dot_rows(w[:, part], slopes)
-        slopes *= -d * pick(kappa, part)
-        np.subtract(slopes, shares, out=fluxes[:, part])
+    for block in blocks(cells.number):
+        shares = load.shares(cells, block)
+        np.negative(shares, out=excess[:, block])
+        slopes = cells.apply(w[:, block], block)
+        steepness[block] = dot_rows(w[:, block], slopes)
+        slopes *= -d * pick(kappa, block)
+        np.subtract(slopes, shares, out=fluxes[:, block])
     side, known = edge.side, np.zeros(len(cells.exterior))
     known[side.dofs] = edge.shares.sum(axis=0)
     for i, share in enumerate(to_cells(cells, side, edge.shares)):
@@ -117,8 +117,8 @@ def equilibrate(
     half = cells.over_facets(fluxes)
     half *= 0.5
     half[cells.exterior] = 0.0
-    for part in blocks(cells.number):
-        excess[:, part] -= half[cells.facets[:, part]]
+    for block in blocks(cells.number):
+        excess[:, block] -= half[cells.facets[:, block]]
     there = on_contact.local, on_contact.cells
     diagonal = d**2 * pick(kappa, on_contact.cells) * cells.opposite(on_contact)
     force, through = fluxes[there] - known[on_contact.dofs], known[on_contact.dofs]
@@ -377,8 +377,8 @@ def unbalanced(
         if kappa_min.ndim:
             kappa_min = parents.collected(kappa_min, np.minimum)
         square = np.maximum(square - left**2 / volume, 0.0)
-        part = float(np.sum(coarser.diameters**2 * square / kappa_min))
-        bound += poincare(cells.tdim) * np.sqrt(cells.comm.allreduce(part))
+        own = float(np.sum(coarser.diameters**2 * square / kappa_min))
+        bound += poincare(cells.tdim) * np.sqrt(cells.comm.allreduce(own))
     if len(meshes) > 1:
         coarsest = diffusion(meshes[0].data)
         cells, reaction = coarsest.cells, coarsest.reaction[0]  # kept, with the walk on them
@@ -605,22 +605,22 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
 
 
 def field_squares(
-    cells: Cells, fluxes: FloatArray, part: slice | IndexArray | None = None
+    cells: Cells, fluxes: FloatArray, block: slice | IndexArray | None = None
 ) -> FloatArray:
-    """Compute ‖p‖²_T of the field with these fluxes out of the cell, shape (cells in the part,).
+    """Compute ‖p‖²_T of the field with these fluxes out of the cell, shape (cells in the block,).
 
     p = (s (x − x_T) − Σ a_i X_i) / (d |T|) with s the sum of the fluxes and a_i = flux_i − s/(d+1).
     """
-    if part is None:
+    if block is None:
         out = np.empty(cells.number)
-        for part in blocks(cells.number):
-            out[part] = field_squares(cells, fluxes[:, part], part)
+        for block in blocks(cells.number):
+            out[block] = field_squares(cells, fluxes[:, block], block)
         return out
     d = cells.tdim
     s = sum_rows(fluxes)
     a = fluxes - s / (d + 1)
-    lengths = cells.lengths[:, part]
+    lengths = cells.lengths[:, block]
     squares = s**2 * sum_rows(lengths) / ((d + 1) ** 2 * (d + 2))
     for (i, j), length in zip(cells.pairs, lengths, strict=True):
         squares -= a[i] * a[j] * length
-    return squares / (d**2 * cells.volume[part])
+    return squares / (d**2 * cells.volume[block])

@@ -41,9 +41,9 @@ class Masses:
         """Whether there is a c; the same on all ranks."""
         return reacts(self.reaction)
 
-    def on_cells(self, cells: Cells, part: slice | IndexArray) -> FloatArray:
+    def on_cells(self, cells: Cells, block: slice | IndexArray) -> FloatArray:
         """Return c|T|, shape (n,)."""
-        return np.asarray(pick(self.reaction, part) * cells.volume[part])
+        return np.asarray(pick(self.reaction, block) * cells.volume[block])
 
     def largest(self, cells: Cells, side: BoundaryFacets) -> float:
         """Return the largest b, nearly, on some facets of all ranks; collective."""
@@ -52,10 +52,10 @@ class Masses:
         return max(cells.comm.allgather(float(found)))
 
     def fall(
-        self, cells: Cells, excess: FloatArray, height: FloatArray, part: slice | IndexArray
+        self, cells: Cells, excess: FloatArray, height: FloatArray, block: slice | IndexArray
     ) -> tuple[FloatArray, FloatArray]:
         """Compute how fast c‖v − u_h‖² falls, as `Slopes`, from both on cells, shapes (3, n)."""
-        mass, whole, humps = self.on_cells(cells, part), sum_rows(excess), sum_rows(height)
+        mass, whole, humps = self.on_cells(cells, block), sum_rows(excess), sum_rows(height)
         at_vertices = (whole + excess) / 12.0 + (2.0 * humps - height) / 15.0
         at_facets = (2.0 * whole - excess) / 15.0 + 4.0 / 45.0 * (humps + height)
         return -mass * at_vertices, -mass * at_facets
@@ -105,8 +105,8 @@ class Functional:
     def excess(self, v: FloatArray) -> FloatArray:
         """Return v − u_h at the cells' vertices from v at the vertices, shape (d + 1, cells)."""
         out = np.empty_like(self.w)
-        for part in blocks(self.cells.number):
-            np.subtract(v[self.cells.vertices[:, part]], self.w[:, part], out=out[:, part])
+        for block in blocks(self.cells.number):
+            np.subtract(v[self.cells.vertices[:, block]], self.w[:, block], out=out[:, block])
         return out
 
 
@@ -147,17 +147,17 @@ class Slopes:
     ) -> None:
         """Compute them anew on some cells, or on all with ``slice(None)``; see `of`."""
         cells, kappa, masses = functional.cells, functional.kappa, functional.masses
-        for part in blocks(cells.number) if isinstance(where, slice) else (where,):
-            k, c, height = pick(kappa, part), excess[:, part], bumps[cells.facets[:, part]]
-            rest = cells.trace(part) - 2.0 * cells.squares(part)
-            at_vertices = -k * cells.apply(c - 4 / 3 * height, part)
-            at_facets = 4 / 3 * k * (cells.apply(c - 2.0 * height, part) - rest * height)
+        for block in blocks(cells.number) if isinstance(where, slice) else (where,):
+            k, c, height = pick(kappa, block), excess[:, block], bumps[cells.facets[:, block]]
+            rest = cells.trace(block) - 2.0 * cells.squares(block)
+            at_vertices = -k * cells.apply(c - 4 / 3 * height, block)
+            at_facets = 4 / 3 * k * (cells.apply(c - 2.0 * height, block) - rest * height)
             if masses.reacts:
-                more = masses.fall(cells, c, height, part)
+                more = masses.fall(cells, c, height, block)
                 at_vertices += more[0]
                 at_facets += more[1]
-            self.vertices[:, part], self.facets[:, part] = at_vertices, at_facets
-            self.energies[part] = -dot_rows(c, at_vertices) - dot_rows(height, at_facets)
+            self.vertices[:, block], self.facets[:, block] = at_vertices, at_facets
+            self.energies[block] = -dot_rows(c, at_vertices) - dot_rows(height, at_facets)
         which: slice | IndexArray = where
         if not isinstance(where, slice):
             which = np.flatnonzero(np.isin(masses.side.cells, where))

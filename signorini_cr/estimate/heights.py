@@ -71,10 +71,10 @@ class _OfHeights:
         self.lost[masses.side.dofs] = 0.4 * masses.loss
         self.at = masses.side.local, masses.side.cells
         self._reacts = masses.reacts
-        for part in blocks(cells.number):
-            self.own[part] = pick(functional.kappa, part) * cells.trace(part)
+        for block in blocks(cells.number):
+            self.own[block] = pick(functional.kappa, block) * cells.trace(block)
             if self._reacts:
-                self.own[part] += masses.on_cells(cells, part) / 15.0
+                self.own[block] += masses.on_cells(cells, block) / 15.0
 
     def without_bumps(self, excess: FloatArray) -> tuple[float, FloatArray]:
         """Return E for no bumps, this rank's share, and −½ its slope on each cell.
@@ -84,15 +84,15 @@ class _OfHeights:
         """
         cells, kappa, masses = self.functional.cells, self.functional.kappa, self.functional.masses
         slope, energy = np.empty_like(excess), 0.0
-        for part in blocks(cells.number):
-            k = pick(kappa, part)
-            np.multiply(k, cells.apply(excess[:, part], part), out=slope[:, part])
-            energy += float(np.sum(dot_rows(excess[:, part], slope[:, part])))
+        for block in blocks(cells.number):
+            k = pick(kappa, block)
+            np.multiply(k, cells.apply(excess[:, block], block), out=slope[:, block])
+            energy += float(np.sum(dot_rows(excess[:, block], slope[:, block])))
             if self._reacts:
-                flat = np.zeros_like(excess[:, part])
-                at_vertices, at_facets = masses.fall(cells, excess[:, part], flat, part)
-                energy -= float(np.sum(dot_rows(excess[:, part], at_vertices)))
-                slope[:, part] += 0.75 * at_facets
+                flat = np.zeros_like(excess[:, block])
+                at_vertices, at_facets = masses.fall(cells, excess[:, block], flat, block)
+                energy -= float(np.sum(dot_rows(excess[:, block], at_vertices)))
+                slope[:, block] += 0.75 * at_facets
         none = np.zeros(len(cells.exterior))
         _, at_middle, of_facets = masses.fall_on_facets(cells, excess, none, slice(None))
         np.add.at(slope, self.at, 0.75 * at_middle)
@@ -121,21 +121,21 @@ class _OfHeights:
     def multiply(self, heights: FloatArray, out: FloatArray) -> None:
         """Put the cells' matrices times heights by facet dof into an array, shape (3, cells)."""
         cells, side = self.functional.cells, self.functional.masses.side
-        for part in blocks(cells.number):
-            self._times(heights[cells.facets[:, part]], part, out[:, part])
+        for block in blocks(cells.number):
+            self._times(heights[cells.facets[:, block]], block, out[:, block])
         np.add.at(out, self.at, self.lost[side.dofs] * heights[side.dofs])
 
-    def _times(self, height: FloatArray, part: slice | IndexArray, out: FloatArray) -> FloatArray:
+    def _times(self, height: FloatArray, block: slice | IndexArray, out: FloatArray) -> FloatArray:
         """Put the matrices, but for b, times heights of local bumps into an array."""
-        cells, own = self.functional.cells, self.own[part]
-        twice, stiffness = 2.0 * pick(self.functional.kappa, part), cells.stiffness[:, part]
+        cells, own = self.functional.cells, self.own[block]
+        twice, stiffness = 2.0 * pick(self.functional.kappa, block), cells.stiffness[:, block]
         for i, (j, k) in enumerate(cells.others):
             row = np.multiply(stiffness[i + j - 1], height[j], out=out[i])
             row += stiffness[i + k - 1] * height[k]
             row *= twice
             row += own * height[i]
         if self._reacts:
-            mass = self.functional.masses.on_cells(cells, part)
+            mass = self.functional.masses.on_cells(cells, block)
             out += mass / 15.0 * sum_rows(height)
         return out
 
@@ -162,10 +162,10 @@ def _of_vertices(functional: Functional) -> FloatArray:
     """Return ½ ∂²E by values at vertices, ghosts included; collective."""
     cells, masses = functional.cells, functional.masses
     local = np.empty((3, cells.number))
-    for part in blocks(cells.number):
-        np.multiply(pick(functional.kappa, part), cells.squares(part), out=local[:, part])
+    for block in blocks(cells.number):
+        np.multiply(pick(functional.kappa, block), cells.squares(block), out=local[:, block])
         if masses.reacts:
-            local[:, part] += masses.on_cells(cells, part) / 6.0
+            local[:, block] += masses.on_cells(cells, block) / 6.0
     ends = cells.others[masses.side.local].T, masses.side.cells
     np.add.at(local, ends, masses.loss / 3.0)
     return nonzero(cells.over_vertices(local))
@@ -184,15 +184,15 @@ def promise_of_vertices(
     """
     cells, kappa, masses = functional.cells, functional.kappa, functional.masses
     slope = np.empty_like(excess)
-    for part in blocks(cells.number):
-        k, height = pick(kappa, part), bumps[cells.facets[:, part]]
+    for block in blocks(cells.number):
+        k, height = pick(kappa, block), bumps[cells.facets[:, block]]
         if masses.reacts:
-            fall, _ = masses.fall(cells, excess[:, part], height, part)
+            fall, _ = masses.fall(cells, excess[:, block], height, block)
         height *= -4 / 3
-        height += excess[:, part]
-        np.multiply(k, cells.apply(height, part), out=slope[:, part])
+        height += excess[:, block]
+        np.multiply(k, cells.apply(height, block), out=slope[:, block])
         if masses.reacts:
-            slope[:, part] -= fall
+            slope[:, block] -= fall
     ends = cells.others[masses.side.local].T, masses.side.cells
     np.subtract.at(slope, ends, masses.fall_on_facets(cells, excess, bumps, slice(None))[0])
     owned = slice(cells.owned_vertices())

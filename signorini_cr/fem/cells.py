@@ -50,7 +50,7 @@ def _search(
     mesh: Mesh, cells: IndexArray, may: Callable[[FloatArray, FloatArray], BoolArray]
 ) -> IndexArray:
     """Find those of some cells in whose extents there may be something; see `Cells.search`."""
-    nodes, parts = compat.cell_nodes(mesh), (cells[part] for part in blocks(len(cells)))
+    nodes, parts = compat.cell_nodes(mesh), (cells[block] for block in blocks(len(cells)))
     found = [which[may(*_extents(mesh, nodes[which]))] for which in parts]
     return np.concatenate([cells[:0], *found])
 
@@ -205,16 +205,16 @@ class Cells:
         self.volume = np.empty(n)
         x = np.ascontiguousarray(mesh.geometry.x[:, : mesh.geometry.dim].T)
         nodes = _rows(compat.cell_nodes(mesh)[:n])
-        for part in blocks(n):
-            corner = [[row.take(i) for row in x] for i in nodes[:, part]]
+        for block in blocks(n):
+            corner = [[row.take(i) for row in x] for i in nodes[:, block]]
             if stretch is not None:
-                corner = [list(np.einsum("nij,jn->in", stretch[part], c)) for c in corner]
+                corner = [list(np.einsum("nij,jn->in", stretch[block], c)) for c in corner]
             edges = [[p - q for p, q in zip(c, corner[0], strict=True)] for c in corner[1:]]
             for k, (i, j) in enumerate(self.pairs):
-                self.lengths[k, part] = sum(
+                self.lengths[k, block] = sum(
                     (p - q) ** 2 for p, q in zip(corner[i], corner[j], strict=True)
                 )
-            self.volume[part], self.stiffness[:, part] = _shape(edges, self.lengths[:, part])
+            self.volume[block], self.stiffness[:, block] = _shape(edges, self.lengths[:, block])
 
     def drain(self, sinks: Mapping[int, FloatArray]) -> None:
         """Let parts take up a flux, which asks for data that ask for a mesh; before all else."""
@@ -224,9 +224,9 @@ class Cells:
         """Return the same cells with lengths as they are."""
         return self if self.stretch is None else Cells(self.domain, self.V, self.fixed, self.sinks)
 
-    def extents(self, part: slice) -> tuple[FloatArray, FloatArray]:
-        """Find least and largest coordinates in some cells, shapes (gdim, cells in the part)."""
-        return _extents(self.domain.mesh, compat.cell_nodes(self.domain.mesh)[: self.number][part])
+    def extents(self, block: slice) -> tuple[FloatArray, FloatArray]:
+        """Find least and largest coordinates in some cells, shapes (gdim, cells in the block)."""
+        return _extents(self.domain.mesh, compat.cell_nodes(self.domain.mesh)[: self.number][block])
 
     def search(self, may: Callable[[FloatArray, FloatArray], BoolArray]) -> IndexArray:
         """Find owned cells in whose extents there may be something, ascending.
@@ -257,13 +257,13 @@ class Cells:
             found, mesh = _search(fine, children, may), fine
         return found
 
-    def corners(self, part: slice) -> tuple[FloatArray, FloatArray]:
-        """Find stretched vertices and ∇λ_i of some cells, shapes (d + 1, cells in the part, d)."""
+    def corners(self, block: slice) -> tuple[FloatArray, FloatArray]:
+        """Find stretched vertices and ∇λ_i of some cells, shapes (d + 1, cells in the block, d)."""
         mesh = self.domain.mesh
-        nodes = compat.cell_nodes(mesh)[: self.number][part]
+        nodes = compat.cell_nodes(mesh)[: self.number][block]
         x = mesh.geometry.x[nodes.T, : mesh.geometry.dim]
         if self.stretch is not None:
-            x = np.einsum("nij,cnj->cni", self.stretch[part], x)
+            x = np.einsum("nij,cnj->cni", self.stretch[block], x)
         inverse = np.linalg.inv((x[1:] - x[0]).transpose(1, 0, 2)).transpose(2, 0, 1)
         return x, np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])
 
@@ -505,15 +505,15 @@ class Cells:
         """Sum over all ranks."""
         return self.comm.allreduce(np.array(values, dtype=np.float64))
 
-    def apply(self, c: FloatArray, part: slice | IndexArray) -> FloatArray:
-        """Compute |T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the part)."""
+    def apply(self, c: FloatArray, block: slice | IndexArray) -> FloatArray:
+        """Compute |T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the block)."""
         out = np.empty_like(c)
         if self.tdim == 2:
             # what flows to each vertex from the next one, all the way round
             first, third, second = self.stiffness
-            first = (c[1] - c[0]) * first[part]
-            second = (c[2] - c[1]) * second[part]
-            third = (c[0] - c[2]) * third[part]
+            first = (c[1] - c[0]) * first[block]
+            second = (c[2] - c[1]) * second[block]
+            third = (c[0] - c[2]) * third[block]
             np.subtract(first, third, out=out[0])
             np.subtract(second, first, out=out[1])
             np.subtract(third, second, out=out[2])
@@ -521,7 +521,7 @@ class Cells:
         out[:] = 0.0
         for (i, j), s in zip(self.pairs, self.stiffness, strict=True):
             flow = c[j] - c[i]
-            flow *= s[part]
+            flow *= s[block]
             out[i] += flow
             out[j] -= flow
         return out
@@ -529,8 +529,8 @@ class Cells:
     def slopes(self, c: FloatArray) -> FloatArray:
         """Compute |T| |∇w|² for w = Σ c_i λ_i, c of shape (d + 1, cells), shape (cells,)."""
         out = np.empty(self.number)
-        for part in blocks(self.number):
-            out[part] = dot_rows(c[:, part], self.apply(c[:, part], part))
+        for block in blocks(self.number):
+            out[block] = dot_rows(c[:, block], self.apply(c[:, block], block))
         return out
 
     def opposite(self, side: BoundaryFacets) -> FloatArray:
@@ -540,17 +540,17 @@ class Cells:
             out -= np.where((side.local == i) | (side.local == j), s[side.cells], 0.0)
         return out
 
-    def squares(self, part: slice | IndexArray) -> FloatArray:
-        """Compute |T| |∇λ_i|², shape (d + 1, cells in the part)."""
-        out = np.zeros((self.tdim + 1, len(self.volume[part])))
-        for (i, j), s in zip(self.pairs, self.stiffness[:, part], strict=True):
+    def squares(self, block: slice | IndexArray) -> FloatArray:
+        """Compute |T| |∇λ_i|², shape (d + 1, cells in the block)."""
+        out = np.zeros((self.tdim + 1, len(self.volume[block])))
+        for (i, j), s in zip(self.pairs, self.stiffness[:, block], strict=True):
             out[i] -= s
             out[j] -= s
         return out
 
-    def trace(self, part: slice | IndexArray) -> FloatArray:
+    def trace(self, block: slice | IndexArray) -> FloatArray:
         """Compute |T| Σ |∇λ_i|²."""
-        return -2.0 * sum_rows(self.stiffness[:, part])
+        return -2.0 * sum_rows(self.stiffness[:, block])
 
 
 def on_cells(mesh: Mesh, values: FloatArray) -> fem.Function:
@@ -638,7 +638,7 @@ def _shape(edges: list[list[FloatArray]], lengths: FloatArray) -> tuple[FloatArr
 def vertex_rows(u: FloatArray, cells: Cells) -> FloatArray:
     """Compute u_h at the cells' vertices from its facet dofs, shape (d + 1, cells)."""
     out = np.empty(cells.facets.shape)
-    for part in blocks(cells.number):
-        values = u[cells.facets[:, part]]
-        np.subtract(sum_rows(values), cells.tdim * values, out=out[:, part])
+    for block in blocks(cells.number):
+        values = u[cells.facets[:, block]]
+        np.subtract(sum_rows(values), cells.tdim * values, out=out[:, block])
     return out

@@ -192,7 +192,7 @@ class Condition:
 
     @property
     def loss(self) -> Any:
-        """B ≥ 0: a_h(u, v) gains the integral of b u v."""
+        """The coefficient b ≥ 0: a_h(u, v) gains the integral of b u v."""
         return None
 
 

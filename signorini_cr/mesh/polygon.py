@@ -191,10 +191,10 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
         at = at[(below[at] <= above[i]) & (above[at] >= below[i])]
         c, d, along = a[at], b[at], direction[at]
         t = np.clip(((a[i] - c) * along).sum(axis=1) / length2[at], 0, 1)
-        gap = np.linalg.norm(c + t[:, None] * along - a[i], axis=1)
-        gap[(at == i) | (after[at] == i)] = np.inf
-        if gap.min() <= near:
-            raise InputError(f"{vertex(i)} lies on {edge(int(at[gap.argmin()]))}")
+        distance = np.linalg.norm(c + t[:, None] * along - a[i], axis=1)
+        distance[(at == i) | (after[at] == i)] = np.inf
+        if distance.min() <= near:
+            raise InputError(f"{vertex(i)} lies on {edge(int(at[distance.argmin()]))}")
         crossing = (_side(a[i], b[i], c) * _side(a[i], b[i], d) < 0) & (
             _side(c, d, a[i]) * _side(c, d, b[i]) < 0
         )

@@ -215,6 +215,11 @@ def _prepare(
             f"PETSc can't solve with -{REDUCED_PREFIX}ksp_type {outer.getType()}: it needs the "
             f"method mult of a matrix that is never made; see -{PREFIX}ksp_type"
         )
+    if snes.getType() == PETSc.SNES.Type.VINEWTONSSLS:
+        raise InputError(
+            f"PETSc can't solve with -{PREFIX}snes_type {snes.getType()}: it needs the method"
+            " diagonalScale of a matrix that is never made"
+        )
     # after the type, which brings functions of its own
     snes.setFunction(lambda _, x, r: stiffness.residual(x, vectors.b, r), vectors.residual)
     sizes = vectors.b.getSizes(), vectors.b.getSizes()

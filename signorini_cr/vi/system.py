@@ -385,14 +385,13 @@ class System:
         release(pattern, here, around)
         return found
 
-    @property
     def data_rounded(self) -> float:
-        """Bound of what rounding of u_D and of the loads may change in b, summed up; collective."""
+        """Bound what rounding of u_D and of the loads may change in b, summed up; collective."""
         owned, fixed = self.A.getLocalSize()[0], self.owned_dirichlet
-        b, chi = self.b[:owned], self.chi[:owned]
-        b[fixed], values = 0.0, b[fixed]  # on Γ0 b has u_D, which is no force
-        size = _sum_of_sizes(b) + 2.0 * _sum_of_sizes(chi)  # b − χ is u_D's share
-        b[fixed] = values
+        forces = self.b[:owned].copy()
+        forces[fixed] = 0.0  # b has u_D there
+        # b − χ is u_D's share
+        size = _sum_of_sizes(forces) + 2.0 * _sum_of_sizes(self.chi[:owned])
         if self.offset:
             sums = self.row_sums()
             sums[fixed] = 0.0
