@@ -82,6 +82,32 @@ def room_for_recursion() -> Iterator[None]:
 
 def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
     """Start PETSc and do what the command says; whatever goes wrong becomes a message."""
+    comm = _begin(args, screen, asked)
+    if isinstance(comm, int):
+        return comm
+    try:
+        from .. import jit
+        from ..errors import InputError, NotConverged
+
+        jit.tell = screen.warn
+        try:
+            status = {"solve": _solve, "check": _check}[args.command](args, screen, comm)
+        except (InputError, NotConverged) as error:
+            screen.complain(f"{args.file}: {error}")
+            status = BAD_INPUT if isinstance(error, InputError) else NOT_CONVERGED
+        screen.flush()
+        comm.Barrier()  # mpirun ends all ranks when the first leaves with an error
+        return status
+    except (Exception, KeyboardInterrupt) as error:
+        return _end(args, screen, comm, asked, error)
+
+
+def _begin(args: argparse.Namespace, screen: Screen, asked: list[int]) -> Any:
+    """Start PETSc, and MPI with it.
+
+    Returns:
+        The communicator, or the exit status where that can't be done.
+    """
     if (complaint := too_little()) is not None:
         return _refuse(screen, f"{args.file}: {complaint}", NOT_CONVERGED)
     if sys.flags.optimize > 1:
@@ -103,6 +129,7 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         if (complaint := left_alone(comm.size)) is not None:
             screen.complain(complaint)
             return BAD_INPUT
+        return comm
     except (Exception, KeyboardInterrupt) as error:
         if asked or isinstance(error, KeyboardInterrupt):
             status = status_of(asked)
@@ -120,41 +147,43 @@ def _run(args: argparse.Namespace, screen: Screen, asked: list[int]) -> int:
         if launched()[1] > 1:  # the others would wait for it, and it for them when MPI ends
             os._exit(status)
         return status
-    try:
-        from .. import jit
-        from ..errors import InputError, NotConverged
 
-        jit.tell = screen.warn
-        try:
-            status = {"solve": _solve, "check": _check}[args.command](args, screen, comm)
-        except (InputError, NotConverged) as error:
-            screen.complain(f"{args.file}: {error}")
-            status = BAD_INPUT if isinstance(error, InputError) else NOT_CONVERGED
-        screen.flush()
-        comm.Barrier()  # mpirun ends all ranks when the first leaves with an error
-        return status
-    except (Exception, KeyboardInterrupt) as error:
-        # Perhaps on this rank only: the others must not wait for it
-        kept = "".join(getattr(error, "__notes__", ()))  # from _solve
-        if asked or isinstance(error, KeyboardInterrupt):
-            status = status_of(asked)
-            if not screen.root:  # which tells and ends all, if it was asked and can
-                time.sleep(PASSED_ON + 0.3 * min(1 + comm.rank, 5))
-                screen.root = True
-            word = "terminated" if status == TERMINATED else "interrupted"
-            screen.complain(f"{word}{kept and f'; {kept}'}")
-            return _end_all(comm, status)
-        if ran_out_of_memory(error):  # while it began, or while it wrote
+
+def _end(
+    args: argparse.Namespace, screen: Screen, comm: Any, asked: list[int], error: BaseException
+) -> int:
+    """Tell of an error that perhaps this rank alone has, so that the others must not wait for it.
+
+    Args:
+        args: The command line.
+        screen: Where it is told.
+        comm: All ranks.
+        asked: The signals that have come.
+        error: The error.
+
+    Returns:
+        The exit status, if there are no other ranks.
+    """
+    kept = "".join(getattr(error, "__notes__", ()))  # from _solve
+    if asked or isinstance(error, KeyboardInterrupt):
+        status = status_of(asked)
+        if not screen.root:  # which tells and ends all, if it was asked and can
+            time.sleep(PASSED_ON + 0.3 * min(1 + comm.rank, 5))
             screen.root = True
-            screen.complain(f"{args.file}: {NO_MEMORY}" + (kept and f"\n{kept}"))
-            return _end_all(comm, NOT_CONVERGED)
-        import traceback
+        word = "terminated" if status == TERMINATED else "interrupted"
+        screen.complain(f"{word}{kept and f'; {kept}'}")
+        return _end_all(comm, status)
+    if ran_out_of_memory(error):  # while it began, or while it wrote
+        screen.root = True
+        screen.complain(f"{args.file}: {NO_MEMORY}" + (kept and f"\n{kept}"))
+        return _end_all(comm, NOT_CONVERGED)
+    import traceback
 
-        where = f" on rank {comm.rank}" if comm.size > 1 else ""
-        with suppress(OSError):  # whether or not it can be told
-            traceback.print_exc()
-            print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
-        return _end_all(comm, FAULT)
+    where = f" on rank {comm.rank}" if comm.size > 1 else ""
+    with suppress(OSError):  # whether or not it can be told
+        traceback.print_exception(error)
+        print(f"signorini-cr: unexpected error{where}, see above", file=sys.stderr, flush=True)
+    return _end_all(comm, FAULT)
 
 
 def _refuse(screen: Screen, words: str, status: int) -> int:
