@@ -117,6 +117,7 @@ def _begin(args: argparse.Namespace, screen: Screen, asked: list[int]) -> Any:
         elsewhere = temporary.choose()
     except OSError as error:
         return _refuse(screen, str(error), BAD_INPUT)
+    os.environ.pop("MPLBACKEND", None)  # pictures go to files, and a notebook's own may be missing
     try:
         start_petsc(args.petsc)
         from mpi4py import MPI

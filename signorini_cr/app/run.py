@@ -131,7 +131,12 @@ class Run:
         self.screen.progress("writing")
         with naming("--out"):
             names = output.write_output(
-                self.folder, report, finest, resumable=True, moments=moments
+                self.folder,
+                report,
+                finest,
+                resumable=True,
+                moments=moments,
+                tell=self.screen.warn,
             )
             if self.args.html:
                 names.append(self._write_page(report))

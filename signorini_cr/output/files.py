@@ -71,7 +71,7 @@ def write_files(
     writers: Mapping[str, Writer],
     removed: Iterable[str] = (),
     comm: MPI.Comm = MPI.COMM_WORLD,
-) -> None:
+) -> list[str]:
     """Put files into a folder: all of them or, if a writer raises, none.
 
     They are written into a hidden folder on the same file system and renamed into place. Where the
@@ -81,9 +81,13 @@ def write_files(
         folder: Made if it is not there. Other files in it are left alone.
         writers: What writes the file of each name to the path that it is given. The first file
             vouches for the others: it goes before any of `removed` and comes last, so that
-            wherever it is found, there is nothing of a former run beside it.
-        removed: Names that shall not be there afterwards unless they are among `writers`.
+            wherever it is found, there is nothing of a former run beside it. Another may leave
+            its file out.
+        removed: Names that shall not be there afterwards unless they were written.
         comm: The ranks that take part; all must call.
+
+    Returns:
+        The names of what was written.
 
     Raises:
         InputError: The system refuses to write.
@@ -98,9 +102,9 @@ def write_files(
         held.append(lock)
         return str(stage)
 
-    def publish() -> None:
-        first, *others = writers
-        obsolete = [path / name for name in set(removed) - set(writers)]
+    def publish() -> list[str]:
+        first, *others = written = [name for name in writers if (stage / name).exists()]
+        obsolete = [path / name for name in set(removed) - set(written)]
         with disk_errors(path):
             path.mkdir(parents=True, exist_ok=True)
             if any(map(os.path.lexists, obsolete)):
@@ -109,12 +113,13 @@ def write_files(
                     each.unlink(missing_ok=True)
             for name in (*others, first):
                 os.replace(stage / name, path / name)
+        return written
 
     stage = Path(on_root(comm, prepare))
     try:
         for name, write in writers.items():
             write(stage / name)
-        on_root(comm, publish)
+        return on_root(comm, publish)
     finally:
         if comm.rank == 0:
             _leave(stage, *held)

@@ -368,7 +368,14 @@ def _message(falls: Mapping[str, str]) -> str:
 def drawn(comm: MPI.Comm, draw: Callable[[], Figure | SubFigure]) -> Figure | SubFigure | None:
     """Draw on rank 0, which alone gets the figure; collective."""
     figures: list[Figure | SubFigure] = []
-    on_root(comm, lambda: figures.append(draw()))
+
+    def attempt() -> None:
+        from matplotlib import rc_context
+
+        with rc_context({"text.usetex": False}):  # it has no words for λ and ‖∇u‖
+            figures.append(draw())
+
+    on_root(comm, attempt)
     return figures[0] if figures else None
 
 

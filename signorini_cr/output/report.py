@@ -13,6 +13,7 @@ import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -28,6 +29,7 @@ from ..errors import InputError, on_root
 from ..estimate.certificate import SHARES
 from ..estimate.force import NO_BOUNDS
 from ..means import NO_MEAN
+from ..memory import ran_out_of_memory
 from . import checkpoint, plots
 from .files import Writer, write_files, write_text
 from .strip import Moment, plot_strip
@@ -249,8 +251,11 @@ def write_output(
     pictures: bool = True,
     resumable: bool = False,
     moments: Sequence[Moment] = (),
+    tell: Callable[[str], object] = warnings.warn,
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
+
+    A picture that Matplotlib fails to draw is left out.
 
     Args:
         folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
@@ -262,6 +267,7 @@ def write_output(
             Matplotlib is not installed.
         resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
         moments: Of a run in time, for the strip; what `series.write_step` has left is of this one.
+        tell: Called on all ranks with what a user should know.
 
     Returns:
         The names of the files written.
@@ -292,12 +298,26 @@ def write_output(
             writers["strip.png"] = lambda path: plots.drawn(
                 comm, lambda: plot_strip(moments, path, title, units)
             )
+    for name in [name for name in writers if name.endswith(".png")]:
+        writers[name] = _if_drawn(writers[name], tell)
     kept = {checkpoint.NAME} if resumable else set()
     if moments:
         kept |= {"times.csv", "series.pvd", checkpoint.MOMENTS}
-    removed = set(FILES) - kept
-    write_files(folder, writers, removed=removed, comm=comm)
-    return list(writers)
+    return write_files(folder, writers, removed=set(FILES) - kept, comm=comm)
+
+
+def _if_drawn(write: Writer, tell: Callable[[str], object]) -> Writer:
+    """Leave a picture out that can't be drawn, as where a user's settings of Matplotlib fail."""
+
+    def attempt(path: Path) -> None:
+        try:
+            write(path)
+        except Exception as error:
+            if isinstance(error, InputError) or ran_out_of_memory(error):
+                raise
+            tell(f"{path.name} cannot be drawn: {type(error).__name__}: {error}")
+
+    return attempt
 
 
 def _clear_mesh(solution: Solution, path: Path, title: str) -> tuple[Domain, Path, str]:

@@ -12,13 +12,23 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from ..errors import on_root
-from ..rounding import at_most, counted, interval, known, rounded_up
+from ..rounding import at_most, counted, interval, known
 from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
 from .report import FILES, bounded, energy_bounds, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
-from .tables import Column, energy, explained, is_plain_force, levels_csv, rows_of, short, unit_of
+from .tables import (
+    Column,
+    bound_of,
+    energy,
+    explained,
+    is_plain_force,
+    levels_csv,
+    rows_of,
+    short,
+    unit_of,
+)
 from .units import GLUE, PLAIN, Units
 from .vtu import write_solution
 
@@ -37,7 +47,7 @@ COLUMNS: tuple[Column, ...] = (
     ("contact", 8, lambda r: short(r["length"])),
     ("force", 12, lambda r: _force(r)),
     ("energy", 12, lambda r: energy(r, 4)),
-    ("bound", 9, lambda r: "none" if r["bound_h1"] is None else short(rounded_up(r["bound_h1"]))),
+    ("bound", 9, bound_of),
 )
 """The printed table."""
 

@@ -163,7 +163,7 @@ def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None)
 
 def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> str:
     """Return the printed table in Markdown, units in its head."""
-    columns = _columns(records[0]) if records else []
+    columns = _columns_of_all(records) if records else []
     head, *rows = rows_of(columns, records, MEASURED, units)
     rows = [head, [(w - 1) * "-" + ":" for _, w, _ in columns], *rows]
     lines = (
@@ -175,7 +175,7 @@ def markdown_table(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -
 
 def table_rows(records: Sequence[Mapping[str, Any]], units: Units = PLAIN) -> list[list[str]]:
     """Return the cells of the printed table, its head first, which has the units."""
-    return rows_of(_columns(records[0]), records, MEASURED, units)
+    return rows_of(_columns_of_all(records), records, MEASURED, units)
 
 
 def rows_of(
@@ -260,12 +260,24 @@ def _columns(first: Mapping[str, Any]) -> list[Column]:
             ("contact", 8, lambda r: short(r["contact"]["length"])),
         ]
     if bound:
-        columns.append(("bound", 7, lambda r: short(rounded_up(r["bound_h1"]))))
+        columns.append(("bound", 7, bound_of))
     if bound and exact:
         # Eighty columns: the number of cells gives way, it is in levels.csv
         del columns[1]
         columns.append(("eff.", 4, lambda r: _fixed(r["effectivity"])))
     return columns
+
+
+def _columns_of_all(records: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """Return the same for all records, of which some may have a bound and others none."""
+    bounded = (record for record in records if record["bound_h1"] is not None)
+    return _columns(next(bounded, records[0]))
+
+
+def bound_of(record: Mapping[str, Any]) -> str:
+    """Format the certified bound of a level or a step, some of which may have none."""
+    bound = record["bound_h1"]
+    return "none" if bound is None else short(rounded_up(bound))
 
 
 def energy(record: Mapping[str, Any], otherwise: int = 7) -> str:

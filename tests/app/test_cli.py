@@ -855,6 +855,24 @@ def test_where_the_force_has_no_bounds_the_reason_is_told(write) -> None:
         assert "no bounds: Γ1 touches Γ0" in " ".join(text.split())
 
 
+def test_a_bound_that_comes_and_goes(write) -> None:
+    """α jumps inside a facet, which is in contact on some meshes, and then there is no bound."""
+    text = CASE.replace("[-1, 0], [1, 0]", "[0, 0], [1, 0]").replace("[-1, 1]]", "[0, 1]]")
+    text = text.replace(LINE, 'boundary = ["contact", "neumann", "dirichlet", "neumann"]')
+    text = text.replace("size = 0.5", "size = SIZE").replace('"1 + r"', '"-0.4"')
+    text = text.replace("obstacle = 0", 'obstacle = "where(x < 0.41, -0.3, -0.2)"')
+    seen = set()
+    for size in ("0.3", "0.6", "0.25"):
+        path = write(text.replace("SIZE", size))
+        status, _, err = run("solve", path, "--out", "out", "--levels", "4", "--html")
+        assert (status, err) == (0, "")
+        if COMM.rank == 0:
+            levels = json.loads(Path("out/report.json").read_text())["levels"]
+            assert len(levels) == 4
+            seen |= {level["bound_h1"] is None for level in levels}
+    assert seen == {True, False} or COMM.rank
+
+
 def test_quiet_and_p1(write) -> None:
     path, out = write(CASE), Path("out")
     assert run("solve", path, "--out", out, "--element", "P1", "--quiet") == (0, "", "")

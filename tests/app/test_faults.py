@@ -149,6 +149,16 @@ def test_without_docstrings_one_message_tells(ranks: int, tmp_path: Path) -> Non
     assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
 
 
+@pytest.mark.serial
+def test_pictures_are_drawn_whatever_notebooks_name(tmp_path: Path) -> None:
+    """A backend that is missing here keeps Matplotlib from being loaded."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "--levels", "1"]
+    done = helpers.command(*argv, MPLBACKEND="module://nowhere.backend")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert helpers.is_picture(tmp_path / "out" / "solution.png")
+
+
 PLACES = """import os, sys
 from signorini_cr import temporary
 os.environ.update(TMPDIR="/proc/nowhere")

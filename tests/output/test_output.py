@@ -331,3 +331,32 @@ def test_a_full_disk_is_told_in_words(
         output.write_output(shared_tmp_path / "out", report, solution)
     WORLD.barrier()
     assert not (shared_tmp_path / "out").exists()
+
+
+def test_a_picture_that_cannot_be_drawn_is_left_out(finished, shared_tmp_path, monkeypatch):
+    """It does not cost the field; that of a former run goes."""
+    solution, report = finished
+    output.write_output(shared_tmp_path / "out", report, solution)
+
+    def failing(*_, **__):
+        raise KeyError("latex")
+
+    monkeypatch.setattr(output.plots, "plot_contact", failing)
+    told = []
+    names = output.write_output(shared_tmp_path / "out", report, solution, tell=told.append)
+    assert told == ["contact.png cannot be drawn: KeyError: 'latex'"]
+    WORLD.barrier()
+    there = {path.name for path in (shared_tmp_path / "out").iterdir()}
+    assert set(names) == there and {"solution.vtu", "solution.png"} <= there
+    assert "contact.png" not in there
+
+
+@pytest.mark.serial
+def test_settings_of_matplotlib_that_need_what_is_missing(finished, tmp_path):
+    """Here, LaTeX."""
+    import matplotlib
+
+    solution, report = finished
+    with matplotlib.rc_context({"text.usetex": True}):
+        names = output.write_output(tmp_path, report, solution, tell=pytest.fail)
+    assert "solution.png" in names

@@ -68,6 +68,21 @@ def test_the_energy_norm_is_told_where_it_is_another_one():
     assert "; in the norm of the energy it is at most 0.988; J(u)" in told
 
 
+@pytest.mark.parametrize("exact", [None, 0.5])
+def test_some_levels_have_a_bound_and_others_none(exact):
+    """As where α jumps on a facet that only some meshes have in contact."""
+    bounded = RECORD | {"error_h1": exact, "rate_h1": None, "rate_l2": None, "effectivity": 0.5}
+    free = bounded | {"level": 1, "bound_h1": None, "bound_energy_norm": None, "effectivity": None}
+    assert table_row(bounded, bounded).split()[-2 if exact else -1] == "0.267"
+    assert "none" in table_row(free, bounded).split()
+    assert len(table_row(free, bounded)) == len(table_row(bounded, bounded))
+    for records in ([bounded, free], [free, bounded]):
+        head, _, *rows = markdown_table(records).splitlines()
+        place = [name.strip() for name in head.split("|")].index("bound")
+        found = [row.split("|")[place].strip() for row in rows]
+        assert sorted(found) == ["0.267", "none"]
+
+
 def test_no_bound_no_figures():
     record = RECORD | {"bound_h1": None, "bound_reason": "no flux"}
     assert certified(record) == ["no bound of the error: no flux"]
