@@ -7,13 +7,21 @@ fewest cells that hold a given part of it; their sides are halved.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
 from .arrays import BoolArray, FloatArray
-from .errors import InputError, NotConverged, insist_on_count
+from .errors import (
+    InputError,
+    NotConverged,
+    insist_on_count,
+    insist_on_function,
+    insist_on_kind,
+    insist_on_number,
+)
 from .fem.problem import Problem
 from .levels import LevelMonitor, check_arguments, solve_sequence
 from .limits import Limits
@@ -157,12 +165,15 @@ def adapt_to_run(
         InputError: As for `solve_adaptive`; or the run has no steps, or is on another mesh.
         NotConverged: As for `solve_adaptive`, or the run raised it.
     """
+    insist_on_function("run", run)
     step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction, runs=RUNS)
     refined = [*meshes]
     while True:
         bound, last = 0.0, None
         indicators: FloatArray = np.zeros(1)
-        for _, last in run(refined):
+        steps = run(refined)
+        insist_on_kind("what run returns", steps, Iterable, "pairs of a time and a solution")
+        for _, last in steps:
             shares = Shares.of(last)
             bound, indicators = max(bound, shares.bound), indicators + shares.indicators
         if last is None:
@@ -201,12 +212,13 @@ def _by_shares(
     runs: float = 1.0,
 ) -> Callable[[Solution, Shares], Refined | None]:
     """Make such a step from what is said of where the error is; for ``runs`` see `Limits.admit`."""
+    insist_on_kind("fraction", fraction, Real, "a number")
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None:
         insist_on_count("levels", levels)
-    if not tolerance >= 0.0:
-        raise InputError(f"tolerance is {tolerance}; it must be 0 or more")
+    insist_on_number("tolerance", tolerance, 0.0)
+    insist_on_number("max_dofs", max_dofs, 1.0)
 
     def step(solution: Solution, shares: Shares) -> Refined | None:
         last = levels is not None and solution.level.number + 1 >= levels

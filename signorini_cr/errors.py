@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from numbers import Integral
+from numbers import Integral, Real
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -61,6 +61,17 @@ def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], nee
         raise InputError(f"{name} is of the type {type(value).__name__}: {needed} is needed")
 
 
+def insist_on_function(name: str, value: object) -> None:
+    """Refuse what can't be called.
+
+    Args:
+        name: What the argument is called.
+        value: What was given for it.
+    """
+    if not callable(value):
+        raise InputError(f"{name} is of the type {type(value).__name__}: a function is needed")
+
+
 def insist_on_count(name: str, value: object) -> None:
     """Refuse what is no whole number of 1 or more.
 
@@ -71,6 +82,23 @@ def insist_on_count(name: str, value: object) -> None:
     insist_on_kind(name, value, Integral, "a whole number")
     if isinstance(value, Integral) and value < 1:
         raise InputError(f"{name} is {value}; it must be 1 or more")
+
+
+def insist_on_number(name: str, value: object, least: float, strict: bool = False) -> None:
+    """Refuse what is no number, or below another one.
+
+    Args:
+        name: What the argument is called.
+        value: What was given for it.
+        least: What it must not be below.
+        strict: Whether that one itself is refused, too.
+    """
+    insist_on_kind(name, value, Real, "a number")
+    assert isinstance(value, Real)
+    above = float(value) > least if strict else float(value) >= least
+    if not above:
+        needed = f"above {least:g}" if strict else f"{least:g} or more"
+        raise InputError(f"{name} is {value}; it must be {needed}")
 
 
 def meant(
@@ -103,15 +131,26 @@ def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:
         function: Returns something that can be pickled.
         *args: Handed over to `function`.
     """
-    result: T | None = None
+    found = together(comm, lambda: function(*args) if comm.rank == 0 else None)
+    return comm.bcast(found, root=0)
+
+
+def together(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:
+    """Call `function(*args)` on every rank; what it raises on any is raised on all.
+
+    Args:
+        comm: The ranks that take part; all must call.
+        function: What is not collective itself, as a function of the user's.
+        *args: Handed over to `function`.
+    """
+    result: T
     error: Exception | None = None
-    if comm.rank == 0:
-        try:
-            result = function(*args)
-        except Exception as caught:
-            error = caught
+    try:
+        result = function(*args)
+    except Exception as caught:
+        error = caught
     fail_together(comm, error)
-    return comm.bcast(result, root=0)
+    return result
 
 
 def fail_together(comm: MPI.Comm, error: Exception | None) -> None:

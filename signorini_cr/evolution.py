@@ -27,7 +27,7 @@ from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
 from .data.moments import Rule, Volume
 from .diffusion import Diffusion
-from .errors import InputError, insist_on_count
+from .errors import InputError, insist_on_count, insist_on_kind, raise_together
 from .fem.conditions import Data
 from .fem.problem import Problem, as_expression
 from .levels import LevelMonitor, Start, check_arguments, solve_level
@@ -54,6 +54,8 @@ class Scheme(NamedTuple):
     weights: tuple[float, ...]
 
 
+MOST_STEPS = 2**53
+"""The whole numbers up to it are floats, too."""
 SCHEMES = {"euler": Scheme(1.0, (1.0,)), "bdf2": Scheme(1.5, (4.0 / 3.0, -1.0 / 3.0))}
 """By name; the first steps, which have too little before them, are Euler's."""
 
@@ -181,6 +183,10 @@ class Solver:
             NotConverged: As for `solve`.
         """
         own, start = self._of_this(source, before)
+        fit = bool(np.isfinite(np.asarray(rate, dtype=np.float64)).all())
+        raise_together(
+            self.V.mesh.comm, None if fit else "rate: numbers that are finite are needed"
+        )
         self._carry_down()
         operator, boundary = self._have_changed()
         if boundary:
@@ -235,7 +241,12 @@ class Solver:
         found, V = fem.Function(self.V), self.V
         sums: list[FloatArray] = []
         for each in (data, 1.0):
-            volume = Volume(as_expression(each, forms.x), forms.mesh, rule)
+            expression = as_expression(each, forms.x, "initial", True)
+            if expression.ufl_shape:
+                raise InputError(
+                    f"initial has the shape {expression.ufl_shape}; a scalar is needed"
+                )
+            volume = Volume(expression, forms.mesh, rule)
             moments = chi(VolumeMoments.of(volume, on_mesh.cells), (), on_mesh.cells)
             sums.append(Layout.of_space(V).shared_sum(moments))
         # the matrix of products of CR's functions is diagonal for triangles
@@ -314,15 +325,21 @@ def solve_in_time(
         NotConverged: A step was not solved, or would not fit into ``max_time``; or the mesh would
             not fit into the memory there is.
     """
+    insist_on_kind("end", end, Real, "a number")
     if not (end > 0.0 and np.isfinite(end)):
         raise InputError(f"end is {end}; it must be a time after 0")
     insist_on_count("steps", steps)
-    if not np.isfinite(steps / end):
+    insist_on_kind("done", done, Integral, "a whole number")
+    if not 0 <= done <= steps:
+        raise InputError(f"done is {done}; it must be the number of a step, or 0")
+    if steps > MOST_STEPS or not np.isfinite(steps / end):
         raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
-    if scheme not in SCHEMES:
+    if not isinstance(scheme, str) or scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
-    if not (time is None or hasattr(time, "value")):
-        raise InputError(f"time is {time!r}; it must be a dolfinx Constant, which data hold")
+    if time is not None and not _is_clock(time):
+        raise InputError(
+            f"time is {time!r}; it must be a dolfinx Constant, a float64, which data hold"
+        )
     check_arguments(problem, domain)
     own = _capacities(problem, capacity)
     if problem.exact is not None and problem.f is None:
@@ -374,6 +391,12 @@ def solve_in_time(
             solver.close()
 
 
+def _is_clock(time: object) -> bool:
+    """Tell whether something has a time that can be set."""
+    value = np.asarray(getattr(time, "value", None))
+    return value.shape == () and np.issubdtype(value.dtype, np.floating)
+
+
 def _capacities(problem: Problem, usual: float) -> dict[str, float]:
     """Take the capacities of materials that have their own, by name; all of them are above 0."""
     given = {name: each.capacity for name, each in problem.materials.items()}
@@ -390,7 +413,7 @@ def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:
     given = {name: each.reaction for name, each in problem.materials.items()}
     x = ufl.SpatialCoordinate(domain.mesh)
     return {
-        name: as_expression(each, x)
+        name: as_expression(each, x, "reaction", True)
         for name, each in {"": problem.reaction, **given}.items()
         if each is not None
     }

@@ -71,6 +71,8 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
             raise InputError(
                 f"{part!r} is no Dirichlet or contact part of the boundary; {meant(part, known)}"
             )
+    if len(set(names)) < len(names):
+        raise InputError(f"parts: {', '.join(names)}: each may be given once")
     conditions = [known[name] for name in names]
     return _interval(solution, conditions, weight)
 

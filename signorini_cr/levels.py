@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dolfinx import fem
 
 from .diffusion import Diffusion
-from .errors import InputError, NotConverged, insist_on_count, insist_on_kind
+from .errors import InputError, NotConverged, insist_on_count, insist_on_function, insist_on_kind
 from .fem.conditions import facets_of
 from .fem.physics import Physics
 from .fem.problem import Problem
@@ -251,6 +251,8 @@ def solve_level(
             nested_start(start.coarser, level, u, start.before)
     if level.floating is not None:
         level.floating.hold(system, u)
+    if monitor is not None:
+        insist_on_function("monitor", monitor)
     told = None if monitor is None else lambda *facts: monitor(level.number, *facts)
     try:
         with (

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from mpi4py import MPI
 
-from .errors import NotConverged
+from .errors import NotConverged, insist_on_kind, insist_on_number
 from .memory import most_memory, shortage
 from .mesh.domain import Domain
 from .restart import Restart
@@ -35,7 +35,13 @@ class Limits:
     """
 
     def __init__(self, max_time: float | None = None):
-        """Begin to count."""
+        """Begin to count.
+
+        Raises:
+            InputError: That is no time.
+        """
+        if max_time is not None:
+            insist_on_number("max_time", max_time, 0.0, strict=True)
         self._max_time = max_time
         self._began = time.perf_counter()
         self._passed = 0.0
@@ -52,12 +58,14 @@ class Limits:
 
         Raises:
             NotConverged: It does not.
+            InputError: There is something else in the place of `restart`.
         """
         comm, topology, number = domain.mesh.comm, domain.mesh.topology, levels - 1
         dofs = topology.index_map(0 if element == "P1" else topology.dim - 1).size_global
         for k in range(levels - 1):  # the halves of all facets, and three in each triangle
             dofs = 2 * dofs + 3 * 4**k * topology.index_map(topology.dim).size_global
         if restart is not None:
+            insist_on_kind("restart", restart, Restart, "a Restart")
             number, dofs = len(restart.added), restart.u[0][1].size
         _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
 

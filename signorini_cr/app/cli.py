@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -31,7 +32,7 @@ from .signals import interruptible, status_of
 
 DONE, FAULT, BAD_INPUT, NOT_CONVERGED = 0, 1, 2, 3
 NO_MEMORY = "out of memory"
-INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+INTERRUPTED = 128 + signal.SIGINT
 FRAMES = 10_000
 """Calls within one another: UFL differentiates by recursion, 40 calls at most for each of the 250
 operations that `expressions.LONGEST_CHAIN` allows one upon the other."""
@@ -114,9 +115,17 @@ def _begin(args: argparse.Namespace, screen: Screen, asked: list[int]) -> Any:
         words = "Python runs without docstrings (-OO, PYTHONOPTIMIZE=2), which compiling takes"
         return _refuse(screen, words, BAD_INPUT)
     try:
+        os.getcwd()
+    except OSError as error:
+        words = f"the folder that it was started in cannot be used: {error.strerror}"
+        return _refuse(screen, words, BAD_INPUT)
+    try:
         elsewhere = temporary.choose()
     except OSError as error:
         return _refuse(screen, str(error), BAD_INPUT)
+    if any(word.startswith("e") for word in sys.warnoptions):  # PYTHONWARNINGS=error, say
+        warnings.simplefilter("default")  # what libraries warn of ends no run
+    os.environ.setdefault("UCX_DEBUG_SIGNO", "0")  # of MPI's, which would take SIGHUP for itself
     os.environ.pop("MPLBACKEND", None)  # pictures go to files, and a notebook's own may be missing
     try:
         start_petsc(args.petsc)
@@ -171,7 +180,7 @@ def _end(
         if not screen.root:  # which tells and ends all, if it was asked and can
             time.sleep(PASSED_ON + 0.3 * min(1 + comm.rank, 5))
             screen.root = True
-        word = "terminated" if status == TERMINATED else "interrupted"
+        word = "interrupted" if status == INTERRUPTED else "terminated"
         screen.complain(f"{word}{kept and f'; {kept}'}")
         return _end_all(comm, status)
     if ran_out_of_memory(error):  # while it began, or while it wrote

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: an end in good order, at a moment when it does no harm."""
+"""Ctrl-C, SIGTERM and SIGHUP: an end in good order, at a moment when it does no harm."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
+
+ENDING = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+"""Signals that ask for an end; the last comes where a terminal is closed."""
 
 
 @contextmanager
@@ -52,8 +55,8 @@ def interruptible() -> Iterator[list[int]]:
     drop, sys.unraisablehook = sys.unraisablehook, dropped
     found: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():  # others can't be interrupted
-        # not where it is ignored, as in the background
-        for each in (signal.SIGINT, signal.SIGTERM):
+        # not where it is ignored, as in the background or by nohup
+        for each in ENDING:
             if signal.getsignal(each) in (signal.default_int_handler, signal.SIG_DFL):
                 found[each] = signal.signal(each, ask)
     try:
@@ -77,7 +80,7 @@ def _must_not_be_disturbed(frame: FrameType | None) -> bool:
 def status_of(asked: Sequence[int]) -> int:
     """Return the exit status after a signal; from here on it is too late for another one."""
     if threading.current_thread() is threading.main_thread():
-        for each in (signal.SIGINT, signal.SIGTERM):
+        for each in ENDING:
             signal.signal(each, signal.SIG_IGN)
     return 128 + (asked[0] if asked else signal.SIGINT)
 

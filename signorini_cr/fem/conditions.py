@@ -122,9 +122,10 @@ class Condition:
         own = {name: getattr(self, name) for name in self.names()} | (
             {main: 0.0} if left_out else {}
         )
+        may_lack = {each.name for each in fields(self) if each.default is None}
         expressions = {
             name: None
-            if value is None
+            if value is None and name in may_lack
             else given.expression(value, called=_in_python(label, part, name))
             for name, value in own.items()
         }

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 from typing import Any
 
 import basix.ufl
@@ -23,12 +23,15 @@ from dolfinx import fem
 from dolfinx.mesh import Mesh
 from ufl.algorithms import compute_form_data
 from ufl.algorithms.check_arities import ArityMismatch
-from ufl.constantvalue import ComplexValue
+from ufl.constantvalue import ComplexValue, IntValue
 from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_pre_traversal
+from ufl.domain import extract_unique_domain
+from ufl.geometry import GeometricFacetQuantity
+from ufl.restriction import Restricted
 
 from ..arrays import Int32Array
-from ..errors import InputError, meant
+from ..errors import InputError, insist_on_kind, meant, together
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials
@@ -139,7 +142,10 @@ class Problem:
         return in_short(self)
 
     def __post_init__(self) -> None:
-        """Refuse degrees that Basix would stop the process for."""
+        """Refuse other kinds of things, and degrees that Basix would stop the process for."""
+        insist_on_kind("conditions", self.conditions, Mapping, "a dictionary by parts")
+        insist_on_kind("materials", self.materials, Mapping, "a dictionary by names")
+        insist_on_kind("form", self.form, (Form, NoneType), "a Form")
         for name in ("quadrature_degree", "error_degree"):
             degree = getattr(self, name)
             if not isinstance(degree, int | np.integer) or degree < 0:
@@ -174,28 +180,48 @@ class Problem:
         )
 
 
-def as_expression(data: Data, x: Expr, called: str = "data") -> Expr:
-    """Turn ``data`` into a UFL expression in the coordinates x.
+def as_expression(data: Data, x: Expr, called: str = "data", in_cells: bool = False) -> Expr:
+    """Turn ``data`` into a UFL expression in the coordinates x; collective.
+
+    What a function of the user's raises on one rank is raised on all.
 
     Args:
         data: What the user has given.
         x: The coordinates.
         called: What it is called in messages.
+        in_cells: Whether it is to have values inside cells, and not on facets alone.
 
     Raises:
         InputError: That is not possible.
     """
-    try:
-        found = ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
-        if any(isinstance(each, ComplexValue) for each in unique_pre_traversal(found)):
-            raise ValueError("it holds a complex number")
-        return found
-    except (TypeError, ValueError) as error:
-        text = "expressions as text are for problem files; " if isinstance(data, str) else ""
-        raise InputError(
-            f"{called}: {data!r} does not give a number or a UFL expression ({error}); {text}"
-            "functions of x take theirs from ufl, as in ufl.sin(x[0])"
-        ) from error
+
+    def made() -> Expr:
+        try:
+            found = ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+            for each in unique_pre_traversal(found):
+                for kind, words in _NO_DATA.items():
+                    if isinstance(each, kind) and (in_cells or kind is not GeometricFacetQuantity):
+                        raise ValueError(f"it holds {words}")
+                if isinstance(each, IntValue):
+                    float(each)  # which may be too large
+            return found
+        except (TypeError, ValueError, OverflowError) as error:
+            text = "expressions as text are for problem files; " if isinstance(data, str) else ""
+            raise InputError(
+                f"{called}: {data!r} does not give a number or a UFL expression ({error}); {text}"
+                "functions of x take theirs from ufl, as in ufl.sin(x[0])"
+            ) from error
+
+    mesh = extract_unique_domain(x).ufl_cargo()
+    return together(mesh.comm, made)
+
+
+_NO_DATA: dict[type, str] = {
+    ComplexValue: "a complex number",
+    ufl.Argument: "a test or trial function",
+    Restricted: "values of one side of a facet",
+    GeometricFacetQuantity: "what facets have, as their normal",
+}
 
 
 class Kernel:
@@ -343,7 +369,7 @@ class Forms:
             said = "finite and above 0" if float(self.kappa) > 0.0 else "above 0"
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be {said}")
         self.exact = (
-            None if problem.exact is None else as_expression(problem.exact, self.x, "exact")
+            None if problem.exact is None else as_expression(problem.exact, self.x, "exact", True)
         )
         # UFL can't differentiate a number
         constant = (
@@ -371,9 +397,9 @@ class Forms:
 
     def _by_material(self, name: str, usual: Data, materials: Materials) -> Expr:
         """Make a datum that materials may have of their own, and elsewhere is the usual one."""
-        base = as_expression(usual, self.x, name)
+        base = as_expression(usual, self.x, name, True)
         own = {
-            material: as_expression(datum, self.x, f"materials[{material!r}].{name}")
+            material: as_expression(datum, self.x, f"materials[{material!r}].{name}", True)
             for material, data in self.problem.materials.items()
             if (datum := getattr(data, name)) is not None
         }
@@ -606,8 +632,9 @@ class Forms:
         Raises:
             InputError: It is none that the element can do with.
         """
+        make = getattr(self.problem.form, name)
         try:
-            form = getattr(self.problem.form, name)(*arguments, *self._measures)
+            form = together(self.mesh.comm, make, *arguments, *self._measures)
         except (TypeError, ValueError) as error:  # of UFL, or of what the function takes
             raise InputError(f"form: {name} makes no form: {error}") from error
         if not isinstance(form, ufl.Form):

@@ -29,7 +29,7 @@ def ufl_element(mesh: Mesh, element: str) -> Any:
     Raises:
         InputError: There is no element of that name.
     """
-    if element not in ELEMENTS:
+    if not isinstance(element, str) or element not in ELEMENTS:
         raise InputError(f"element {element!r} is unknown; allowed: {', '.join(ELEMENTS)}")
     return basix.ufl.element(ELEMENTS[element], mesh.basix_cell(), 1)
 

@@ -36,7 +36,7 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes, coordinate_map
-from ..errors import InputError, insist_on_kind, naming, on_root, raise_together
+from ..errors import InputError, insist_on_kind, naming, on_root, raise_together, together
 from ..garbage import watch
 from ..rounding import counted
 from . import gmshmesh
@@ -242,6 +242,7 @@ class Domain:
         """
         insist_on_kind("mesh", mesh, Mesh, "a dolfinx Mesh")
         insist_on_kind("facet_tags", facet_tags, MeshTags, "dolfinx MeshTags")
+        insist_on_kind("parts", parts, Sequence, "a list of values")
         others = {**{str(value): value for value in parts}, **others}
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
         inner = numbered(others)
@@ -519,9 +520,12 @@ class Polygon:
 
     def __post_init__(self) -> None:
         """Take lists as well as arrays and check everything that can be checked at once."""
+        insist_on_kind("materials", self.materials, Mapping, "a dictionary by names")
         object.__setattr__(self, "vertices", coordinates(self.vertices))
         object.__setattr__(self, "boundary", tuple(self.boundary))
         object.__setattr__(self, "holes", tuple(self.holes))
+        for hole in self.holes:
+            insist_on_kind("a hole", hole, Polygon, "a Polygon")
         object.__setattr__(self, "names", tuple(self.names))
         check_labels(self.boundary, len(self.vertices), (*PARTS, *self.names))
         object.__setattr__(self, "edges", tuple(self.edges) or tuple(range(len(self.vertices))))
@@ -577,12 +581,8 @@ class Polygon:
                 the mesh.
         """
         insist_on_kind("size", size, Real, "a positive number")
-        if not (np.isfinite(size) and size > 0):
-            raise InputError(f"size is {size}: a positive number is needed")
-        if size > self.diameter * (1 + 1e-9):
-            raise InputError(
-                f"size is {size:g}, longer than the domain, whose diameter is {self.diameter:g}"
-            )
+        insist_on_kind("comm", comm, MPI.Comm, "a communicator of MPI")
+        together(comm, self._insist_on_size, size)
         self.check_parts()
         loops = [self.vertices, *(hole.vertices for hole in self.holes)]
         names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
@@ -590,6 +590,15 @@ class Polygon:
         numbers = numbered_materials(list(self.materials))
         what = loops, labels, float(size), self.materials, numbers
         return _distribute(comm, self.parts, numbers, gmshmesh.triangulate, *what)
+
+    def _insist_on_size(self, size: float) -> None:
+        """Refuse a length that no facet can have."""
+        if not (np.isfinite(size) and size > 0):
+            raise InputError(f"size is {size}: a positive number is needed")
+        if size > self.diameter * (1 + 1e-9):
+            raise InputError(
+                f"size is {size:g}, longer than the domain, whose diameter is {self.diameter:g}"
+            )
 
     @property
     def parts(self) -> dict[str, int]:
@@ -621,6 +630,8 @@ def read_gmsh(
         InputError: The file can't be read, or is no such mesh; the message says where.
     """
     insist_on_kind("path", path, (str, PathLike), "the path of a file")
+    insist_on_kind("names", names, Sequence, "a list of names")
+    insist_on_kind("materials", materials, Sequence, "a list of names")
     parts, numbers = numbered(names), numbered_materials(materials)
     needed = [name for name in parts if name not in PARTS] if names else USUAL
     what = Path(path), parts, needed, numbers

@@ -402,7 +402,7 @@ class _Reader:
         """Read $PhysicalNames, in ASCII always."""
         body, first = self.body("PhysicalNames")
         rows = [(i, row) for i, row in enumerate(body.split(b"\n"), first) if row.strip()]
-        pattern = re.compile(rb'\s*([0-3])\s+(\d{1,9})\s+"(.*)"\s*')
+        pattern = re.compile(rb'\s*([0-3])\s+(\d{1,10})\s+"(.*)"\s*')
         if not rows or not rows[0][1].strip().isdigit():
             raise _Damaged(f"a number is expected in line {first}")
         if int(rows[0][1]) != len(rows) - 1:

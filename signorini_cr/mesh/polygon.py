@@ -97,7 +97,10 @@ def circle(center: Sequence[float], radius: float, size: float) -> FloatArray:
 
 def _one(point: Sequence[float]) -> FloatArray:
     """Return a point as an array, shape (2,)."""
-    x = np.array(point, dtype=np.float64)
+    try:
+        x = np.array(point, dtype=np.float64)
+    except (TypeError, ValueError):
+        x = np.empty(0)
     if x.shape != (2,) or not np.abs(x).max() <= FARTHEST:
         raise InputError(f"a point [x, y] of numbers up to {FARTHEST:g} is needed, found {point}")
     return x

@@ -159,6 +159,31 @@ def test_pictures_are_drawn_whatever_notebooks_name(tmp_path: Path) -> None:
     assert helpers.is_picture(tmp_path / "out" / "solution.png")
 
 
+@pytest.mark.serial
+def test_what_libraries_warn_of_ends_no_run(tmp_path: Path) -> None:
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "--levels", "1"]
+    done = helpers.command(*argv, PYTHONWARNINGS="error")
+    assert done.returncode == 0 and "Traceback" not in done.stderr
+
+
+@pytest.mark.serial
+def test_a_folder_that_is_gone_is_told(tmp_path: Path) -> None:
+    """The one that the command is started in."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "run.py").write_text(
+        "import os, sys\nos.rmdir(os.getcwd())\nfrom signorini_cr.app import cli\n"
+        "sys.exit(cli.main())\n"
+    )
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = helpers.start(tmp_path / "run.py", *argv, cwd=tmp_path / "gone")
+    assert done.returncode == cli.BAD_INPUT
+    words = " ".join(done.stderr.split())
+    assert words.startswith("signorini-cr: the folder that it was started in cannot be used: No su")
+    assert not (tmp_path / "out").exists()
+
+
 PLACES = """import os, sys
 from signorini_cr import temporary
 os.environ.update(TMPDIR="/proc/nowhere")
@@ -304,7 +329,11 @@ def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypat
 @pytest.mark.serial
 @pytest.mark.parametrize(
     "number, word, expected",
-    [(signal.SIGINT, "interrupted", 130), (signal.SIGTERM, "terminated", 143)],
+    [
+        (signal.SIGINT, "interrupted", 130),
+        (signal.SIGTERM, "terminated", 143),
+        (signal.SIGHUP, "terminated", 129),
+    ],
 )
 def test_an_interruption_inside_a_callback_is_one(
     number: signal.Signals, word: str, expected: int, tmp_path: Path, monkeypatch, capsys
@@ -327,6 +356,22 @@ def test_an_interruption_inside_a_callback_is_one(
     assert len(json.loads((out / "report.json").read_text())["levels"]) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.serial
+def test_a_terminal_that_is_closed_ends_a_run(tmp_path: Path) -> None:
+    """MPI's libraries may set handlers of their own, when they are loaded."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    (tmp_path / "run.py").write_text(
+        "import os, signal, sys\nfrom signorini_cr.app import cli\n"
+        "def step(self, text):\n"
+        "    if 'level 2' in text:\n        os.kill(os.getpid(), signal.SIGHUP)\n"
+        "cli.Screen.step = step\nsys.exit(cli.main())\n"
+    )
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q"]
+    done = helpers.start(tmp_path / "run.py", *argv)
+    assert done.returncode == 129
+    assert " ".join(done.stderr.split()).startswith("signorini-cr: terminated; levels 0 to 1 are")
 
 
 @pytest.mark.serial

@@ -10,6 +10,7 @@ from dolfinx.fem import Function
 from helpers import HELD_ABOVE
 from mpi4py import MPI
 from petsc4py import PETSc
+from ufl.domain import extract_unique_domain
 
 from signorini_cr import (
     Contact,
@@ -236,6 +237,17 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
         ),
         ({"f": 1j}, "1j does not give a number or a UFL expression .it holds a complex number"),
         ({"obstacle": lambda x: 2j * x[0]}, "it holds a complex number"),
+        ({"f": lambda x: ufl.avg(x[0])}, "it holds values of one side of a facet"),
+        ({"obstacle": lambda x: x[0]("-")}, "it holds values of one side of a facet"),
+        (
+            {"coefficient": lambda x: ufl.FacetNormal(extract_unique_domain(x))[0]},
+            "it holds what facets",
+        ),
+        (
+            {"f": lambda x: ufl.TestFunction(function_space(HELD_ABOVE.mesh(0.5).mesh))},
+            "it holds a test or trial function",
+        ),
+        ({"f": -(10**400)}, "int too large to convert to float"),
         ({"f": lambda x: np.sin(x[0])}, r"as in ufl.sin\(x\[0\]\)"),
         ({"f": lambda x: x}, r"f has the shape \(2,\); a scalar"),
         ({"g": lambda x: ufl.as_vector([x[0], 1.0])}, "g has the shape"),
