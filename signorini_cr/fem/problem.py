@@ -587,7 +587,7 @@ class Forms:
             # UFL can't differentiate a number
             one = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name="1")
             one.x.array[:] = 1.0
-            own = self.problem.form.a(one, v, *self._measures)
+            own = self._called("a", one, v)
             if not compute_form_data(own, complex_mode=False).preprocessed_form.empty():
                 terms.append(own)
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
@@ -626,17 +626,24 @@ class Forms:
 
         return _Cells(self._numbers, self.mesh.ufl_domain()), ds
 
+    def _called(self, name: str, *arguments: Expr) -> Any:
+        """Call a function of the user's that makes a form; what one rank raises all do."""
+
+        def made() -> object:
+            try:
+                return getattr(self.problem.form, name)(*arguments, *self._measures)
+            except (TypeError, ValueError) as error:  # of UFL, or of what the function takes
+                raise InputError(f"form: {name} makes no form: {error}") from error
+
+        return together(self.mesh.comm, made)
+
     def _own(self, name: str, arity: int, *arguments: Expr) -> ufl.Form:
         """Make a form of the user's own, of some arguments.
 
         Raises:
             InputError: It is none that the element can do with.
         """
-        make = getattr(self.problem.form, name)
-        try:
-            form = together(self.mesh.comm, make, *arguments, *self._measures)
-        except (TypeError, ValueError) as error:  # of UFL, or of what the function takes
-            raise InputError(f"form: {name} makes no form: {error}") from error
+        form = self._called(name, *arguments)
         if not isinstance(form, ufl.Form):
             raise InputError(f"form: {name} returns {form!r}; a UFL form is needed")
         for integral in form.integrals():
