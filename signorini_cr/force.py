@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,6 +90,22 @@ def _interval(
     return Interval(found.value, lower, max(lower, upper))
 
 
+class _ByPhi(NamedTuple):
+    """∫ λ as a(v, φ) − χ(φ), before what Γ1 leaves.
+
+    Attributes:
+        middle: The number.
+        reach: How far it may be from the truth.
+        at: φ at the cells' vertices, shape (d + 1, cells).
+        flows: y·n of φ's flux, shape (d + 1, cells).
+    """
+
+    middle: float
+    reach: float
+    at: FloatArray
+    flows: FloatArray
+
+
 def _corrected(
     made: Made, solution: Certified, conditions: Sequence[Condition], weight: Data | None
 ) -> tuple[float, float] | None:
@@ -105,61 +122,104 @@ def _corrected(
     known = [condition for condition in conditions if condition not in settled.free]
     if settled.mixed and known:
         return None
-    bound = solution.certificate.bound_companion
-    assert bound is not None
-    middle, reach = 0.0, 0.0
-    at: FloatArray = np.zeros((cells.tdim + 1, cells.number))
-    flows = np.zeros_like(at)
-    data = diffusion(made.level.data)
-    omega = None if weight is None else scalar(weight, data.forms)
+    none: FloatArray = np.zeros((cells.tdim + 1, cells.number))
+    found: _ByPhi | None = _ByPhi(0.0, 0.0, none, none)
     if known:
-        problem = _harmonic(data.forms, conditions, settled.free, 1.0 if omega is None else omega)
-        dual = certified(problem, made.level)
-        of_phi = in_p1(dual, cells, bent=weight is not None)
-        if of_phi is None:
-            return None
-        assert dual.bound_companion is not None
-        at, flows = of_phi.vertices[cells.vertices], of_phi.through(cells)
-        apart, weighed = 0.0, Weighed(force=sum(through(made, cells, c) for c in known))
-        if weight is not None:
-            given, own = Weight.of(made, cells, known, weight, settled.free), at
-            at = given.put_into(own)
-            *off_companion, size = np.sqrt(
-                cells.total(
-                    square(made, cells, at - own), of_bumps(of_phi, cells), square(made, cells, at)
-                )
+        found = _by_phi(made, solution, settled, conditions, known, weight)
+    if found is None:
+        return None
+    reach = found.reach + _left_on_contact(made, settled, conditions, weight, found)
+    return float(found.middle - reach), float(found.middle + reach)
+
+
+def _by_phi(
+    made: Made,
+    solution: Certified,
+    settled: Settled,
+    conditions: Sequence[Condition],
+    known: Sequence[Condition],
+    weight: Data | None,
+) -> _ByPhi | None:
+    """Solve for φ, and work it against v; None where φ has no bound; collective.
+
+    Args:
+        made: v and y.
+        solution: Of the problem.
+        settled: Where there is contact for certain, and where there is none.
+        conditions: The parts.
+        known: Those of them with contact, or on which u is set.
+        weight: ω; None for 1.
+    """
+    cells, bound = made.cells(), solution.certificate.bound_companion
+    assert bound is not None
+    forms = diffusion(made.level.data).forms
+    value = 1.0 if weight is None else scalar(weight, forms)
+    dual = certified(_harmonic(forms, conditions, settled.free, value), made.level)
+    phi = in_p1(dual, cells, bent=weight is not None)
+    if phi is None:
+        return None
+    assert dual.bound_companion is not None
+    at = phi.vertices[cells.vertices]
+    apart, weighed = 0.0, Weighed(force=sum(through(made, cells, c) for c in known))
+    if weight is not None:
+        given, own = Weight.of(made, cells, known, weight, settled.free), at
+        at = given.put_into(own)
+        *off_companion, size = np.sqrt(
+            cells.total(
+                square(made, cells, at - own), of_bumps(phi, cells), square(made, cells, at)
             )
-            apart = float(sum(off_companion))
-            weighed = given.weighed(made, cells, float(size))
-        product = bound * (dual.bound_companion + apart)
-        if settled.held:
-            product += bound * left_by(of_phi, made)
-            if not np.isfinite(product):
-                return None
-        work, missed, slack = against(made, cells, at)
-        force, work, energy, lifted, more = cells.total(
-            weighed.force,
-            work,
-            square(made, cells, at),
-            weighed.square,
-            missed + unsure(made, at, slack, weighed) + weighed.unsure,
         )
-        middle, reach = force + work, made.loose * np.sqrt(energy) + more + product
-        reach += 2.0 * made.reach * np.sqrt(lifted)
+        apart = float(sum(off_companion))
+        weighed = given.weighed(made, cells, float(size))
+    product = bound * (dual.bound_companion + apart)
+    if settled.held:
+        product += bound * left_by(phi, made)
+        if not np.isfinite(product):
+            return None
+    work, missed, slack = against(made, cells, at)
+    force, work, energy, lifted, more = cells.total(
+        weighed.force,
+        work,
+        square(made, cells, at),
+        weighed.square,
+        missed + unsure(made, at, slack, weighed) + weighed.unsure,
+    )
+    reach = made.loose * np.sqrt(energy) + more + product + 2.0 * made.reach * np.sqrt(lifted)
+    return _ByPhi(force + work, reach, at, phi.through(cells))
+
+
+def _left_on_contact(
+    made: Made,
+    settled: Settled,
+    conditions: Sequence[Condition],
+    weight: Data | None,
+    found: _ByPhi,
+) -> float:
+    """Bound what Γ1 leaves of a(u − v, φ); collective.
+
+    Args:
+        made: v and y.
+        settled: Where there is contact for certain, and where there is none.
+        conditions: The parts that are asked for.
+        weight: ω; None for 1.
+        found: φ.
+    """
+    cells, data = made.cells(), diffusion(made.level.data)
+    omega = None if weight is None else scalar(weight, data.forms)
     through_facets, off = np.zeros((2, len(cells.exterior)))
     loss = np.zeros((2, len(cells.exterior)))
     loss[:, made.segments.facets.dofs] = made.segments.loss, made.segments.most
     for condition in (*settled.held, *settled.free):
         side, chosen = cells.sides[condition.number], float(condition in conditions)
-        trace = trace_of(cells, side, at)
+        trace = trace_of(cells, side, found.at)
         ends: Sequence[float | FloatArray] = (chosen,)
+        flows = found.flows[side.local, side.cells]
         lost = loss[:, None, side.dofs] * measures(cells, side) * trace
-        through_facets[side.dofs] = np.abs(flows[side.local, side.cells] + lost).max(axis=(0, 1))
+        through_facets[side.dofs] = np.abs(flows + lost).max(axis=(0, 1))
         if omega is not None and chosen and condition in settled.free:
             ends = ranges(data.compiled.trace(omega), cells, side)
         off[side.dofs] = np.max([np.abs(trace - end).max(axis=0) for end in ends], axis=0)
-    reach += settled.unknown(made, cells, through_facets, off)
-    return float(middle - reach), float(middle + reach)
+    return settled.unknown(made, cells, through_facets, off)
 
 
 def _harmonic(
