@@ -95,8 +95,9 @@ class Limits:
         if grown >= TELLING:
             growth = max(growth, (last.peak - before.peak) / grown)
         words = shortage(comm, growth * more)
-        if self._max_time is not None and passed + seconds > self._max_time:
-            words = self._words(seconds)
+        left = self._left(comm)
+        if left is not None and seconds > left:
+            words = _words(seconds, left)
         _refuse(solution.level.number + 1, dofs, words)
 
     def admit_step(self, comm: MPI.Comm) -> None:
@@ -109,14 +110,22 @@ class Limits:
         """
         passed = comm.allreduce(time.perf_counter() - self._began, op=MPI.MAX)
         seconds, self._passed = passed - (self._passed or passed), passed
-        if self._max_time is not None and passed + seconds > self._max_time:
-            raise NotConverged(f"it would take about {self._words(seconds)}")
+        left = self._left(comm)
+        if left is not None and left <= 0.0:
+            raise NotConverged("the time of --max-time is over")
+        if left is not None and seconds > left:
+            raise NotConverged(f"it would take about {_words(seconds, left)}")
 
-    def _words(self, seconds: float) -> str:
-        """Say what is asked for, and what there is."""
-        assert self._max_time is not None
-        left = max(self._max_time - self._passed, 0.0)
-        return f"{seconds:.2g} s, and of --max-time there are {left:.2g} s left"
+    def _left(self, comm: MPI.Comm) -> float | None:
+        """Find the time left when `_passed` was set; ranks may have begun apart; collective."""
+        if self._max_time is None:
+            return None
+        return float(comm.allreduce(self._max_time, op=MPI.MIN)) - self._passed
+
+
+def _words(seconds: float, left: float) -> str:
+    """Say what is asked for, and what there is."""
+    return f"{seconds:.2g} s, and of --max-time there are {max(left, 0.0):.2g} s left"
 
 
 def _refuse(number: int, dofs: int, words: str | None) -> None:

@@ -8,7 +8,7 @@ facets.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from . import compat
 from .arrays import FloatArray, Int32Array
-from .errors import raise_together
+from .errors import InputError
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine, refine_edges
@@ -29,6 +29,10 @@ from .solution import Solution
 
 Places = npt.NDArray[np.complex128]
 """Points of the plane; they sort by x, then by y."""
+
+
+class AnotherMesh(InputError):
+    """What is to go on was solved on another mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +45,13 @@ class Restart:
         u: Places of the nodes of u_h and its values there, shape (nodes, block), on the last mesh
             and on the one below it; or, in time, all on the last mesh, after the last step and
             after those before it.
+        space: What the nodes of u_h are those of, in its order; None of what was read from a file,
+            whose order is that of other ranks.
     """
 
     added: tuple[Places | None, ...]
     u: tuple[tuple[Places, FloatArray], ...]
+    space: fem.FunctionSpace | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, solution: Solution, below: Restart | None, adaptive: bool) -> Restart:
@@ -78,24 +85,30 @@ class Restart:
         return cls(_added(solution.level.meshes, solution.domain.mesh.comm), ())
 
     @classmethod
-    def of_steps(cls, last: Sequence[Solution], below: Restart | None = None) -> Restart:
+    def of_steps(
+        cls,
+        last: Sequence[Solution],
+        below: Restart | None = None,
+        earlier: Sequence[tuple[Places, FloatArray]] = (),
+    ) -> Restart:
         """Take what there is after a step in time to rank 0; collective.
 
         Args:
             last: Of this step and of those before it that the next ones need; on the same mesh.
             below: The same for the step before, or `of_meshes`; None at the first, where every
                 triangle was cut into four.
+            earlier: What follows in `u`, of steps before those.
 
         Returns:
             Nothing but empty arrays on the other ranks.
         """
         V, comm = last[0].u.function_space, last[0].domain.mesh.comm
         size = V.dofmap.index_map.size_local
-        known = () if below is None else below.u
-        at = known[0][0] if known else _gathered(_places(V)[:size], comm)
+        known = below is not None and below.space is V
+        at = below.u[0][0] if below is not None and known else _gathered(_places(V)[:size], comm)
         u = tuple((at, _gathered(_by_nodes(each.u), comm)) for each in last)
         uniform = (None,) * last[0].level.number
-        return cls(uniform if below is None else below.added, u)
+        return cls(uniform if below is None else below.added, (*u, *earlier), V)
 
     def meshes(self, domain: Domain) -> Iterator[Refined]:
         """Refine as it was done before; collective.
@@ -118,14 +131,17 @@ class Restart:
         """Read u_h on the last mesh (0) or on the one below (1), or so many steps back; collective.
 
         Raises:
-            InputError: The mesh is another one.
+            AnotherMesh: The mesh is another one.
         """
         at, values = self.u[number]
         order, mine = np.argsort(at), _places(V)
         index = order[np.minimum(np.searchsorted(at, mine, sorter=order), len(at) - 1)]
         other = len(at) != V.dofmap.index_map.size_global or not np.array_equal(at[index], mine)
-        complaint = "the mesh is not the one that the levels before were solved on"
-        raise_together(V.mesh.comm, complaint if other else None)
+        if V.mesh.comm.allreduce(other, op=MPI.LOR):
+            raise AnotherMesh(
+                "the mesh is not the one that the levels before were solved on: other versions of"
+                " gmsh and DOLFINx may make another one of the same polygon"
+            )
         u = fem.Function(V)
         u.x.array[:] = values[index].ravel()
         return u

@@ -307,6 +307,27 @@ def test_all_of_the_equation_may_depend_on_the_time(scheme):
         assert 0.0 <= solution.certificate.bound_energy_norm < 1e-5
 
 
+def test_a_pulse_that_is_next_to_nothing_at_first():
+    """Its square is no number for some steps; the last ones are as if it were 0 there."""
+    domain = SQUARE.mesh(0.5)
+    t, start = clock(domain), 0.4
+
+    def pulse(x):
+        return -100.0 * ufl.exp(-(((t - 0.5) / 0.02) ** 2))
+
+    def from_half(x):
+        return ufl.conditional(t > start, pulse(x), 0.0)
+
+    forces = []
+    for f in (pulse, from_half):
+        problem = Problem(f=f, conditions=WALLS | {"floor": Contact(-0.05)})
+        steps = [*solve_in_time(problem, domain, end=1.0, steps=20, time=t)]
+        forces.append([solution.contact.force for _, solution in steps])
+        assert all(solution.certificate.bound_h1 is not None for _, solution in steps)
+        assert max(forces[-1]) > 1.0
+    assert forces[0] == pytest.approx(forces[1], rel=1e-6, abs=1e-9)
+
+
 def test_what_goes_on_for_long_stands_still():
     """u_n tends to the stationary solution; steps then take nothing; multigrid, with its meshes."""
     domain = SQUARE.mesh(0.3)

@@ -217,6 +217,7 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..memory import most_memory
     from ..output import report as output
     from ..output.files import check_writable
+    from ..restart import AnotherMesh
     from .run import stopped, what_is_kept
     from .runs import solve_case
 
@@ -229,6 +230,8 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         solve_case(args, screen, comm, folder, records)
         return DONE
     except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, AnotherMesh):
+            raise InputError(f"--resume: {error}; another --out begins anew") from error
         if isinstance(error, InputError) and records:  # a full disk; data that a finer mesh hits
             raise NotConverged(f"{error}\n{what_is_kept(records, folder)}") from error
         if not ran_out_of_memory(error):

@@ -72,10 +72,10 @@ class Run:
 
     @property
     def time_left(self) -> float | None:
-        """The time left of --max-time."""
+        """The time left of --max-time, a moment at least; None for any."""
         if self.args.max_time is None:
             return None
-        return float(self.args.max_time + self.args.began - time.perf_counter())
+        return max(float(self.args.max_time + self.args.began - time.perf_counter()), 1e-9)
 
     def said(self) -> dict[str, Any]:
         """Say all that the levels depend on, by the name the user knows it by; collective."""

@@ -139,6 +139,7 @@ class Steps:
         self._records: list[output.Record] = []
         self._last: list[Solution] = []
         self._moments: list[strip.Moment] = []
+        self._earlier = self._restart.u[1:] if self._restart is not None and self._done else ()
         if self._done:
             with naming("--resume"):
                 self._moments = series.read_moments(run.folder, run.comm)
@@ -236,7 +237,9 @@ class Steps:
     def _write_steps(self) -> None:
         """Write what a run goes on from, and the tables; collective."""
         run, last, search = self._run, self._last, self._search
-        self._restart = Restart.of_steps(last, self._restart)
+        # behind the steps of this process are those that it goes on from
+        earlier = self._earlier[: 1 + self._back - len(last)]
+        self._restart = Restart.of_steps(last, self._restart, earlier)
         facts = {"said": self._said, "times": self._records}
         if search.tried:
             # where the search was cut short it goes on from there

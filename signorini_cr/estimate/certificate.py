@@ -739,6 +739,8 @@ def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
 
 ROUNDING = 64 * np.finfo(np.float64).eps
 """Relative error of what a cell adds to the certificate's norms."""
+LOST = 1e-150
+"""What a cell may lose of a norm: squares of what is below 1e-154 are hardly numbers."""
 
 
 def _rounding(
@@ -753,18 +755,21 @@ def _rounding(
 
     Gradients are differences of values, fluxes are differences of gradients' and loads' shares: all
     is as large as the values times the hat functions' gradients, and as h‖f‖, or smaller. So it is
-    with ω, of which y may have the curl.
+    with ω, of which y may have the curl. And what squares below all numbers have lost is there.
     """
     largest = None if flux.beyond is None else flux.beyond.largest(cells)
-    total = 0.0
+    total, size, stiff, some = 0.0, 0.0, 0.0, bool(flux.excess.any())
     for block in blocks(cells.number):
         low, high = pick(kappa.low, block), pick(kappa.high, block)
+        size = max(size, float(cells.diameter2[block].max(initial=0.0)))
+        stiff = max(stiff, float(np.max(high, initial=0.0)))
         values = np.maximum(w[:, block].max(axis=0), -w[:, block].min(axis=0))
         trace = cells.trace(block)
         square = high * trace * values**2
         of_load = np.abs(load.mean[block])
         if load.variance is not None:
             of_load += np.sqrt(load.variance[block])
+        some = some or bool(of_load.any()) or bool(values.any())
         square += cells.diameter2[block] * cells.volume[block] * of_load**2 / low
         square += pick(reaction, block) * cells.volume[block] * values**2
         if largest is not None:
@@ -772,7 +777,11 @@ def _rounding(
         if cells.stretch is not None:  # it is as good as κ's eigenvalues are near to one another
             square *= (kappa.most[block] / kappa.least[block]) ** 2
         total += float(np.sum(square))
-    return float(ROUNDING * np.sqrt(cells.total(total)[0]))
+    sums = cells.total(total, cells.number, float(cells.volume.sum()), some)
+    total, number, volume, some = sums
+    size, stiff = np.sqrt(np.max(cells.comm.allgather((size, stiff)), axis=0))
+    lost = LOST * (stiff + (1.0 + size) * (1.0 + np.sqrt(volume)) / np.sqrt(kappa.smallest))
+    return float(ROUNDING * np.sqrt(total) + lost * np.sqrt(number) * (some > 0.0))
 
 
 def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:

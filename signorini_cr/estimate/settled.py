@@ -72,7 +72,8 @@ class Settled:
             dofs = np.concatenate(none + [cells.sides[each.number].dofs for each in parts])
             against, known = against[dofs], known[dofs]
             ratio = np.where(against == 0.0, 0.0, np.inf)
-            np.divide(against, known, out=ratio, where=known > 0.0)
+            with np.errstate(over="ignore"):  # by what is next to nothing
+                np.divide(against, known, out=ratio, where=known > 0.0)
             return max(cells.comm.allgather(float(ratio.max(initial=0.0))))
 
         held = most(self.held, flows, self.force)

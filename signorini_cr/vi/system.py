@@ -31,7 +31,8 @@ ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
 
 TINY = 1e-130
-"""What is not 0 must not be smaller: its square is multiplied with small numbers, and is lost."""
+"""What is smaller counts as 0: its square is multiplied with small numbers, and is lost. A bound of
+the error counts it, and what it can't count, see `estimate.certificate.LOST`."""
 
 FAR = 16.0
 """Values so many times as far from 0 as from one another are told from their middle."""
@@ -147,7 +148,11 @@ class System:
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b)
-        self.residual_scale = self._scale(self._trivial() if same is None else same._known_trivial)
+        trivial = self._trivial() if same is None else same._known_trivial
+        self.residual_scale = self._scale(trivial)
+        if self.is_trivial:  # as far as numbers go
+            self.b[: len(trivial[0])], self.b[len(trivial[0]) :] = trivial[0], 0.0
+            layout.shared_sum(self.b)
 
     def _read_boundary(self, owned: int) -> None:
         """Take values and bounds from the data; collective.
@@ -299,9 +304,7 @@ class System:
         largest = max(
             float(max(each.max(initial=0.0), -each.min(initial=0.0))) for each in residuals
         )
-        if 0.0 < max(comm.allgather(largest)) < TINY:
-            raise InputError("data: so small that their squares are lost; choose other units")
-        return scale
+        return scale if max(comm.allgather(largest)) >= TINY else 0.0
 
     @property
     def owned_dirichlet(self) -> Int32Array:

@@ -8,12 +8,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 import helpers
+import kills
 import numpy as np
 import pytest
 from mpi4py import MPI
 
-from signorini_cr import Domain, Polygon, Problem, limits, memory, solve_adaptive, solve_levels
-from signorini_cr.app import cli
+from signorini_cr import (
+    Domain,
+    Polygon,
+    Problem,
+    limits,
+    memory,
+    solve,
+    solve_adaptive,
+    solve_levels,
+)
+from signorini_cr.app import cli, run
 from signorini_cr.errors import InputError, NotConverged
 from signorini_cr.output import checkpoint
 from signorini_cr.restart import Restart
@@ -338,6 +348,43 @@ def test_time_grows_as_between_the_last_two_levels(monkeypatch) -> None:
     with pytest.raises(NotConverged, match=r"its 100 .* about 10 s, and .* are 8 s left") as caught:
         some.admit(Done(2, 50), 100)
     assert caught.value.level == 3
+
+
+def test_another_mesh_is_refused(case, monkeypatch, capfd) -> None:
+    """As another gmsh may make of the same polygon: here the mesh of another size."""
+    case()
+    assert solved("--levels", 2) == 0
+    before = report()
+    another = Restart.of(solve(Problem(), rectangle(0.4)), None, adaptive=False)
+    monkeypatch.setattr(Restart, "meshes", lambda self, domain: iter(()))
+    read = run.read_checkpoint
+    monkeypatch.setattr(run, "read_checkpoint", lambda *place: (another, read(*place)[1]))
+    capfd.readouterr()
+    assert solved("--resume") == cli.BAD_INPUT
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        assert "--resume: the mesh is not the one that the levels before were solved on: " in error
+        assert error.endswith("; another --out begins anew")
+    assert report() == before
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("seconds", ["0.01", "2"])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_little_time_is_enough_for_the_first_level(seconds: str, ranks: int, tmp_path) -> None:
+    """And ranks that were started apart have different times left."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    (tmp_path / "run.py").write_text(
+        "import sys\nfrom signorini_cr.app import cli, commandline\nrun = cli._run\n"
+        "def begun_apart(args, *others):\n"
+        "    args.began -= 1.9 * commandline.launched()[0]\n    return run(args, *others)\n"
+        "cli._run = begun_apart\nsys.exit(cli.main())\n"
+    )
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q", "--max-time", seconds]
+    done = helpers.start(tmp_path / "run.py", *argv, ranks=ranks, seconds=60)
+    assert done.returncode == cli.NOT_CONVERGED, done.stderr
+    words = " ".join(done.stderr.split())
+    assert words.count("of --max-time there are") == 1 and "finished and kept" in words
 
 
 def test_a_level_that_memory_does_not_hold_is_refused(case, monkeypatch, capfd) -> None:

@@ -318,34 +318,52 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_ended(
 @pytest.mark.parametrize(
     "first, then, scheme", [(1, 2, "bdf2"), (2, 1, "bdf2"), (2, 1, "adaptive")]
 )
-def test_on_another_number_of_ranks(first, then, scheme, case, whole, shared_tmp_path, monkeypatch):
+def test_on_another_number_of_ranks(first, then, scheme, case, whole, shared_tmp_path):
     """Three of six steps are done, with two steps behind each as bdf2 has them."""
-    text, whole, out = in_scheme(scheme), whole(scheme), shared_tmp_path / "out"
-    (shared_tmp_path / "run.py").write_text(
-        "import sys\n"
-        "from signorini_cr import evolution\n"
-        "from signorini_cr.app import cli, timerun\n"
-        "from signorini_cr.errors import NotConverged\n"
-        "from signorini_cr.output import plots\n"
-        "plots.can_draw = lambda comm: False\n"
-        "found = []\n"
-        "def solve_on(self, meshes, begin=timerun.Steps._solve_on):\n"
-        "    found.append(0)\n"
-        "    begin(self, meshes)\n"
-        "def stop(self, *arguments, solve=evolution.Solver.solve):\n"
-        "    found[:] = [each + 1 for each in found]\n"
-        "    if max(found, default=0) > 3 and '--resume' not in sys.argv:\n"
-        "        raise NotConverged('told')\n"
-        "    return solve(self, *arguments)\n"
-        "timerun.Steps._solve_on, evolution.Solver.solve = solve_on, stop\n"
-        "sys.exit(cli.main())\n"
-    )
-    words = ["solve", case(text), "--out", out, "-q"]
-    done = helpers.start(shared_tmp_path / "run.py", *words, ranks=first)
+    whole, out, run = whole(scheme), shared_tmp_path / "out", shared_tmp_path / "run.py"
+    run.write_text(FEW_STEPS)
+    words = ["solve", case(in_scheme(scheme)), "--out", out, "-q"]
+    done = helpers.start(run, *words, ranks=first, MOST="3")
     assert "time step 4: told" in " ".join(done.stderr.split())
-    done = helpers.start(shared_tmp_path / "run.py", *words, "--resume", ranks=then)
+    done = helpers.start(run, *words, "--resume", ranks=then)
     assert (done.returncode, done.stderr) == (0, "")
     assert_same(out, whole)
+
+
+@pytest.mark.serial
+def test_ended_again_and_again(case, whole, shared_tmp_path):
+    """After one more step each time, in which the steps before are still those of another run."""
+    whole, out, run = whole("bdf2"), shared_tmp_path / "out", shared_tmp_path / "run.py"
+    run.write_text(FEW_STEPS)
+    words = ["solve", case(in_scheme("bdf2")), "--out", out, "-q"]
+    helpers.start(run, *words, MOST="3")
+    for step, ranks in ((5, 2), (6, 1)):  # the last that is kept is looked at once more
+        done = helpers.start(run, *words, "--resume", ranks=ranks, MOST="2")
+        assert f"time step {step}: told" in " ".join(done.stderr.split())
+    for _ in range(2):
+        done = helpers.start(run, *words, "--resume", ranks=2)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert_same(out, whole)
+
+
+FEW_STEPS = """import os, sys
+from signorini_cr import evolution
+from signorini_cr.app import cli, timerun
+from signorini_cr.errors import NotConverged
+from signorini_cr.output import plots
+plots.can_draw = lambda comm: False
+found = []
+def solve_on(self, meshes, begin=timerun.Steps._solve_on):
+    found.append(0)
+    begin(self, meshes)
+def stop(self, *arguments, solve=evolution.Solver.solve):
+    found[:] = [each + 1 for each in found]
+    if max(found, default=0) > int(os.environ.get("MOST", "99")):
+        raise NotConverged("told")
+    return solve(self, *arguments)
+timerun.Steps._solve_on, evolution.Solver.solve = solve_on, stop
+sys.exit(cli.main())
+"""
 
 
 def test_what_another_run_in_time_has_left_is_refused(case, undrawn, shared_tmp_path, capfd):

@@ -119,6 +119,21 @@ def test_bound_is_above_the_error_and_near_it(name, jitter):
             assert low <= example.energy <= high
 
 
+@pytest.mark.parametrize("power", [100, 128, 131, 149, 153, 155, 160, 200, 300, 320])
+def test_loads_whose_squares_are_lost_are_bounded(power):
+    """−Δu = −a without contact is a (y² − 1)/2: ‖∇u‖ = a/√3, J = −a²/6, and −a/3 in the mean."""
+    a = 10.0**-power
+    solution = solve(Problem(f=-a, obstacle=-1.0), HELD_ABOVE.mesh(0.3))
+    certificate, mean_ = solution.certificate, solution.mean()
+    error = 0.0 if np.any(solution.u.x.array) else a / np.sqrt(3)
+    assert (error > 0.0) == (power > 128)
+    assert error <= certificate.bound_h1 <= 1.2 * a / np.sqrt(3) + 1e-148
+    assert certificate.energy[0] <= -a * (a / 6) <= certificate.energy[1]
+    assert mean_.lower <= -a / 3 <= mean_.upper
+    held = solve(Problem(f=-a), HELD_ABOVE.mesh(0.3)).flux("contact")  # u = a (y² − y)/2
+    assert held.lower <= a / 2 <= held.upper
+
+
 def test_bound_without_exact_solution():
     """On E the error is known up to a much smaller one: that of a mesh two refinements on."""
     solutions = list(solve_levels(exact.E.problem, exact.E.structured(8), 4))
