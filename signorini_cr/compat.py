@@ -108,8 +108,7 @@ def can_take_facets() -> bool:
     """Tell whether a topology can be given facets of our own numbering; later versions can't.
 
     It can't be told which of them lie between ranks, but knows those that it found itself before.
-    All meshes of S1 to 1.6 M dofs take 2.4 s on one rank then, where DOLFINx looks for the facets
-    2.9 s; on each of two a refinement to 1.4 M cells takes 0.08 s, where it takes 0.25 s.
+    What that is worth is in benchmarks/results/refinement.md.
     """
     return hasattr(cpp.mesh.Topology, "set_connectivity")
 
