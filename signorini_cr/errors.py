@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from mpi4py import MPI
 
@@ -84,7 +84,7 @@ def insist_on_count(name: str, value: object) -> None:
         raise InputError(f"{name} is {value}; it must be 1 or more")
 
 
-def insist_on_number(name: str, value: object, least: float, strict: bool = False) -> None:
+def insist_on_number(name: str, value: Any, least: float, strict: bool = False) -> None:
     """Refuse what is no number, or below another one.
 
     Args:
@@ -94,9 +94,7 @@ def insist_on_number(name: str, value: object, least: float, strict: bool = Fals
         strict: Whether that one itself is refused, too.
     """
     insist_on_kind(name, value, Real, "a number")
-    assert isinstance(value, Real)
-    above = float(value) > least if strict else float(value) >= least
-    if not above:
+    if not (value > least if strict else value >= least):
         needed = f"above {least:g}" if strict else f"{least:g} or more"
         raise InputError(f"{name} is {value}; it must be {needed}")
 

@@ -67,7 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         wait_for_all()
         return BAD_INPUT
     with interruptible() as asked, room_for_recursion():
-        return _run(args, screen, asked)
+        try:
+            return _run(args, screen, asked)
+        except KeyboardInterrupt:  # while nothing has begun, or when all has been told
+            return status_of(asked)
 
 
 @contextmanager

@@ -621,7 +621,8 @@ def test_what_a_lifting_changes(known, reaction):
 def test_rounding():
     """As large as values times the hat functions' gradients, as c^{1/2} u_h and as h‖f‖."""
     cells, rng, kappa, _ = some_cells(2)
-    none = SimpleNamespace(beyond=None)
+    none = SimpleNamespace(beyond=None, excess=np.zeros(1))
+    kappa.smallest = float(kappa.low.min())
     for sign, c in ((1, 0.0), (-1, 0.0), (1, 7.0)):
         w = sign * np.array([[3.0], [1.0], [2.0]]) * np.ones(cells.number)
         load = SimpleNamespace(mean=np.zeros(cells.number), variance=None)
@@ -633,9 +634,12 @@ def test_rounding():
     expected = cells.lengths.max(axis=0) * cells.volume * 9.0 / kappa.low
     found = certificate._rounding(cells, kappa, np.array(5.0), 0 * w, load, none)
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
+    load.mean[:], load.variance = 1e-200, None  # whose square is no number
+    assert 1e-150 < certificate._rounding(cells, kappa, np.array(0.0), 0 * w, load, none) < 1e-147
+    load.mean[:] = 0.0
+    assert certificate._rounding(cells, kappa, np.array(0.0), 0 * w, load, none) == 0.0
     heights = rng.normal(size=len(cells.exterior))
-    load.mean[:], load.variance = 0.0, None
-    fluxes = SimpleNamespace(beyond=Beyond(heights, None))
+    fluxes = SimpleNamespace(beyond=Beyond(heights, None), excess=np.zeros(1))
     expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.low
     found = certificate._rounding(cells, kappa, np.array(5.0), 0 * w, load, fluxes)
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
