@@ -119,6 +119,7 @@ def test_bound_is_above_the_error_and_near_it(name, jitter):
             assert low <= example.energy <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [100, 128, 131, 149, 153, 155, 160, 200, 300, 320])
 def test_loads_whose_squares_are_lost_are_bounded(power):
     """−Δu = −a without contact is a (y² − 1)/2: ‖∇u‖ = a/√3, J = −a²/6, and −a/3 in the mean."""

@@ -333,6 +333,7 @@ def test_a_full_disk_is_told_in_words(
     assert not (shared_tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_picture_that_cannot_be_drawn_is_left_out(finished, shared_tmp_path, monkeypatch):
     """It does not cost the field; that of a former run goes."""
     solution, report = finished
@@ -351,6 +352,7 @@ def test_a_picture_that_cannot_be_drawn_is_left_out(finished, shared_tmp_path, m
     assert "contact.png" not in there
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_settings_of_matplotlib_that_need_what_is_missing(finished, tmp_path):
     """Here, LaTeX."""
