@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from . import series, tables
+from .report import FIELDS
 from .units import Units
 
 PICTURES = {
@@ -136,7 +137,7 @@ def _search(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _steps(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
-    fields = f"{series.SERIES} opens the fields of all steps, {series.FIELDS}, in ParaView"
+    fields = f"{series.SERIES} opens the fields of all steps, {FIELDS}, in ParaView"
     return [
         "<h2>Steps</h2>",
         _table(series.table_rows(records, units)),

@@ -63,6 +63,8 @@ FILES = (
     checkpoint.MOMENTS,
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
+FIELDS = "step_*.vtu"
+"""Those of steps in time, which are taken away likewise."""
 
 MOST_CELLS = 4000
 """Of a mesh that is drawn, if there is a coarser one."""
@@ -240,8 +242,14 @@ def write_levels(
     writers = _texts(report, solution)
     facts = {"said": said, "levels": report["levels"]}
     writers[checkpoint.NAME] = lambda path: checkpoint.write_checkpoint(path, restart, facts, comm)
-    write_files(folder, writers, removed=FILES, comm=comm)
+    write_files(folder, writers, removed=of_former_runs(folder, comm), comm=comm)
     return list(writers)
+
+
+def of_former_runs(folder: str | os.PathLike[str], comm: MPI.Comm) -> set[str]:
+    """Find the names of what runs leave, in time or not; collective."""
+    found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
+    return {*FILES, *found}
 
 
 def write_output(
@@ -303,7 +311,8 @@ def write_output(
     kept = {checkpoint.NAME} if resumable else set()
     if moments:
         kept |= {"times.csv", "series.pvd", checkpoint.MOMENTS}
-    return write_files(folder, writers, removed=set(FILES) - kept, comm=comm)
+    removed = (set(FILES) if moments else of_former_runs(folder, comm)) - kept
+    return write_files(folder, writers, removed=removed, comm=comm)
 
 
 def _if_drawn(write: Writer, tell: Callable[[str], object]) -> Writer:

@@ -16,7 +16,7 @@ from ..rounding import at_most, counted, interval, known
 from . import checkpoint
 from .files import Writer, write_files, write_text
 from .meanings import OF_STEPS
-from .report import FILES, bounded, energy_bounds, plain, report_json
+from .report import FIELDS, bounded, energy_bounds, of_former_runs, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
 from .tables import (
     Column,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ..restart import Restart
     from ..solution import Solution
 
-TABLE, SERIES, FIELDS = "times.csv", "series.pvd", "step_*.vtu"
+TABLE, SERIES = "times.csv", "series.pvd"
 COLUMNS: tuple[Column, ...] = (
     ("step", 5, lambda r: str(r["step"])),
     ("time", 10, lambda r: r["told"]),
@@ -250,18 +250,12 @@ def write_search(
         InputError: The folder can't be written to.
     """
     facts = {"said": said, "levels": report["search"]}
-    removed = _of_former_runs(folder, comm) if len(report["search"]) == 1 else set()
+    removed = of_former_runs(folder, comm) if len(report["search"]) == 1 else set()
     writers: dict[str, Writer] = {
         "report.json": lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
     }
     write_files(folder, writers, removed=removed, comm=comm)
-
-
-def _of_former_runs(folder: str | os.PathLike[str], comm: MPI.Comm) -> set[str]:
-    """Find the names of what runs leave, in time or not; collective."""
-    found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
-    return {*FILES, *found}
 
 
 def write_steps(
@@ -289,7 +283,7 @@ def write_steps(
         InputError: The folder can't be written to.
     """
     comm, records = solution.domain.mesh.comm, report["times"]
-    removed = _of_former_runs(folder, comm) if len(records) == 1 else set()
+    removed = of_former_runs(folder, comm) if len(records) == 1 else set()
 
     def text(make: Callable[[], str]) -> Writer:
         return lambda path: on_root(comm, write_text, path, make)

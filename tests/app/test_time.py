@@ -230,6 +230,21 @@ def test_what_makes_no_sense_in_time(old, new, said, case, shared_tmp_path, capf
         assert not out.exists()
 
 
+def test_fields_of_steps_go_where_another_run_has_none(case, undrawn, shared_tmp_path):
+    """Beside a report lies what is of its run, and what is the user's own."""
+    out = shared_tmp_path / "out"
+    assert solved(case(), out) == 0
+    assert len([*out.glob("step_*.vtu")]) == 6
+    COMM.Barrier()
+    if COMM.rank == 0:
+        (out / "mine.txt").write_text("kept")
+    static = CASE.partition("[time]")[0].replace("sin(4*t)", "1").replace(" - 0.02*t", "")
+    assert solved(case(static), out) == 0
+    names = {path.name for path in out.iterdir()}
+    assert {"mine.txt", "solution.vtu"} <= names and not names & {"times.csv", "series.pvd"}
+    assert not any(name.startswith("step_") for name in names)
+
+
 @pytest.mark.parametrize("option", ["--element=p1"])
 def test_options_that_do_not_go_with_time(option, case, shared_tmp_path, capfd):
     assert main(["solve", str(case()), "--out", str(shared_tmp_path / "out"), option]) == 2
