@@ -183,10 +183,9 @@ class Solver:
             NotConverged: As for `solve`.
         """
         own, start = self._of_this(source, before)
-        fit = bool(np.isfinite(np.asarray(rate, dtype=np.float64)).all())
-        raise_together(
-            self.V.mesh.comm, None if fit else "rate: numbers that are finite are needed"
-        )
+        rates = np.asarray(rate, dtype=np.float64)
+        words = None if np.isfinite(rates).all() else "rate: numbers that are finite are needed"
+        raise_together(self.V.mesh.comm, words)
         self._carry_down()
         operator, boundary = self._have_changed()
         if boundary:
@@ -198,7 +197,7 @@ class Solver:
             self._set_up()
         self._solved += 1
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
-        data = diffusion(self._level.data).renewed(own, np.asarray(rate, dtype=np.float64))
+        data = diffusion(self._level.data).renewed(own, rates)
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
         level = Level((*meshes[:-1], renewed), self._held, self._level.system)
         return solve_level(level, lambda _: nullcontext(self._cycle), start, monitor, {"mesh": 0.0})
@@ -241,7 +240,7 @@ class Solver:
         found, V = fem.Function(self.V), self.V
         sums: list[FloatArray] = []
         for each in (data, 1.0):
-            expression = as_expression(each, forms.x, "initial", True)
+            expression = as_expression(each, forms.x, "initial", in_cells=True)
             if expression.ufl_shape:
                 raise InputError(
                     f"initial has the shape {expression.ufl_shape}; a scalar is needed"
@@ -413,7 +412,7 @@ def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:
     given = {name: each.reaction for name, each in problem.materials.items()}
     x = ufl.SpatialCoordinate(domain.mesh)
     return {
-        name: as_expression(each, x, "reaction", True)
+        name: as_expression(each, x, "reaction", in_cells=True)
         for name, each in {"": problem.reaction, **given}.items()
         if each is not None
     }

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from ufl.core.expr import Expr
 
 from .arrays import FloatArray
 from .data.diffusion import diffusion
@@ -122,13 +123,14 @@ def _corrected(
     known = [condition for condition in conditions if condition not in settled.free]
     if settled.mixed and known:
         return None
+    omega = None if weight is None else scalar(weight, diffusion(made.level.data).forms)
     none: FloatArray = np.zeros((cells.tdim + 1, cells.number))
     found: _ByPhi | None = _ByPhi(0.0, 0.0, none, none)
     if known:
-        found = _by_phi(made, solution, settled, conditions, known, weight)
+        found = _by_phi(made, solution, settled, conditions, known, omega)
     if found is None:
         return None
-    reach = found.reach + _left_on_contact(made, settled, conditions, weight, found)
+    reach = found.reach + _left_on_contact(made, settled, conditions, omega, found)
     return float(found.middle - reach), float(found.middle + reach)
 
 
@@ -138,7 +140,7 @@ def _by_phi(
     settled: Settled,
     conditions: Sequence[Condition],
     known: Sequence[Condition],
-    weight: Data | None,
+    omega: Expr | None,
 ) -> _ByPhi | None:
     """Solve for φ, and work it against v; None where φ has no bound; collective.
 
@@ -148,21 +150,21 @@ def _by_phi(
         settled: Where there is contact for certain, and where there is none.
         conditions: The parts.
         known: Those of them with contact, or on which u is set.
-        weight: ω; None for 1.
+        omega: ω; None for 1.
     """
     cells, bound = made.cells(), solution.certificate.bound_companion
     assert bound is not None
     forms = diffusion(made.level.data).forms
-    value = 1.0 if weight is None else scalar(weight, forms)
+    value = 1.0 if omega is None else omega
     dual = certified(_harmonic(forms, conditions, settled.free, value), made.level)
-    phi = in_p1(dual, cells, bent=weight is not None)
+    phi = in_p1(dual, cells, bent=omega is not None)
     if phi is None:
         return None
     assert dual.bound_companion is not None
     at = phi.vertices[cells.vertices]
     apart, weighed = 0.0, Weighed(force=sum(through(made, cells, c) for c in known))
-    if weight is not None:
-        given, own = Weight.of(made, cells, known, weight, settled.free), at
+    if omega is not None:
+        given, own = Weight.of(made, cells, known, omega, settled.free), at
         at = given.put_into(own)
         *off_companion, size = np.sqrt(
             cells.total(
@@ -192,7 +194,7 @@ def _left_on_contact(
     made: Made,
     settled: Settled,
     conditions: Sequence[Condition],
-    weight: Data | None,
+    omega: Expr | None,
     found: _ByPhi,
 ) -> float:
     """Bound what Γ1 leaves of a(u − v, φ); collective.
@@ -201,11 +203,10 @@ def _left_on_contact(
         made: v and y.
         settled: Where there is contact for certain, and where there is none.
         conditions: The parts that are asked for.
-        weight: ω; None for 1.
+        omega: ω; None for 1.
         found: φ.
     """
     cells, data = made.cells(), diffusion(made.level.data)
-    omega = None if weight is None else scalar(weight, data.forms)
     through_facets, off = np.zeros((2, len(cells.exterior)))
     loss = np.zeros((2, len(cells.exterior)))
     loss[:, made.segments.facets.dofs] = made.segments.loss, made.segments.most

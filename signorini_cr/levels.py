@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import NamedTuple
 
 from dolfinx import fem
@@ -251,9 +252,10 @@ def solve_level(
             nested_start(start.coarser, level, u, start.before)
     if level.floating is not None:
         level.floating.hold(system, u)
+    told = None
     if monitor is not None:
         insist_on_function("monitor", monitor)
-    told = None if monitor is None else lambda *facts: monitor(level.number, *facts)
+        told = partial(monitor, level.number)
     try:
         with (
             lend(system) as cycle,

@@ -104,8 +104,8 @@ class Restart:
         """
         V, comm = last[0].u.function_space, last[0].domain.mesh.comm
         size = V.dofmap.index_map.size_local
-        known = below is not None and below.space is V
-        at = below.u[0][0] if below is not None and known else _gathered(_places(V)[:size], comm)
+        same = below is not None and below.space is V
+        at = below.u[0][0] if below and same else _gathered(_places(V)[:size], comm)
         u = tuple((at, _gathered(_by_nodes(each.u), comm)) for each in last)
         uniform = (None,) * last[0].level.number
         return cls(uniform if below is None else below.added, (*u, *earlier), V)

@@ -777,11 +777,11 @@ def _rounding(
         if cells.stretch is not None:  # it is as good as κ's eigenvalues are near to one another
             square *= (kappa.most[block] / kappa.least[block]) ** 2
         total += float(np.sum(square))
-    sums = cells.total(total, cells.number, float(cells.volume.sum()), some)
-    total, number, volume, some = sums
+    own = total, cells.number, float(cells.volume.sum()), some
+    total, number, volume, there = cells.total(*own)
     size, stiff = np.sqrt(np.max(cells.comm.allgather((size, stiff)), axis=0))
     lost = LOST * (stiff + (1.0 + size) * (1.0 + np.sqrt(volume)) / np.sqrt(kappa.smallest))
-    return float(ROUNDING * np.sqrt(total) + lost * np.sqrt(number) * (some > 0.0))
+    return float(ROUNDING * np.sqrt(total) + lost * np.sqrt(number) * (there > 0.0))
 
 
 def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:

@@ -369,7 +369,9 @@ class Forms:
             said = "finite and above 0" if float(self.kappa) > 0.0 else "above 0"
             raise InputError(f"data: the coefficient is {float(self.kappa):g}; it must be {said}")
         self.exact = (
-            None if problem.exact is None else as_expression(problem.exact, self.x, "exact", True)
+            None
+            if problem.exact is None
+            else as_expression(problem.exact, self.x, "exact", in_cells=True)
         )
         # UFL can't differentiate a number
         constant = (
@@ -397,9 +399,9 @@ class Forms:
 
     def _by_material(self, name: str, usual: Data, materials: Materials) -> Expr:
         """Make a datum that materials may have of their own, and elsewhere is the usual one."""
-        base = as_expression(usual, self.x, name, True)
+        base = as_expression(usual, self.x, name, in_cells=True)
         own = {
-            material: as_expression(datum, self.x, f"materials[{material!r}].{name}", True)
+            material: as_expression(datum, self.x, f"materials[{material!r}].{name}", in_cells=True)
             for material, data in self.problem.materials.items()
             if (datum := getattr(data, name)) is not None
         }
