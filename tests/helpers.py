@@ -92,6 +92,25 @@ def command(*arguments: str | Path, **options: Any) -> subprocess.CompletedProce
     return start("-m", "signorini_cr", *arguments, **options)
 
 
+def altered(
+    folder: Path, case: str, program: str, *words: str, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Solve a problem by a command that something has been done to; results are in `out`.
+
+    Args:
+        folder: Where problem, program and results are.
+        case: The problem file's text.
+        program: What the process does before it runs the command.
+        words: Options of the command.
+        options: Those of `start`.
+    """
+    (folder / "case.toml").write_text(case)
+    ending = "import sys\nfrom signorini_cr.app import cli\nsys.exit(cli.main())\n"
+    (folder / "run.py").write_text(f"{program}\n{ending}")
+    argv = ["solve", folder / "case.toml", "--out", folder / "out", *words]
+    return start(folder / "run.py", *argv, **options)
+
+
 def script(path: Path, *arguments: str | Path, **variables: str) -> tuple[int, str]:
     """Run a program on the ranks of this process, as under mpirun; collective.
 

@@ -1166,14 +1166,12 @@ def test_on_two_ranks_mistakes_are_told_once(tmp_path: Path) -> None:
 @pytest.mark.serial
 def test_a_rank_that_fails_alone_ends_the_run(tmp_path: Path) -> None:
     """In the midst of the solver, where the other one waits for it."""
-    (tmp_path / "case.toml").write_text(CASE)
-    (tmp_path / "run.py").write_text(
-        "import sys\nfrom signorini_cr.app import cli\n\ndef step(self, text):\n"
+    program = (
+        "from signorini_cr.app import cli\n\ndef step(self, text):\n"
         "    if not self.root:\n        raise RuntimeError('here')\n\n"
-        "cli.Screen.step = step\nsys.exit(cli.main())\n"
+        "cli.Screen.step = step"
     )
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.start(tmp_path / "run.py", *argv, ranks=2)
+    done = helpers.altered(tmp_path, CASE, program, ranks=2)
     assert done.returncode == 1
     assert "RuntimeError: here" in done.stderr
     assert "signorini-cr: unexpected error on rank 1, see above" in done.stderr

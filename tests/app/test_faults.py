@@ -54,11 +54,10 @@ def test_a_run_that_is_ended_leaves_whole_files_of_one_run(
 
 
 LIMITED = """
-import resource, sys
+import resource
 from pathlib import Path
 from mpi4py import MPI
 from signorini_cr import limits
-from signorini_cr.app import cli
 from signorini_cr.vi.level import Level
 limits.shortage = lambda *_: None  # no estimate beforehand
 made = Level.__post_init__
@@ -71,7 +70,6 @@ def limited(self):
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 Level.__post_init__ = limited
-sys.exit(cli.main())
 """
 
 
@@ -82,10 +80,8 @@ def test_where_memory_ends_the_levels_before_are_kept(limited, tmp_path: Path) -
 
     Not while a mesh is made: DOLFINx 0.11 does that in threads, whose errors end the process.
     """
-    (tmp_path / "case.toml").write_text(kills.CASE)
-    (tmp_path / "run.py").write_text(LIMITED.replace("LIMITED_RANKS", repr(limited)))
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.start(tmp_path / "run.py", *argv, ranks=limited[-1] + 1)
+    program = LIMITED.replace("LIMITED_RANKS", repr(limited))
+    done = helpers.altered(tmp_path, kills.CASE, program, ranks=limited[-1] + 1)
     assert done.returncode == cli.NOT_CONVERGED, done.stderr
     words = " ".join(done.stderr.split())
     level = int(words.split("stopped on level ")[1].split(":")[0])
@@ -104,13 +100,8 @@ def test_where_memory_ends_the_levels_before_are_kept(limited, tmp_path: Path) -
 @pytest.mark.parametrize("most", [100_000_000, 300_000_000, 500_000_000])
 def test_where_memory_ends_at_the_beginning_one_message_tells(most: int, tmp_path: Path) -> None:
     """`ulimit -v`, before a library is loaded and while some are."""
-    (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))
-    (tmp_path / "run.py").write_text(
-        f"import resource, sys\nresource.setrlimit(resource.RLIMIT_AS, ({most}, {most}))\n"
-        "from signorini_cr.app import cli\nsys.exit(cli.main())\n"
-    )
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q"]
-    done = helpers.start(tmp_path / "run.py", *argv)
+    program = f"import resource\nresource.setrlimit(resource.RLIMIT_AS, ({most}, {most}))"
+    done = helpers.altered(tmp_path, kills.CASE.replace("9", "1"), program, "-q")
     if done.returncode == 0:
         assert most > memory.LEAST
         return
@@ -124,13 +115,8 @@ def test_where_memory_ends_at_the_beginning_one_message_tells(most: int, tmp_pat
 @pytest.mark.parametrize("most", [20, 40])
 def test_where_few_files_may_be_open_one_message_tells(most: int, tmp_path: Path) -> None:
     """`ulimit -n`, before MPI ends the process."""
-    (tmp_path / "case.toml").write_text(kills.CASE)
-    (tmp_path / "run.py").write_text(
-        f"import resource, sys\nresource.setrlimit(resource.RLIMIT_NOFILE, ({most}, {most}))\n"
-        "from signorini_cr.app import cli\nsys.exit(cli.main())\n"
-    )
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.start(tmp_path / "run.py", *argv)
+    program = f"import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, ({most}, {most}))"
+    done = helpers.altered(tmp_path, kills.CASE, program)
     words = " ".join(done.stderr.split())
     assert done.returncode == cli.NOT_CONVERGED, words
     assert words.endswith(f"ulimit -n allows {most} open files, and 64 are needed")
@@ -170,26 +156,18 @@ def test_what_libraries_warn_of_ends_no_run(tmp_path: Path) -> None:
 @pytest.mark.serial
 def test_a_folder_that_is_gone_is_told(tmp_path: Path) -> None:
     """The one that the command is started in."""
-    (tmp_path / "case.toml").write_text(kills.CASE)
-    (tmp_path / "gone").mkdir()
-    (tmp_path / "run.py").write_text(
-        "import os, sys\nos.rmdir(os.getcwd())\nfrom signorini_cr.app import cli\n"
-        "sys.exit(cli.main())\n"
-    )
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.start(tmp_path / "run.py", *argv, cwd=tmp_path / "gone")
+    (gone := tmp_path / "gone").mkdir()
+    done = helpers.altered(tmp_path, kills.CASE, "import os\nos.rmdir(os.getcwd())", cwd=gone)
     assert done.returncode == cli.BAD_INPUT
     words = " ".join(done.stderr.split())
     assert words.startswith("signorini-cr: the folder that it was started in cannot be used: No su")
     assert not (tmp_path / "out").exists()
 
 
-PLACES = """import os, sys
+PLACES = """import os
 from signorini_cr import temporary
 os.environ.update(TMPDIR="/proc/nowhere")
 temporary.USUAL = USUAL
-from signorini_cr.app import cli
-sys.exit(cli.main())
 """
 
 
@@ -197,11 +175,9 @@ sys.exit(cli.main())
 @pytest.mark.parametrize("there", [True, False])
 def test_where_temporary_files_cannot_be_written(there: bool, tmp_path: Path) -> None:
     """Open MPI would end the process with a signal."""
-    (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))
     usual = ("/proc/nowhere", str(tmp_path)) if there else ("/dev/full", "/proc")
-    (tmp_path / "run.py").write_text(PLACES.replace("= USUAL", f"= {usual!r}"))
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.start(tmp_path / "run.py", *argv)
+    program = PLACES.replace("= USUAL", f"= {usual!r}")
+    done = helpers.altered(tmp_path, kills.CASE.replace("9", "1"), program)
     words = " ".join(done.stderr.split())
     begins = "temporary files cannot be kept in /proc/nowhere (No such file or directory)"
     if there:
@@ -216,11 +192,8 @@ def test_where_temporary_files_cannot_be_written(there: bool, tmp_path: Path) ->
 @pytest.mark.serial
 def test_a_run_without_a_home_folder(tmp_path: Path) -> None:
     """Open MPI and DOLFINx ask for it; what is compiled goes where the system says it is."""
-    (tmp_path / "case.toml").write_text(kills.CASE.replace("9", "1"))
-    program = "import os, sys\nos.environ.pop('HOME', None)\nfrom signorini_cr.app import cli\n"
-    (tmp_path / "run.py").write_text(f"{program}sys.exit(cli.main())\n")
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q"]
-    done = helpers.start(tmp_path / "run.py", *argv)
+    program = "import os\nos.environ.pop('HOME', None)"
+    done = helpers.altered(tmp_path, kills.CASE.replace("9", "1"), program, "-q")
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -361,15 +334,13 @@ def test_an_interruption_inside_a_callback_is_one(
 @pytest.mark.serial
 def test_a_terminal_that_is_closed_ends_a_run(tmp_path: Path) -> None:
     """MPI's libraries may set handlers of their own, when they are loaded."""
-    (tmp_path / "case.toml").write_text(kills.CASE)
-    (tmp_path / "run.py").write_text(
-        "import os, signal, sys\nfrom signorini_cr.app import cli\n"
+    program = (
+        "import os, signal\nfrom signorini_cr.app import cli\n"
         "def step(self, text):\n"
         "    if 'level 2' in text:\n        os.kill(os.getpid(), signal.SIGHUP)\n"
-        "cli.Screen.step = step\nsys.exit(cli.main())\n"
+        "cli.Screen.step = step"
     )
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q"]
-    done = helpers.start(tmp_path / "run.py", *argv)
+    done = helpers.altered(tmp_path, kills.CASE, program, "-q")
     assert done.returncode == 129
     assert " ".join(done.stderr.split()).startswith("signorini-cr: terminated; levels 0 to 1 are")
 

@@ -374,15 +374,14 @@ def test_another_mesh_is_refused(case, monkeypatch, capfd) -> None:
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_little_time_is_enough_for_the_first_level(seconds: str, ranks: int, tmp_path) -> None:
     """And ranks that were started apart have different times left."""
-    (tmp_path / "case.toml").write_text(kills.CASE)
-    (tmp_path / "run.py").write_text(
-        "import sys\nfrom signorini_cr.app import cli, commandline\nrun = cli._run\n"
+    program = (
+        "from signorini_cr.app import cli, commandline\nrun = cli._run\n"
         "def begun_apart(args, *others):\n"
         "    args.began -= 1.9 * commandline.launched()[0]\n    return run(args, *others)\n"
-        "cli._run = begun_apart\nsys.exit(cli.main())\n"
+        "cli._run = begun_apart"
     )
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out", "-q", "--max-time", seconds]
-    done = helpers.start(tmp_path / "run.py", *argv, ranks=ranks, seconds=60)
+    words = "-q", "--max-time", seconds
+    done = helpers.altered(tmp_path, kills.CASE, program, *words, ranks=ranks, seconds=60)
     assert done.returncode == cli.NOT_CONVERGED, done.stderr
     words = " ".join(done.stderr.split())
     assert words.count("of --max-time there are") == 1 and "finished and kept" in words
