@@ -21,7 +21,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import helpers
 import numpy as np
@@ -43,13 +43,17 @@ obstacle = "0.1*x - 0.2"
 levels = 9
 """
 STEPS = 40
+SEARCHED = 4
+"""Steps of a run whose mesh is searched for."""
 CASES = {
     "uniform": CASE,
     "adaptive": CASE.replace("levels = 9", 'mode = "adaptive"\nlevels = 20'),
     "time": CASE.replace("f = -3", 'f = "-3 - 20*sin(5*t)"').replace("levels = 9", "levels = 3")
     + f'[time]\nend = 2\nsteps = {STEPS}\nscheme = "bdf2"\n',
+    "search": CASE.replace("f = -3", 'f = "-3 - 20*sin(5*t)"')
+    + f'mode = "adaptive"\n[time]\nend = 0.5\nsteps = {SEARCHED}\n',
 }
-"""On a sequence of meshes, on meshes that adapt, and in steps in time."""
+"""On a sequence of meshes, on meshes that adapt, in steps in time, on meshes sought for these."""
 PATIENCE = 5.0
 """Seconds until all processes of a run are gone."""
 
@@ -119,11 +123,15 @@ def own_cache(folder: Path) -> Path:
     return cache
 
 
+def finished(report: dict[str, Any]) -> int:
+    """How many levels a report has, or how many meshes that were tried and steps."""
+    return len(report.get("times", report["levels"])) + len(report.get("search", []))
+
+
 def levels_in(out: Path) -> int:
-    """How many levels, or steps, the report has."""
+    """How many levels, or meshes that were tried and steps, the report has."""
     try:
-        report = json.loads((out / "report.json").read_text())
-        return len(report.get("times", report["levels"]))
+        return finished(json.loads((out / "report.json").read_text()))
     except (OSError, ValueError, KeyError, TypeError):
         return 0
 
@@ -201,8 +209,8 @@ def killed(
             faults.append(f"nothing is said of what is kept: {said[-600:]}")
     if levels > 0 and random.random() < 0.3:
         again = [*solve, "--resume", "-q"]
-        all_of_it = STEPS if kind == "time" else levels + 1
-        again += [] if kind == "time" else ["--levels", str(all_of_it)]
+        all_of_it = {"time": STEPS, "search": 9 + SEARCHED}.get(kind, levels + 1)
+        again += [] if kind in ("time", "search") else ["--levels", str(all_of_it)]
         # a minute longer where a killed one has left a form half compiled
         more_run = subprocess.run(again, capture_output=True, text=True, env=clean, timeout=180)
         if more_run.returncode or levels_in(out) < all_of_it:
@@ -236,18 +244,21 @@ def _left(out: Path) -> tuple[int, list[str]]:
     report = json.loads((out / "report.json").read_text())
     what, table = ("times", "times.csv") if "times" in report else ("levels", "levels.csv")
     number = len(report[what])
-    with (out / table).open() as file:
-        rows = list(csv.DictReader(file))
-    if not number <= len(rows) <= number + 1:
-        faults.append(f"{number} {what} in the report, {len(rows)} in the table")
+    if number:  # while a mesh is searched for there are no steps
+        with (out / table).open() as file:
+            rows = list(csv.DictReader(file))
+        if not number <= len(rows) <= number + 1:
+            faults.append(f"{number} {what} in the report, {len(rows)} in the table")
+    elif (out / table).exists():
+        faults.append(f"no {what} in the report, and a table of some")
     if what == "times" and len(fields) < number:
         faults.append(f"{number} steps in the report, {len(fields)} fields")
     if (out / "solution.vtu").exists() and not report["complete"]:
         faults.append("a field beside a report that is not complete")
     found = read_checkpoint(out, MPI.COMM_SELF)
-    if found is None or len(found[1][what]) < number:
+    if found is None or finished({"levels": [], **found[1]}) < finished(report):
         faults.append("nothing to resume from")
-    return number, faults
+    return finished(report), faults
 
 
 def main() -> None:

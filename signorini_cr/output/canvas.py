@@ -64,7 +64,16 @@ def as_png(figure: Figure | SubFigure) -> bytes:
     file = io.BytesIO()
     # whatever the layout has left no room for, a title of several lines for one, is on it
     figure.canvas.print_figure(file, format="png", bbox_inches="tight", pad_inches=0.1)
+    _drop_glyphs()
     return file.getvalue()
+
+
+def _drop_glyphs() -> None:
+    """Make fonts forget what formulas were set with; they would keep it, some kB a picture."""
+    from matplotlib.font_manager import FontProperties, findfont, get_font
+
+    for style in ("normal", "italic"):
+        get_font(findfont(FontProperties(style=style))).clear()
 
 
 def label_bar(bar: Colorbar, units: Units) -> None:

@@ -50,6 +50,20 @@ def test_without_a_path_there_is_a_figure_that_shows_itself(solution):
         assert np.ptp(pixels[..., :3]) > 0.9
 
 
+@pytest.mark.serial
+def test_fonts_keep_nothing_of_a_picture():
+    """Or each formula's glyphs would stay for as long as the process lives."""
+    manager = pytest.importorskip("matplotlib.font_manager")
+    names = (manager.FontProperties(style=style) for style in ("normal", "italic"))
+    fonts = [manager.get_font(manager.findfont(name)) for name in names]
+    figure = canvas.new_figure(4.0, 3.0)
+    figure.suptitle("$u_h$, 1 of $\\mathrm{two}$")
+    figure.canvas.draw()
+    assert all(font.get_num_glyphs() > 0 for font in fonts)
+    canvas.as_png(figure)
+    assert [font.get_num_glyphs() for font in fonts] == [0, 0]
+
+
 def test_axes_show_what_the_solution_says(solution):
     figure, (ours, theirs) = grid(1, 2) if WORLD.rank == 0 else (None, (None, None))
     drawn = plots.plot_solution(solution, ax=ours)
