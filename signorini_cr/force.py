@@ -19,6 +19,7 @@ from .estimate.force import (
     Interval,
     against,
     interval,
+    lost_of_norms,
     made_of,
     of_bumps,
     square,
@@ -171,7 +172,7 @@ def _by_phi(
                 square(made, cells, at - own), of_bumps(phi, cells), square(made, cells, at)
             )
         )
-        apart = float(sum(off_companion))
+        apart = float(sum(off_companion)) + 2.0 * lost_of_norms(made, cells)
         weighed = given.weighed(made, cells, float(size))
     product = bound * (dual.bound_companion + apart)
     if settled.held:
@@ -186,7 +187,9 @@ def _by_phi(
         weighed.square,
         missed + unsure(made, at, slack, weighed) + weighed.unsure,
     )
-    reach = made.loose * np.sqrt(energy) + more + product + 2.0 * made.reach * np.sqrt(lifted)
+    lost = lost_of_norms(made, cells)
+    reach = made.loose * (np.sqrt(energy) + lost) + more + product
+    reach += 2.0 * made.reach * (np.sqrt(lifted) + lost)
     return _ByPhi(force + work, reach, at, phi.through(cells))
 
 

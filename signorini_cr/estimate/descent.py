@@ -9,6 +9,9 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fem.cells import Cells, blocks
 
+LONGEST = 1e100
+"""Of a step that scaled matrices ask for; theirs are about 1."""
+
 
 def descend(
     cells: Cells,
@@ -41,7 +44,10 @@ def descend(
         if not square > share * first:
             break
         change = image(way)
-        length = square / float(cells.total(way[owned] @ change[owned])[0])
+        bend = float(cells.total(way[owned] @ change[owned])[0])
+        if not square < LONGEST * bend:  # A's products are below all numbers
+            break
+        length = square / bend
         fall += length * square
         for block in blocks(len(down)):
             numbers[block] += length * way[block]

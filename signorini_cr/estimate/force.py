@@ -22,7 +22,7 @@ from ..garbage import release
 from ..jit import compiled
 from ..options import DUAL, ESTIMATE_PREFIX, solve_once
 from ..vi.solved import Solved
-from .certificate import Certificate, Made
+from .certificate import LOST, Certificate, Made
 from .companion import bend_squares
 from .duality import apart
 from .heights import distance
@@ -92,10 +92,11 @@ def interval(
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     work, off, slack = against(made, cells, at)
     (energy,) = cells.total(square(made, cells, at))
+    lost = lost_of_norms(made, cells)
     if given is None:
         weighed = Weighed(force=sum(through(made, cells, condition) for condition in conditions))
     else:
-        weighed = given.weighed(made, cells, float(np.sqrt(energy)))
+        weighed = given.weighed(made, cells, float(np.sqrt(energy)) + lost)
     at_fixed = any(condition.fixed is not None for condition in conditions)
     # what e = 0 on Γ0 is good for elsewhere has to be paid for where φ = 1
     exits = at_fixed or made.on_contact_alone
@@ -107,7 +108,7 @@ def interval(
         weighed.unsure + 0.5 * off + more,
     )
     # ℓ meets all of A(u − v), of which one half is known to be at most the radius
-    reach = made.reach * (np.sqrt(energy) + 2.0 * np.sqrt(lifted)) + more
+    reach = made.reach * (np.sqrt(energy) + 2.0 * np.sqrt(lifted) + 3.0 * lost) + more
     # a force off one bound only has its sign
     signs = {s for c in conditions for s, _ in c.bounds} if not at_fixed else set()
     if min(cells.comm.allgather(weighed.least)) < 0.0:
@@ -115,6 +116,13 @@ def interval(
     lowest, highest = (0.0 if signs == {s} else s * -np.inf for s in (1, -1))
     lower, upper = max(float(middle - reach), lowest), min(float(middle + reach), highest)
     return Interval(float(value), lower, upper)
+
+
+def lost_of_norms(made: Made, cells: Cells) -> float:
+    """Bound what norms of φ and ℓ lack where squares are below all numbers; collective."""
+    stiff = max(cells.comm.allgather(float(np.max(made.kappa, initial=0.0))))
+    (number,) = cells.total(cells.number)
+    return float(LOST * (1.0 + np.sqrt(stiff)) * np.sqrt(number))
 
 
 def through(made: Made, cells: Cells, condition: Condition) -> float:
