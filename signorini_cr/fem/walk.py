@@ -47,16 +47,19 @@ class Walk:
         columns: dict[str, npt.NDArray] = {"vertices": vertices, "measure": measure}
         if mesh.topology.dim == 2:
             columns["reverse"] = _clockwise(mesh, facets, vertices)
+            columns["nodes"] = _nodes(mesh, facets)
         rows = _gathered(mesh.comm, columns)
         if not rows:
             return cls(mesh.comm, {}, np.empty(0, dtype=np.int64), None)
         midpoints, length = rows["vertices"].mean(axis=1), rows["measure"]
-        # The same order whatever the ranks held: by coordinates first
-        order, way = np.lexsort(midpoints.T[::-1]), None
+        # The same order whatever the ranks held: by coordinates, then by the side that Ω is on
+        along = rows["vertices"][:, 1] - rows["vertices"][:, 0]
+        along = np.where(rows["reverse"][:, None], -along, along) if "reverse" in rows else along
+        order, way = np.lexsort([*along.T[::-1], *midpoints.T[::-1]]), None
         part: Int64Array = np.zeros(len(order), dtype=np.int64)
         arc_length: FloatArray = np.full(len(order), np.nan)
         if mesh.topology.dim == 2:
-            way, part, arc_length = _Way.of(rows["vertices"], rows["reverse"], length, order)
+            way, part, arc_length = _Way.of(rows, order)
             order = np.lexsort([way.steps, part])
         place = {"part": part, "arc_length": arc_length, "x": midpoints[:, 0]}
         place |= {"y": midpoints[:, 1], "length": length}
@@ -104,6 +107,15 @@ def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDAr
     return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
 
 
+def _nodes(mesh: Mesh, facets: Int32Array) -> Int64Array:
+    """Find the numbers of facets' vertices that all ranks have for them, shape (n, 2)."""
+    cells, local = facet_entities(mesh, facets).T
+    nodes = cell_nodes(mesh)[cells]
+    ends = nodes[np.arange(3) != local[:, None]].reshape(-1, 2)
+    numbers = mesh.geometry.index_map().local_to_global(ends.ravel().astype(np.int32))
+    return np.asarray(numbers, dtype=np.int64).reshape(-1, 2)
+
+
 def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.NDArray]:
     """Pick the columns of the table that depend on the solution or its bounds."""
     names = ["obstacle", "upper"] if np.isfinite(rows["upper"]).any() else ["obstacle"]
@@ -134,18 +146,19 @@ class _Way:
 
     @classmethod
     def of(
-        cls, vertices: FloatArray, flip: BoolArray, length: FloatArray, sorted_: Int64Array
+        cls, rows: dict[str, npt.NDArray], sorted_: Int64Array
     ) -> tuple[_Way, Int64Array, FloatArray]:
         """Find it, and the part of each facet and how far its midpoint is from the beginning.
 
         Args:
-            vertices: Shape (n, 2, 3).
-            flip: Whether Ω lies to the right, shape (n,).
-            length: Shape (n,).
+            rows: Vertices, shape (n, 2, 3), their numbers, shape (n, 2), whether Ω lies to the
+                right, and measures, shape (n,).
             sorted_: The facets by their position.
         """
+        vertices, nodes, flip = rows["vertices"], rows["nodes"], rows["reverse"]
+        length = rows["measure"]
         ends = np.where(flip[:, None, None], vertices[:, ::-1], vertices)
-        before = _predecessors(ends)
+        before = _predecessors(ends, np.where(flip[:, None], nodes[:, ::-1], nodes))
         rank = np.empty(len(ends), dtype=np.int64)
         rank[sorted_] = np.arange(len(ends))
         first, steps, distance = _way_from_first(_cut(before, rank), length)
@@ -161,14 +174,26 @@ class _Way:
         return found
 
 
-def _predecessors(ends: FloatArray) -> Int64Array:
-    """Find for each facet the one that ends where it begins, itself where there is none."""
+def _predecessors(ends: FloatArray, nodes: Int64Array) -> Int64Array:
+    """Find for each facet the one that ends where it begins, itself where there is none.
+
+    Vertices are told by their numbers, as the faces of a slit have others at the same places. Where
+    several facets end in one, it is the one with nothing but Ω in between.
+    """
+    order = np.argsort(nodes[:, 1], kind="stable")
+    heads = nodes[order, 1]
+    first, last = (np.searchsorted(heads, nodes[:, 0], side=side) for side in ("left", "right"))
     own = np.arange(len(ends))
-    _, vertex = np.unique(ends.reshape(-1, 3), axis=0, return_inverse=True)
-    tail, head = vertex.reshape(-1, 2).T
-    arriving = np.full(vertex.max(initial=-1) + 1, -1)
-    arriving[head] = own
-    return np.where(arriving[tail] >= 0, arriving[tail], own)
+    before = np.where(first < last, order[np.minimum(first, len(order) - 1)], own)
+    several = np.flatnonzero(last - first > 1)
+    along = ends[:, 1] - ends[:, 0]
+    angle = np.arctan2(along[:, 1], along[:, 0])
+    for facet in several:
+        arriving = order[first[facet] : last[facet]]
+        # from the facet to the one before it, Ω to the left
+        between = np.mod(angle[arriving] + np.pi - angle[facet], 2.0 * np.pi)
+        before[facet] = arriving[between.argmin()]
+    return before
 
 
 def _cut(before: Int64Array, rank: Int64Array) -> Int64Array:
