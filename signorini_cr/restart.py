@@ -2,7 +2,7 @@
 
 Cells, facets and vertices are told by where they are. Places are the same to the last bit however a
 mesh is shared out: those of vertices are read, or are midpoints of two others, and so are those of
-facets.
+facets. On the two faces of a slit they would be the same, so facets of the boundary are beside it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.mesh import Mesh
+from dolfinx.mesh import Mesh, exterior_facet_indices
 from mpi4py import MPI
 
 from . import compat
-from .arrays import FloatArray, Int32Array
+from .arrays import BoolArray, FloatArray, Int32Array
 from .errors import InputError
+from .fem.space import largest
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine, refine_edges
@@ -29,6 +30,10 @@ from .solution import Solution
 
 Places = npt.NDArray[np.complex128]
 """Points of the plane; they sort by x, then by y."""
+
+
+BESIDE = 0.2371
+"""How far that is, in lengths of the facet; a number by which it is no other facet's place."""
 
 
 class AnotherMesh(InputError):
@@ -134,6 +139,10 @@ class Restart:
             AnotherMesh: The mesh is another one.
         """
         at, values = self.u[number]
+        if V.dofmap.index_map.size_global == len(at) > len(np.unique(at)):
+            raise AnotherMesh(
+                "nodes of P1 at the same place, as on the two faces of a slit, can't be told apart"
+            )
         order, mine = np.argsort(at), _places(V)
         index = order[np.minimum(np.searchsorted(at, mine, sorter=order), len(at) - 1)]
         other = len(at) != V.dofmap.index_map.size_global or not np.array_equal(at[index], mine)
@@ -148,9 +157,15 @@ class Restart:
 
 
 def _added(meshes: Sequence[NestedMesh], comm: MPI.Comm) -> tuple[Places, ...]:
-    """Find the vertices that each mesh but the first has beyond the one below it; collective."""
-    found = [_gathered(_nodes(each.domain.mesh), comm) for each in meshes]
-    return tuple(np.setdiff1d(fine, coarse) for coarse, fine in pairwise(found))
+    """Find the vertices that each mesh but the first has beyond the one below it; collective.
+
+    And the places of what edges of the boundary are no longer there.
+    """
+    vertices = [_gathered(_nodes(each.domain.mesh), comm) for each in meshes]
+    edges = [_gathered(_boundary(each.domain.mesh), comm) for each in meshes]
+    new = (np.setdiff1d(fine, coarse) for coarse, fine in pairwise(vertices))
+    cut = (np.setdiff1d(coarse, fine) for coarse, fine in pairwise(edges))
+    return tuple(np.concatenate(both) for both in zip(new, cut, strict=True))
 
 
 def _corners(mesh: Mesh) -> Places:
@@ -175,20 +190,42 @@ def _places(V: fem.FunctionSpace) -> Places:
     """Find where the nodes of CR or P1 are, ghosts included."""
     layout, at = Layout.of_space(V), _corners(V.mesh)
     places = np.empty(layout.index_map.size_local + layout.index_map.num_ghosts, dtype=at.dtype)
-    places[layout.cells] = _midpoints(at) if layout.cr else at
+    places[layout.cells] = _sides(V.mesh)[2] if layout.cr else at
     return places
 
 
-def _midpoints(corners: Places) -> Places:
-    """Compute midpoints of the sides opposite corners, shape (cells, 3); a + b is b + a exactly."""
-    return 0.5 * (corners[:, [1, 2, 0]] + corners[:, [2, 0, 1]])
+def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places]:
+    """Find the sides opposite corners of this rank's cells; collective.
+
+    Returns:
+        Edges, whether they are of the boundary, and where they are, all of shape (cells, 3).
+    """
+    topology = mesh.topology
+    topology.create_connectivity(2, 1)
+    topology.create_connectivity(1, 2)
+    edges = topology.connectivity(2, 1).array.reshape(-1, 3)
+    index_map = topology.index_map(1)
+    outer = np.zeros(index_map.size_local + index_map.num_ghosts)
+    outer[exterior_facet_indices(topology)] = 1.0
+    of_boundary = largest(mesh.comm, index_map, outer)[edges] > 0.0
+    corners = _corners(mesh)
+    first, second = corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]
+    middle, along = 0.5 * (first + second), second - first  # a + b is b + a exactly
+    left = (along.conj() * (corners - middle)).imag > 0.0
+    inwards = 1j * np.where(left, along, -along)
+    return edges, of_boundary, np.where(of_boundary, middle + BESIDE * inwards, middle)
+
+
+def _boundary(mesh: Mesh) -> Places:
+    """Return where the edges of the boundary are that cells of this rank have; collective."""
+    _, of_boundary, places = _sides(mesh)
+    return places[of_boundary]
 
 
 def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
-    """Find the edges of this rank's cells whose midpoints are among some places."""
-    mesh.topology.create_connectivity(2, 1)
-    edges = mesh.topology.connectivity(2, 1).array.reshape(-1, 3)
-    return np.unique(edges[np.isin(_midpoints(_corners(mesh)), places)]).astype(np.int32)
+    """Find the edges of this rank's cells whose places are among some; collective."""
+    edges, _, mine = _sides(mesh)
+    return np.unique(edges[np.isin(mine, places)]).astype(np.int32)
 
 
 def _gathered(values: npt.NDArray, comm: MPI.Comm) -> npt.NDArray:

@@ -269,7 +269,7 @@ def _enclosed(
         return np.stack([square, size, steep, least])
 
     weights = np.zeros((4, n))
-    with np.errstate(divide="ignore"):  # without a goal there is none too small to be cut
+    with np.errstate(divide="ignore", over="ignore"):  # without a goal none is too small to be cut
         weights[0] = 0.5 * seen.height * seen.length / np.float64(goal) ** 2
     pieces = whole
     for _ in range(QUARTERS):

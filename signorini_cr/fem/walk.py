@@ -182,7 +182,8 @@ def _predecessors(ends: FloatArray, nodes: Int64Array) -> Int64Array:
     """
     order = np.argsort(nodes[:, 1], kind="stable")
     heads = nodes[order, 1]
-    first, last = (np.searchsorted(heads, nodes[:, 0], side=side) for side in ("left", "right"))
+    first = np.searchsorted(heads, nodes[:, 0], side="left")
+    last = np.searchsorted(heads, nodes[:, 0], side="right")
     own = np.arange(len(ends))
     before = np.where(first < last, order[np.minimum(first, len(order) - 1)], own)
     several = np.flatnonzero(last - first > 1)

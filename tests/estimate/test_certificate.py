@@ -36,6 +36,7 @@ from signorini_cr.compat import cell_nodes
 from signorini_cr.data.ranges import range_of
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate.certificate import certify
+from signorini_cr.estimate.descent import descend
 from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.fem.cells import Cells
 from signorini_cr.force import flux, force_bounds
@@ -133,6 +134,27 @@ def test_loads_whose_squares_are_lost_are_bounded(power):
     assert mean_.lower <= -a / 3 <= mean_.upper
     held = solve(Problem(f=-a), HELD_ABOVE.mesh(0.3)).flux("contact")  # u = a (y² − y)/2
     assert held.lower <= a / 2 <= held.upper
+
+
+@pytest.mark.parametrize("power", [100, 158, 160, 162, 164, 170, 200, 300])
+def test_weights_whose_squares_are_lost(power):
+    """−Δu = −1 is (y² − y)/2 where contact holds it, and λ = 1/2, on a unit square."""
+    w = 10.0**-power
+    solution = solve(Problem(f=-1.0), HELD_ABOVE.mesh(0.3))
+    for weight, share in ((w, 0.5), (lambda x: w * (1.0 + x[0]), 0.75)):
+        for part in ("contact", "dirichlet"):
+            found = solution.flux(part, weight=weight)
+            assert found.lower <= share * w <= found.upper <= found.lower + w + 1e-148
+        found = solution.integral(weight=weight)
+        assert found.lower <= -w * share / 6 <= found.upper
+
+
+def test_descents_end_where_products_are_lost():
+    """Between numbers whose squares are some and such whose squares are none is a narrow strip."""
+    cells = solve(Problem(f=-1.0), HELD_ABOVE.mesh(0.5)).certificate._made.cells()
+    numbers, down = np.zeros(len(cells.exterior)), np.full(len(cells.exterior), 1e-160)
+    fall, left = descend(cells, lambda way: 1e-5 * way, numbers, down, np.ones(len(down)), 3)
+    assert fall == 0.0 < left and not numbers.any()
 
 
 def test_bound_without_exact_solution():
