@@ -45,8 +45,8 @@ class Restart:
     """A sequence of meshes, and u_h on the last two or at the last times, for any number of ranks.
 
     Attributes:
-        added: For each mesh but the coarsest the places of the vertices that the one below does not
-            have; None where every triangle was cut into four.
+        added: For each mesh but the coarsest the places of the edges below it that were cut in
+            two; None where every triangle was cut into four.
         u: Places of the nodes of u_h and its values there, shape (nodes, block), on the last mesh
             and on the one below it; or, in time, all on the last mesh, after the last step and
             after those before it.
@@ -157,15 +157,15 @@ class Restart:
 
 
 def _added(meshes: Sequence[NestedMesh], comm: MPI.Comm) -> tuple[Places, ...]:
-    """Find the vertices that each mesh but the first has beyond the one below it; collective.
-
-    And the places of what edges of the boundary are no longer there.
-    """
+    """Find the places of edges that each mesh but the first has cut in two; collective."""
     vertices = [_gathered(_nodes(each.domain.mesh), comm) for each in meshes]
     edges = [_gathered(_boundary(each.domain.mesh), comm) for each in meshes]
-    new = (np.setdiff1d(fine, coarse) for coarse, fine in pairwise(vertices))
-    cut = (np.setdiff1d(coarse, fine) for coarse, fine in pairwise(edges))
-    return tuple(np.concatenate(both) for both in zip(new, cut, strict=True))
+    found = []
+    for (coarse, fine), (before, after) in zip(pairwise(vertices), pairwise(edges), strict=True):
+        cut = before[~np.isin(before[:, 0], after[:, 0])]
+        inside = np.setdiff1d(np.setdiff1d(fine, coarse), cut[:, 1])
+        found.append(np.concatenate([inside, np.unique(cut[:, 0])]))
+    return tuple(found)
 
 
 def _corners(mesh: Mesh) -> Places:
@@ -217,9 +217,15 @@ def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places]:
 
 
 def _boundary(mesh: Mesh) -> Places:
-    """Return where the edges of the boundary are that cells of this rank have; collective."""
+    """Return where the edges of the boundary and their midpoints are; collective.
+
+    Returns:
+        Shape (edges, 2); of those that cells of this rank have.
+    """
     _, of_boundary, places = _sides(mesh)
-    return places[of_boundary]
+    corners = _corners(mesh)
+    middle = 0.5 * (corners[:, [1, 2, 0]] + corners[:, [2, 0, 1]])
+    return np.stack([places[of_boundary], middle[of_boundary]], axis=1)
 
 
 def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
