@@ -45,7 +45,7 @@ def made(squares: list[tuple[int, int, int]], width: float) -> Mesh:
     points = np.array([key[:2] for key in numbers]) * width
     here = slice(None) if COMM.rank == 0 else slice(0, 0)
     triangle = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
-    return create_mesh(COMM, np.array(cells, np.int64)[here], points[here], triangle)
+    return create_mesh(COMM, np.array(cells, np.int64)[here], x=points[here], e=triangle)
 
 
 def tagged(mesh: Mesh, value: Callable[..., np.ndarray]) -> tuple[Mesh, MeshTags]:
