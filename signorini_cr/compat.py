@@ -220,10 +220,14 @@ def facet_vertices(mesh: Mesh, entities: Int32Array) -> FloatArray:
     Returns:
         Shape (n, d, 3).
     """
+    return np.asarray(mesh.geometry.x[facet_nodes(mesh, entities)])
+
+
+def facet_nodes(mesh: Mesh, entities: Int32Array) -> Int32Array:
+    """Find the rows of `mesh.geometry.x` that `facet_vertices` takes, shape (n, d)."""
     cells, local = entities.T
     corners = np.array(basix.topology(mesh.basix_cell())[-2])
-    nodes = np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)
-    return np.asarray(mesh.geometry.x[nodes])
+    return np.take_along_axis(cell_nodes(mesh)[cells], corners[local], axis=1)
 
 
 class FacetExpression:

@@ -163,6 +163,7 @@ def _by_phi(
         return None
     assert dual.bound_companion is not None
     at = phi.vertices[cells.vertices]
+    lost = lost_of_norms(made, cells)
     apart, weighed = 0.0, Weighed(force=sum(through(made, cells, c) for c in known))
     if omega is not None:
         given, own = Weight.of(made, cells, known, omega, settled.free), at
@@ -172,8 +173,8 @@ def _by_phi(
                 square(made, cells, at - own), of_bumps(phi, cells), square(made, cells, at)
             )
         )
-        apart = float(sum(off_companion)) + 2.0 * lost_of_norms(made, cells)
-        weighed = given.weighed(made, cells, float(size))
+        apart = float(sum(off_companion)) + 2.0 * lost
+        weighed = given.weighed(made, cells, float(size) + lost)
     product = bound * (dual.bound_companion + apart)
     if settled.held:
         product += bound * left_by(phi, made)
@@ -187,7 +188,6 @@ def _by_phi(
         weighed.square,
         missed + unsure(made, at, slack, weighed) + weighed.unsure,
     )
-    lost = lost_of_norms(made, cells)
     reach = made.loose * (np.sqrt(energy) + lost) + more + product
     reach += 2.0 * made.reach * (np.sqrt(lifted) + lost)
     return _ByPhi(force + work, reach, at, phi.through(cells))

@@ -190,15 +190,16 @@ def _places(V: fem.FunctionSpace) -> Places:
     """Find where the nodes of CR or P1 are, ghosts included."""
     layout, at = Layout.of_space(V), _corners(V.mesh)
     places = np.empty(layout.index_map.size_local + layout.index_map.num_ghosts, dtype=at.dtype)
-    places[layout.cells] = _sides(V.mesh)[2] if layout.cr else at
+    places[layout.cells] = _sides(V.mesh)[-1] if layout.cr else at
     return places
 
 
-def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places]:
+def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places, Places]:
     """Find the sides opposite corners of this rank's cells; collective.
 
     Returns:
-        Edges, whether they are of the boundary, and where they are, all of shape (cells, 3).
+        Edges, whether they are of the boundary, their midpoints, and where they are told to be, all
+        of shape (cells, 3).
     """
     topology = mesh.topology
     topology.create_connectivity(2, 1)
@@ -213,7 +214,7 @@ def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places]:
     middle, along = 0.5 * (first + second), second - first  # a + b is b + a exactly
     left = (along.conj() * (corners - middle)).imag > 0.0
     inwards = 1j * np.where(left, along, -along)
-    return edges, of_boundary, np.where(of_boundary, middle + BESIDE * inwards, middle)
+    return edges, of_boundary, middle, np.where(of_boundary, middle + BESIDE * inwards, middle)
 
 
 def _boundary(mesh: Mesh) -> Places:
@@ -222,15 +223,13 @@ def _boundary(mesh: Mesh) -> Places:
     Returns:
         Shape (edges, 2); of those that cells of this rank have.
     """
-    _, of_boundary, places = _sides(mesh)
-    corners = _corners(mesh)
-    middle = 0.5 * (corners[:, [1, 2, 0]] + corners[:, [2, 0, 1]])
+    _, of_boundary, middle, places = _sides(mesh)
     return np.stack([places[of_boundary], middle[of_boundary]], axis=1)
 
 
 def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
     """Find the edges of this rank's cells whose places are among some; collective."""
-    edges, _, mine = _sides(mesh)
+    edges, _, _, mine = _sides(mesh)
     return np.unique(edges[np.isin(mine, places)]).astype(np.int32)
 
 

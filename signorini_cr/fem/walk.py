@@ -10,7 +10,7 @@ from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
-from ..compat import cell_nodes
+from ..compat import cell_nodes, facet_nodes
 from .space import facet_entities
 
 
@@ -52,14 +52,12 @@ class Walk:
         if not rows:
             return cls(mesh.comm, {}, np.empty(0, dtype=np.int64), None)
         midpoints, length = rows["vertices"].mean(axis=1), rows["measure"]
-        # The same order whatever the ranks held: by coordinates, then by the side that Ω is on
-        along = rows["vertices"][:, 1] - rows["vertices"][:, 0]
-        along = np.where(rows["reverse"][:, None], -along, along) if "reverse" in rows else along
-        order, way = np.lexsort([*along.T[::-1], *midpoints.T[::-1]]), None
+        # The same order whatever the ranks held: by coordinates first
+        order, way = np.lexsort(midpoints.T[::-1]), None
         part: Int64Array = np.zeros(len(order), dtype=np.int64)
         arc_length: FloatArray = np.full(len(order), np.nan)
         if mesh.topology.dim == 2:
-            way, part, arc_length = _Way.of(rows, order)
+            way, part, arc_length = _Way.of(rows)
             order = np.lexsort([way.steps, part])
         place = {"part": part, "arc_length": arc_length, "x": midpoints[:, 0]}
         place |= {"y": midpoints[:, 1], "length": length}
@@ -109,11 +107,9 @@ def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDAr
 
 def _nodes(mesh: Mesh, facets: Int32Array) -> Int64Array:
     """Find the numbers of facets' vertices that all ranks have for them, shape (n, 2)."""
-    cells, local = facet_entities(mesh, facets).T
-    nodes = cell_nodes(mesh)[cells]
-    ends = nodes[np.arange(3) != local[:, None]].reshape(-1, 2)
-    numbers = mesh.geometry.index_map().local_to_global(ends.ravel().astype(np.int32))
-    return np.asarray(numbers, dtype=np.int64).reshape(-1, 2)
+    nodes = facet_nodes(mesh, facet_entities(mesh, facets))
+    numbers = mesh.geometry.index_map().local_to_global(nodes.ravel())
+    return np.asarray(numbers, dtype=np.int64).reshape(nodes.shape)
 
 
 def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.NDArray]:
@@ -145,33 +141,35 @@ class _Way:
     steps: Int64Array
 
     @classmethod
-    def of(
-        cls, rows: dict[str, npt.NDArray], sorted_: Int64Array
-    ) -> tuple[_Way, Int64Array, FloatArray]:
+    def of(cls, rows: dict[str, npt.NDArray]) -> tuple[_Way, Int64Array, FloatArray]:
         """Find it, and the part of each facet and how far its midpoint is from the beginning.
 
         Args:
             rows: Vertices, shape (n, 2, 3), their numbers, shape (n, 2), whether Ω lies to the
                 right, and measures, shape (n,).
-            sorted_: The facets by their position.
         """
-        vertices, nodes, flip = rows["vertices"], rows["nodes"], rows["reverse"]
-        length = rows["measure"]
-        ends = np.where(flip[:, None, None], vertices[:, ::-1], vertices)
-        before = _predecessors(ends, np.where(flip[:, None], nodes[:, ::-1], nodes))
+        flip, length = rows["reverse"], rows["measure"]
+        ends = _turned(rows["vertices"], flip)
+        before = _predecessors(ends, _turned(rows["nodes"], flip))
+        # faces of a slit, whose midpoints are the same, have Ω on either side
+        along, midpoints = ends[:, 1] - ends[:, 0], ends.mean(axis=1)
         rank = np.empty(len(ends), dtype=np.int64)
-        rank[sorted_] = np.arange(len(ends))
+        rank[np.lexsort([*along.T[::-1], *midpoints.T[::-1]])] = np.arange(len(ends))
         first, steps, distance = _way_from_first(_cut(before, rank), length)
         part = np.unique(rank[first], return_inverse=True)[1]
         return cls(ends, flip, before, part, steps), part, distance + 0.5 * length[first]
 
     def transitions(self, rows: dict[str, npt.NDArray]) -> FloatArray:
         """Find the transition points, in order along the boundary, shape (m, 3)."""
-        gaps = rows["gap_at_vertices"]
-        gaps = np.where(self.flip[:, None], gaps[:, ::-1], gaps)
+        gaps = _turned(rows["gap_at_vertices"], self.flip)
         points, behind = _transitions(self.before, self.ends, gaps, rows)
         found: FloatArray = points[np.lexsort([self.steps[behind], self.part[behind]])]
         return found
+
+
+def _turned(pairs: npt.NDArray, flip: BoolArray) -> npt.NDArray:
+    """Let what there is of a facet's two vertices change places on some facets."""
+    return np.where(flip.reshape(-1, *[1] * (pairs.ndim - 1)), pairs[:, ::-1], pairs)
 
 
 def _predecessors(ends: FloatArray, nodes: Int64Array) -> Int64Array:
