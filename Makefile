@@ -91,13 +91,16 @@ test-package:
 test-wheels:
 	./container/check-package wheels
 
+# All of it is told at once, whatever fails first.
 lint:
-	$(run) container/tool ruff check
-	$(run) container/tool ruff format --check
-	$(run) container/tool pytest -q tests/test_metadata.py
-	@if command -v shellcheck >/dev/null; then \
-	    grep -lr '^#!.*sh$$' container .ci | xargs -d '\n' shellcheck; \
-	else echo 'no shellcheck here: the shell scripts are not looked at'; fi
+	@failed=; \
+	$(run) container/tool ruff check || failed=1; \
+	$(run) container/tool ruff format --check || failed=1; \
+	$(run) container/tool pytest -q tests/test_metadata.py || failed=1; \
+	if command -v shellcheck >/dev/null; then \
+	    grep -lr '^#!.*sh$$' container .ci | xargs -d '\n' shellcheck || failed=1; \
+	else echo 'no shellcheck here: the shell scripts are not looked at'; fi; \
+	[ -z "$$failed" ]
 
 types:
 	$(run) container/tool mypy

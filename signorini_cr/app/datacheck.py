@@ -14,7 +14,7 @@ from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import InputError
 from ..mesh.domain import Domain
 from .expressions import Expression
-from .reference import EXPRESSIONS
+from .reference import ABOVE, EXPRESSIONS, Key
 
 
 class Datum(NamedTuple):
@@ -38,9 +38,9 @@ class Datum(NamedTuple):
         return f"{own}.{self.key}" + "".join(f"[{i}]" for i in self.entry)
 
     @property
-    def is_kappa(self) -> bool:
-        """Whether it is all of κ; an entry of a tensor is not."""
-        return self.key == "coefficient" and self.section != "boundary" and not self.entry
+    def told(self) -> Key:
+        """The row that the reference has of its key."""
+        return EXPRESSIONS[f"{self.section}{'.NAME' if self.name is not None else ''}.{self.key}"]
 
 
 Weights = Mapping[str, str | None]
@@ -49,13 +49,10 @@ Weights = Mapping[str, str | None]
 
 def _used_on(datum: Datum, domain: Domain, weights: Weights) -> int | None:
     """Find the part of the boundary that an expression is used on, or None for the domain."""
-    section, name, key, _ = datum
-    if section == "quantities" and name is not None:
-        return domain.parts.get(weights[name] or "")
-    if section == "boundary" and name is not None:
-        return domain.parts[name]
-    told = EXPRESSIONS.get(f"{section}.{key}") if name is None else None
-    return domain.parts[told.used_on] if told is not None and told.used_on else None
+    if datum.section == "quantities" and datum.name is not None:
+        return domain.parts.get(weights[datum.name] or "")
+    part = datum.name if datum.section == "boundary" else datum.told.used_on
+    return domain.parts[part] if part else None
 
 
 def _used_in(datum: Datum, data: Collection[Datum], domain: Domain, weights: Weights) -> BoolArray:
@@ -107,10 +104,8 @@ def check_values(
         points = _points(domain, domain.mesh.topology.dim - (part is not None), which, digits)
         values = expression.numpy(points)
         wrong = ~np.isfinite(values)
-        if datum.is_kappa:
-            wrong |= values <= 0
-        elif datum.key in ("reaction", "coefficient") and not datum.entry:
-            wrong |= values < 0
+        if datum.told.least and not datum.entry:  # tensors are looked at as a whole
+            wrong |= values <= 0 if datum.told.least == ABOVE else values < 0
         if wrong.any():
             found = np.column_stack([points[:, :2], values])[wrong]
             first = found[np.lexsort((found[:, 1], found[:, 0]))[0]]
@@ -125,9 +120,8 @@ def check_values(
         when = f", at the time {time:g}"
     message = f"{datum}: the value at {_point(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
-        what = "above 0" if datum.is_kappa else "0 or more"
         there = "there" if datum.section == "material" else "everywhere"
-        raise InputError(f"{message}; the {datum.key} must be {what} {there}{when}")
+        raise InputError(f"{message}; the {datum.key} must be {datum.told.least} {there}{when}")
     part = _used_on(datum, domain, weights)
     named = {value: name for name, value in domain.parts.items()}
     where = "in the domain" if part is None else f"on the {named[part]} part"

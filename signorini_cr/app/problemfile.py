@@ -67,6 +67,7 @@ from .reference import (
     QUANTITIES,
     QUANTITY,
     SECTIONS,
+    TENSOR,
     TYPES,
     allowed,
 )
@@ -640,7 +641,7 @@ def _expressions(
 
 def _by_entries(datum: Datum, value: Any) -> dict[Datum, Any]:
     """Part a tensor into its entries, as ``data.coefficient[0][1]``; keep all else."""
-    if not (isinstance(value, list) and datum.is_kappa):
+    if not (isinstance(value, list) and datum.told.value == TENSOR):
         return {datum: value}
     if len(value) != 2 or not all(isinstance(row, list) and len(row) == 2 for row in value):
         raise InputError(

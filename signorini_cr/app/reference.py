@@ -29,6 +29,8 @@ class Key(NamedTuple):
             domain.
         ends: Whether it says where a run ends, and nothing else: it may differ in a run that is
             resumed.
+        least: What values of an expression are to be, `ABOVE` or `NOT_BELOW`; "" for anything
+            finite. `datacheck` looks at it.
     """
 
     section: str
@@ -40,6 +42,7 @@ class Key(NamedTuple):
     argument: Callable[[str, Any], Any] | None = None
     used_on: str = ""
     ends: bool = False
+    least: str = ""
 
     @property
     def is_expression(self) -> bool:
@@ -55,6 +58,7 @@ USUAL = {name: f"{value}".removesuffix(".0") for name, value in DEFAULTS.items()
 """The same in words."""
 EXPRESSION = "an expression or a number"
 TENSOR = "an expression or a number, or a tensor [[xx, xy], [xy, yy]] of these"
+ABOVE, NOT_BELOW = "above 0", "0 or more"
 WORD = f"a text of {MOST_CHARACTERS} characters at most"
 PART = "boundary.NAME"
 """The sections of the parts of the boundary."""
@@ -128,9 +132,9 @@ KEYS = (
         "obstacle where the two parts meet.", 'dirichlet = "0.2*y"', used_on="dirichlet"),
     Key("data", "coefficient", TENSOR, "1", "κ, above 0 everywhere. It may jump. A tensor is "
         "symmetric, with eigenvalues above 0: [[\"2\", \"0.5\"], [\"0.5\", \"1\"]].",
-        'coefficient = "where(x < 0, 1, 100)"'),
+        'coefficient = "where(x < 0, 1, 100)"', least=ABOVE),
     Key("data", "reaction", EXPRESSION, "0", "c of −∇·(κ∇u) + c u = f, nowhere below 0.",
-        "reaction = 2"),
+        "reaction = 2", least=NOT_BELOW),
     Key(PART, "type", '"contact", "dirichlet", "neumann" or "robin"', "", "What holds there: u ≥ "
         "obstacle, or u ≤ upper, or both; u = value; κ∂ₙu = g; κ∂ₙu + coefficient (u − external) "
         "= g. On contact parts that has the pressure of the obstacle on its right, too.",
@@ -143,7 +147,7 @@ KEYS = (
     Key(PART, "g", EXPRESSION, "0, or derived from `exact.u` but for contact",
         "neumann, robin, contact: the flux into the domain.", "g = 0.5"),
     Key(PART, "coefficient", EXPRESSION, "0", "robin, contact: what is lost there by a unit of u; "
-        "nowhere below 0.", "coefficient = 20"),
+        "nowhere below 0.", "coefficient = 20", least=NOT_BELOW),
     Key(PART, "external", EXPRESSION, "0", "robin, contact: the u at which nothing is lost.",
         "external = -10"),
     Key(MATERIAL, "polygon", "a list of points [x, y]", "", "Where the domain consists of it: "
@@ -152,9 +156,10 @@ KEYS = (
         "`domain.mesh`, which has physical surfaces of such names.",
         "polygon = [[0, 0], [1, 0], [1, 1], [0, 1]]"),
     Key(MATERIAL, "coefficient", TENSOR, "that of [data]", "κ there: a number, or a tensor as that "
-        "of wood along its grain and across.", "coefficient = [[0.3, 0], [0, 0.12]]"),
+        "of wood along its grain and across.", "coefficient = [[0.3, 0], [0, 0.12]]", least=ABOVE),
     Key(MATERIAL, "f", EXPRESSION, "that of [data]", "The load there.", "f = -2"),
-    Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there.", "reaction = 2"),
+    Key(MATERIAL, "reaction", EXPRESSION, "that of [data]", "c there.", "reaction = 2",
+        least=NOT_BELOW),
     Key(MATERIAL, "capacity", "a number above 0", "that of [time]", "What multiplies ∂u/∂t there, "
         "with a section [time].", "capacity = 1.7e6"),
     Key("exact", "u", EXPRESSION, "not known", "The solution, where it is known: errors and rates "

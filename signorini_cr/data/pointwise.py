@@ -147,7 +147,7 @@ def by_operators(expression: Any, leaf: Callable[[Any], Any]) -> Any:
     with np.errstate(all="ignore"):
         while expression not in known:
             e = stack[-1]
-            function = FUNCTIONS.get(type(e))
+            function = OPERATORS.get(type(e))
             operands = () if function is None else e.ufl_operands
             if unknown := [operand for operand in operands if operand not in known]:
                 stack += unknown
@@ -343,7 +343,7 @@ _TRUTHS: dict[type, Callable[..., Any]] = {
     classes.OrCondition: np.logical_or,
     classes.NotCondition: np.logical_not,
 }
-FUNCTIONS: dict[type, Callable[..., Any]] = {
+OPERATORS: dict[type, Callable[..., Any]] = {
     classes.Sum: np.add,
     classes.Product: np.multiply,
     classes.Division: np.divide,

@@ -19,6 +19,9 @@ from .units import GLUE, PLAIN, Units
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
 
 FORCE = "the contact force"
+LEFT, WRONG = 1e-8, 1.001e-6
+"""Parts of the load and of the contact forces that a solver leaves at most, as it is by itself."""
+
 MEASURED = {"h": "x", "contact": "x"}
 """The printed columns whose unit may be told."""
 
@@ -52,7 +55,8 @@ def explained(words: Mapping[str, str], measured: Mapping[str, str], units: Unit
 def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     """Say what happens on Γ1, in a sentence, with the digits that are known.
 
-    A place on Γ1 is known to within a facet, the force as well as it is certain.
+    A place on Γ1 is known to within a facet, the force as well as it is certain. Where PETSc's
+    options have let the solver end before it would have, that is said as well.
 
     Args:
         record: The last level's.
@@ -73,6 +77,17 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     if points:
         more = f" and {len(points) - 6} more" if len(points) > 6 else ""
         line += f"; it begins or ends at {', '.join(points[:6])}{more}{units.after('x')}"
+    left, wrong = record["kkt"]["residual"], record["kkt"]["force_error"]
+    if left is None or left > LEFT or wrong is None or wrong > WRONG:
+        line += (
+            f"; not converged as usual, as an option ends the solver early: the residual is"
+            f" {short(left)} of the load, and"
+        )
+        line += (
+            " how well forces are known is not known"
+            if wrong is None
+            else f" forces are known to {short(wrong)} of their sum"
+        )
     return line
 
 

@@ -41,7 +41,8 @@ class Kkt:
             what the rows are made of, in the class of stiffness where that is larger (`stopping`).
             Rounding of A u_h does not count.
         force_error: What the solver left wrong with the contact forces, summed up without regard
-            to sign, relative to their sum, as measured by the solver.
+            to sign, relative to their sum, as measured by the solver; infinite where a tolerance
+            looser than ours left it no step to measure that by.
     """
 
     min_gap: float

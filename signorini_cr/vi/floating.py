@@ -100,8 +100,9 @@ class Floating:
         adrift[0] = False
         complaint, bad = None, int(np.argmax(adrift))
         if adrift.any() and (where := self._where(V, bad)) is not None:
-            amount = f"of {net[bad]:g}"
-            if 0.0 < abs(rules[-1][bad]) <= doubt[bad]:
+            found = [each[bad] for each in rules]
+            amount = f"of {found[-1]:g}"
+            if abs(found[-1]) <= doubt[bad] and any(found):
                 amount = "that can't be told from 0"
             alone = number[bad] == V.dofmap.index_map.size_global * V.dofmap.index_map_bs
             complaint = (

@@ -77,7 +77,8 @@ class Iterations:
         linear: Linear (CG) iterations.
         preconditioner: The one taken, in words.
         force_error: What may be wrong with the contact forces, in parts of their sum: the largest
-            of all classes, see `stopping`.
+            of all classes, see `stopping`; infinite where a looser tolerance leaves no step to
+            measure it by.
         imbalance: Largest residual of a class of stiffness in parts of its flows; 0 where there is
             one class only.
         extended: Whether forces are those of u_h to twice the digits, see `extended`.
@@ -325,7 +326,8 @@ class NewtonTest:
         """Tell whether no step is needed: by our own tolerance one is made, to look at the set."""
         enough = norm == 0.0 or (self._slack > 1.0 and norm <= small)
         if enough:
-            self.force_error = self.imbalance = 0.0
+            self.imbalance = 0.0
+            self.force_error = 0.0 if norm == 0.0 else np.inf
         return enough
 
     def _forget(self) -> None:

@@ -1128,6 +1128,21 @@ def test_petsc_takes_them(write) -> None:
     options.delValue("signorini_cr_probe")
 
 
+def test_options_that_end_the_solver_early_are_told(write) -> None:
+    """The start of the finer mesh counts as solved then, and what is left of the load is told."""
+    from petsc4py import PETSc
+
+    told = []
+    for more in ((), ("-signorini_snes_atol", "1e10")):
+        status, out, _ = run("solve", write(CASE), "--out", "out", *more)
+        assert status == 0
+        told.append("not converged as usual" in " ".join(out.split()))
+    PETSc.Options().delValue("signorini_snes_atol")
+    last = json.loads(Path("out/report.json").read_text())["levels"][-1]
+    assert told == ([False, True] if COMM.rank == 0 else [False, False])
+    assert last["kkt"]["residual"] > 1e-3 and last["kkt"]["force_error"] is None
+
+
 @pytest.mark.serial
 def test_help_answers_without_the_heavy_libraries() -> None:
     program = (

@@ -180,8 +180,14 @@ def test_every_column_of_the_steps_has_its_meaning():
     ],
 )  # fmt: skip
 def test_places_and_forces_have_the_digits_that_are_known(contact, told):
-    text = plain(facts({"contact": {"facets": 80, **contact}}))
-    assert text == f"contact on {contact['active']} of 80 facets, {told}"
+    record = {"contact": {"facets": 80, **contact}, "kkt": {"residual": 9e-9, "force_error": 1e-6}}
+    text = f"contact on {contact['active']} of 80 facets, {told}"
+    assert plain(facts(record)) == text
+    record["kkt"] = {"residual": 0.321, "force_error": None}
+    assert plain(facts(record)) == (
+        f"{text}; not converged as usual, as an option ends the solver early: the residual is"
+        " 0.321 of the load, and how well forces are known is not known"
+    )
 
 
 def test_energies_have_the_digits_that_are_known():

@@ -363,6 +363,10 @@ def test_who_loosens_the_tolerance_gets_it(options):
     rough = solutions(halves(1.0), 3)[-1]
     assert rough.iterations.linear < usual.iterations.linear
     assert usual.contact.kkt.residual < 1e-8 < rough.contact.kkt.residual < 1e-1
+    options("snes_atol", 1e3 * usual.level.system.residual_scale)
+    start = solutions(halves(1.0), 3)[-1]
+    assert start.iterations.newton == 0 and start.contact.kkt.residual > 1e-8
+    assert start.contact.kkt.force_error == np.inf  # not 0: no step has measured it
 
 
 def two_squares():
