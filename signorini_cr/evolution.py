@@ -18,7 +18,6 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from .arrays import FloatArray, summed
@@ -29,7 +28,7 @@ from .data.moments import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError, insist_on_count, insist_on_kind, raise_together
 from .fem.conditions import Data
-from .fem.problem import Problem, as_expression
+from .fem.problem import Problem, as_expression, functions_in
 from .levels import LevelMonitor, Start, check_arguments, solve_level
 from .limits import Limits
 from .mesh.balance import Refined
@@ -109,11 +108,11 @@ class Solver:
             self._hierarchy.add(*refined)
         self._carry_down()
         self._level = Level(self._hierarchy.meshes)
-        self._held = self._level.floating is None
+        self._has_dirichlet = self._level.floating is None
         system = self._level.system
         self._stack.callback(self._hierarchy.free)
         # what has served a single solve will not stay for many
-        again = self._held and self._solved != 1
+        again = self._has_dirichlet and self._solved != 1
         lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, again)
         self._cycle = self._stack.enter_context(lent)
         self._assembled, self._solved = self.physics.a.snapshot(), 0
@@ -182,10 +181,7 @@ class Solver:
                 another one.
             NotConverged: As for `solve`.
         """
-        own, start = self._of_this(source, before)
-        rates = np.asarray(rate, dtype=np.float64)
-        words = None if np.isfinite(rates).all() else "rate: numbers that are finite are needed"
-        raise_together(self.V.mesh.comm, words)
+        own, rates, start = self._of_this(source, rate, before)
         self._carry_down()
         operator, boundary = self._have_changed()
         if boundary:
@@ -199,28 +195,39 @@ class Solver:
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
         data = diffusion(self._level.data).renewed(own, rates)
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
-        level = Level((*meshes[:-1], renewed), self._held, self._level.system)
+        level = Level((*meshes[:-1], renewed), self._has_dirichlet, self._level.system)
         return solve_level(level, lambda _: nullcontext(self._cycle), start, monitor, {"mesh": 0.0})
 
     def _of_this(
-        self, source: fem.Function | None, before: Solution | fem.Function | None
-    ) -> tuple[FloatArray | None, Start]:
-        """Return the source's values, and the start, if this solver can do with them; collective.
+        self,
+        source: fem.Function | None,
+        rate: FloatArray | float,
+        before: Solution | fem.Function | None,
+    ) -> tuple[FloatArray | None, FloatArray, Start]:
+        """Copy the source's values and the rates, if this solver can do with them; collective.
+
+        Returns:
+            They, which may be other ones by the time that the solution is asked for its bound; and
+            the start.
 
         Raises:
-            InputError: They are not, or it is closed.
+            InputError: It can't, or it is closed.
         """
         if self._closed:
             raise InputError("the solver is closed, and what it had is freed")
         known = before.u if isinstance(before, Solution) else before
-        size = len(self._level.system.u_D.x.array)
+        size, comm = len(self._level.system.u_D.x.array), self._domain.mesh.comm
+        words = _unfit_rate(rate, diffusion(self._level.data).cells.number)
+        if len(set(comm.allgather(source is None))) > 1:
+            words = "source: a Function is given on some ranks, and none on others"
         for name, given in (("source", source), ("before", known)):
             if given is not None and not isinstance(given, fem.Function):
-                raise InputError(f"{name} is {given!r}; a dolfinx Function is needed")
-            another = given is not None and len(given.x.array) != size
-            if self._domain.mesh.comm.allreduce(another, op=MPI.LOR):
-                raise InputError(f"{name}: a Function on another mesh than that which is solved on")
-        return None if source is None else source.x.array, Start(known=known)
+                words = f"{name} is {given!r}; a dolfinx Function is needed"
+            elif given is not None and len(given.x.array) != size:
+                words = f"{name}: a Function on another mesh than that which is solved on"
+        raise_together(comm, words)
+        own = None if source is None else source.x.array.copy()
+        return own, np.array(rate, dtype=np.float64), Start(known=known)
 
     def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
         """Spread materials' numbers over owned cells, shape (cells,), or () if all are the same."""
@@ -245,12 +252,28 @@ class Solver:
                 raise InputError(
                     f"initial has the shape {expression.ufl_shape}; a scalar is needed"
                 )
+            for function in functions_in([expression]):
+                self._level.domain.carried(function)
             volume = Volume(expression, forms.mesh, rule)
             moments = chi(VolumeMoments.of(volume, on_mesh.cells), (), on_mesh.cells)
             sums.append(Layout.of_space(V).shared_sum(moments))
         # the matrix of products of CR's functions is diagonal for triangles
         found.x.array[:] = sums[0] / sums[1]
         return found
+
+
+def _unfit_rate(rate: object, cells: int) -> str | None:
+    """Say why something is no rate of a source on so many owned cells."""
+    try:
+        found = np.asarray(rate, dtype=np.float64)
+    except (TypeError, ValueError):
+        return f"rate is {rate!r}; a number is needed, or one for each owned cell"
+    if found.shape not in ((), (cells,)):
+        return (
+            f"rate has the shape {found.shape}; a number is needed, or one for each owned cell,"
+            f" ({cells},)"
+        )
+    return None if np.isfinite(found).all() else "rate: numbers that are finite are needed"
 
 
 def _given(levels: object, domain: Domain) -> tuple[list[Refined], int]:

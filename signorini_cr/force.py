@@ -124,7 +124,11 @@ def _corrected(
     known = [condition for condition in conditions if condition not in settled.free]
     if settled.mixed and known:
         return None
-    omega = None if weight is None else scalar(weight, diffusion(made.level.data).forms)
+    omega = (
+        None
+        if weight is None
+        else scalar(weight, diffusion(made.level.data).forms, made.level.domain)
+    )
     none: FloatArray = np.zeros((cells.tdim + 1, cells.number))
     found: _ByPhi | None = _ByPhi(0.0, 0.0, none, none)
     if known:

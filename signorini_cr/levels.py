@@ -27,7 +27,7 @@ from .vi.contact import contact_facts
 from .vi.floating import Floating
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
-from .vi.solver import Data, solve_vi
+from .vi.solver import SystemData, solve_vi
 from .vi.system import System
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
@@ -167,7 +167,7 @@ def solve_physics(
         for refined in restart.meshes(domain):
             level.tidy()
             hierarchy.add(*refined)
-            level = Level(hierarchy.meshes, held=level.floating is None)
+            level = Level(hierarchy.meshes, has_dirichlet=level.floating is None)
         start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:
@@ -179,7 +179,7 @@ def solve_physics(
             break
         level.tidy()
         hierarchy.add(*following)
-        level = Level(hierarchy.meshes, held=level.floating is None)
+        level = Level(hierarchy.meshes, has_dirichlet=level.floating is None)
         start = Start()
         if nested:
             start, before = Start(solution, before), solution.u
@@ -261,7 +261,7 @@ def solve_level(
             lend(system) as cycle,
             system.vectors(u, residual) as vectors,
         ):
-            data = Data(
+            data = SystemData(
                 row_sums=system.row_sums,
                 masses=system.masses,
                 rounding=system.data_rounding,

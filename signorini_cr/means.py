@@ -94,7 +94,9 @@ def _bounded(
         raise InputError(f"{NO_MEAN}: {AFLOAT}")
     cells = made.cells()
     _insist_on_extent(cells, place)
-    z = solved(_dual(forms, place, 1.0 if weight is None else scalar(weight, forms)), level)
+    z = solved(
+        _dual(forms, place, 1.0 if weight is None else scalar(weight, forms, level.domain)), level
+    )
     dual = certify(z, sweeps=0)
     if dual.energy is None or dual.bound_companion is None:
         z.level.tidy()
@@ -229,7 +231,7 @@ def _corrected(
     z.x.scatter_forward()
     facets = facets_of(domain, [*forms.fixed, *forms.bounded])
     marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, facets)] = 1.0
-    seen = shared_sum(cells.comm, V.dofmap.index_map, marks.x.array)
+    seen = shared_sum(domain.mesh, V.dofmap.index_map, marks.x.array)
     phi = extended(z, np.flatnonzero(seen > 0).astype(np.int32), made)
     with_phi = np.ascontiguousarray(phi.x.array[dofs].T)
     inside = np.ascontiguousarray(z.x.array[dofs].T) - with_phi
@@ -275,7 +277,7 @@ def _settled(
         return [(0.0, reach)] if np.isfinite(reach) else []
     if settled.held:
         forms = diffusion(made.level.data).forms
-        psi = 1.0 if weight is None else scalar(weight, forms)
+        psi = 1.0 if weight is None else scalar(weight, forms, made.level.domain)
         dual = certified(_dual(forms, where, psi, settled.held), made.level)
     of_z = in_p1(dual, cells)
     if of_z is None:

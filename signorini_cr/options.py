@@ -132,6 +132,10 @@ SMALL_FACTORS: dict[str, object] = {
 """Factors at the bottom of the cycle, on every rank."""
 
 
+class OptionRefused(InputError):
+    """PETSc does not take an option that was set, whatever it is that is to be solved."""
+
+
 def take(words: Sequence[str]) -> None:
     """Take the options under the prefix from a command line that PETSc has not seen.
 
@@ -200,12 +204,12 @@ def read(thing: PETSc.SNES | PETSc.KSP | PETSc.PC) -> None:
     """Let a solver read its options; collective.
 
     Raises:
-        InputError: PETSc does not know a type that was asked for, or cannot read a value.
+        OptionRefused: PETSc does not know a type that was asked for, or cannot read a value.
     """
     try:
         thing.setFromOptions()
     except PETSc.Error as error:
-        raise InputError(
+        raise OptionRefused(
             f"PETSc refuses an option that begins with -{thing.getOptionsPrefix()}: {_words(error)}"
         ) from error
 
@@ -288,7 +292,7 @@ def solve_once(
     """Solve A x = b by a solver that is made for it alone, from such defaults; collective.
 
     Raises:
-        InputError: PETSc does not know what was asked for.
+        OptionRefused: As for `read`.
     """
     ksp = PETSc.KSP().create(A.getComm())
     ksp.setOptionsPrefix(prefix)

@@ -20,7 +20,7 @@ from mpi4py import MPI
 from . import compat
 from .arrays import BoolArray, FloatArray, Int32Array
 from .errors import InputError
-from .fem.space import largest
+from .fem.space import shared_maximum
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine, refine_edges
@@ -208,7 +208,7 @@ def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places, Places]:
     index_map = topology.index_map(1)
     outer = np.zeros(index_map.size_local + index_map.num_ghosts)
     outer[exterior_facet_indices(topology)] = 1.0
-    of_boundary = largest(mesh.comm, index_map, outer)[edges] > 0.0
+    of_boundary = shared_maximum(mesh, index_map, outer)[edges] > 0.0
     corners = _corners(mesh)
     first, second = corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]
     middle, along = 0.5 * (first + second), second - first  # a + b is b + a exactly

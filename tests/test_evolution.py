@@ -23,6 +23,7 @@ from signorini_cr import (
     Solver,
     adapt_to_run,
     limits,
+    norms,
     solve,
     solve_adaptive,
     solve_in_time,
@@ -33,6 +34,8 @@ from signorini_cr.compat import cell_nodes
 pytestmark = pytest.mark.slow
 
 WORLD = MPI.COMM_WORLD
+
+HELD_ABOVE = {"floor": Contact(-0.1), "right": Neumann(), "top": Dirichlet(), "left": Neumann()}
 
 
 def clock(domain):
@@ -623,3 +626,69 @@ def test_what_was_found_before_time_ran_out_is_there(monkeypatch):
         for tried in adapt_to_run(run, max_time=4.5):
             found.append(len(tried.meshes))
     assert found == [0, 1]
+
+
+def test_functions_with_other_values_are_carried_anew():
+    """As weights, as what is projected and as initial values, on meshes that have seen them."""
+    domain = SQUARE.mesh(0.5)
+    k = fem.Function(fem.functionspace(domain.mesh, ("DG", 0)))
+    problem = Problem(f=-3.0, conditions=HELD_ABOVE)
+    *_, solution = solve_levels(problem, domain, 2)
+    of_one = solution.integral(weight=1.0), solution.flux("top", weight=1.0)
+    for value in (1.0, 2.0, -3.0):
+        k.x.array[:] = value
+        for weight in (k, lambda x: k * (1.0 + 0.0 * x[0])):
+            found = solution.integral(weight=weight), solution.flux("top", weight=weight)
+            for one, other in zip(of_one, found, strict=True):
+                assert other.value == pytest.approx(value * one.value, rel=1e-8)
+                ends = sorted((value * one.lower, value * one.upper))
+                assert [other.lower, other.upper] == pytest.approx(ends, rel=1e-5)
+    with Solver(problem, domain, levels=2) as solver:
+        for value in (1.0, 2.0):
+            k.x.array[:] = value
+            assert solver.projected(k).x.array == pytest.approx(value, rel=1e-12)
+        meshes = solver.refined
+
+    def means(initial):
+        run = solve_in_time(problem, domain, end=0.1, steps=2, initial=initial, levels=meshes)
+        return [solution.mean().value for _, solution in run]
+
+    for value in (0.0, 5.0):
+        k.x.array[:] = value
+        assert means(k) == pytest.approx(means(value), rel=1e-10)
+
+
+def test_sources_and_rates_are_those_of_their_solve():
+    """Bounds are asked for when both have other values; f = −3 with a source of 1 is −2."""
+    domain = SQUARE.mesh(0.5)
+    *_, wanted = solve_levels(Problem(f=-2.0, conditions=HELD_ABOVE), domain, 2)
+    with Solver(Problem(f=-3.0, conditions=HELD_ABOVE), domain, levels=2) as solver:
+        source = fem.Function(solver.V)
+        source.x.array[:] = 0.5
+        rate = np.full(solver.V.mesh.topology.index_map(2).size_local, 2.0)
+        found = solver.solve(source=source, rate=rate)
+        source.x.array[:], rate[:] = -7.0, 3.0
+        solver.solve(source=source)
+        assert found.certificate.energy == pytest.approx(wanted.certificate.energy, rel=1e-6)
+        assert found.certificate.bound_h1 == pytest.approx(wanted.certificate.bound_h1, rel=1e-6)
+        assert found.flux("top") == pytest.approx(wanted.flux("top"), rel=1e-6)
+        wrong = np.ones(len(rate) + 3) if WORLD.rank == 0 else rate
+        with pytest.raises(InputError, match="rate has the shape"):
+            solver.solve(source=source, rate=wrong)
+        with pytest.raises(InputError, match="source is 3; a dolfinx Function is needed"):
+            solver.solve(source=3 if WORLD.rank == 0 else source)
+        if WORLD.size > 1:
+            with pytest.raises(InputError, match="given on some ranks, and none on others"):
+                solver.solve(source=source if WORLD.rank == 0 else None)
+
+
+def test_errors_of_another_degree_are_those_of_their_time():
+    domain = SQUARE.mesh(0.5)
+    t = clock(domain)
+    problem = Problem(
+        f=0.0, exact=lambda x: t * x[0] * x[1] ** 2, conditions=HELD_ABOVE, error_degree=8
+    )
+    run = [s for _, s in solve_in_time(problem, domain, end=1.0, steps=2, time=t)]
+    wanted = [solution.errors for solution in run]
+    t.value = 77.0
+    assert [norms.errors(solution, 8) for solution in run] == pytest.approx(wanted, rel=1e-12)

@@ -116,3 +116,16 @@ def test_a_misspelt_option_is_told(tmp_path):
     result = run(tmp_path, "-signorini_snes_monitr")
     assert result.returncode == 0
     assert "name:-signorini_snes_monitr" in result.stdout + result.stderr
+
+
+@pytest.mark.serial
+def test_an_option_that_petsc_refuses_ends_the_run(tmp_path):
+    """That of the bounds' linear systems as well, which come after u_h: no bounds were told."""
+    (tmp_path / "case.toml").write_text(
+        "[domain]\nvertices = [[0, 0], [1, 0], [1, 1], [0, 1]]\nsize = 0.5\n"
+        'boundary = ["contact", "neumann", "dirichlet", "neumann"]\n[data]\nf = "-2 - x"\n'
+    )
+    for name in ("signorini_bottom_pc_type", "signorini_estimate_ksp_type"):
+        done = command("solve", "case.toml", "--out", "out", f"-{name}", "foo", cwd=tmp_path)
+        assert done.returncode == 2 and "PETSc refuses an option" in done.stderr, done.stdout
+        assert not (tmp_path / "out" / "report.json").exists()

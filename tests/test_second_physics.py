@@ -175,7 +175,7 @@ class Coupled:
         np.add.at(sums, nodes, local)
         np.add.at(count, nodes, 1.0)
         for each in (sums, count):
-            shared_sum(mesh.comm, p1.index_map, each.ravel(), 2)
+            shared_sum(mesh, p1.index_map, each.ravel(), 2)
         away = local - (sums / count)[nodes]
         x = mesh.geometry.x[compat.cell_nodes(mesh)[: len(local)], :2]
         edges = x[:, 1:] - x[:, :1]

@@ -19,7 +19,7 @@ from ..mesh.domain import Domain
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
 from .pointwise import evaluate
 
-Found = tuple[FloatArray, FloatArray]
+Values = tuple[FloatArray, FloatArray]
 """Values at points, and what rounding may have done to them."""
 
 ENOUGH = 1e-6
@@ -174,7 +174,7 @@ class _Solution:
         words += ("above" if sign > 0 else "below") + " it by {:.6g}"
         return said or self._first(apart, x, words, pressure, gap)
 
-    def _same(self, key: str, x: FloatArray, given: Found, wanted: Found) -> str | None:
+    def _same(self, key: str, x: FloatArray, given: Values, wanted: Values) -> str | None:
         gap = _difference(given, wanted)
         wrong = np.abs(gap[0]) > ENOUGH * self._size(given, wanted) + gap[1]
         words = f"{key} is {{:.6g}}, but it asks for {{:.6g}}"
@@ -186,7 +186,7 @@ class _Solution:
         corners, _ = facet_measures(self.mesh, self.domain.facets(part))
         return corners.mean(axis=1), entities[:, 0], facet_normals(self.mesh, entities)
 
-    def _values(self, e: Any, x: FloatArray, cells: Int32Array) -> Found:
+    def _values(self, e: Any, x: FloatArray, cells: Int32Array) -> Values:
         """Evaluate an expression at points; what can't be told is nan."""
         found = evaluate(e, x, self.precision, cells)
         if found is None:
@@ -194,7 +194,7 @@ class _Solution:
             return np.full(shape, np.nan), np.full(shape, np.nan)
         return found[0], SAFETY * found[1]
 
-    def _flux(self, where: Condition, x: FloatArray, cells: Int32Array, n: FloatArray) -> Found:
+    def _flux(self, where: Condition, x: FloatArray, cells: Int32Array, n: FloatArray) -> Values:
         """Evaluate κ∂ₙu + b u."""
         if self.slope is None:
             found = np.zeros(len(x)), np.zeros(len(x))
@@ -206,13 +206,13 @@ class _Solution:
             return found
         return _difference(found, self._values(-where.loss * self.u, x, cells))
 
-    def _size(self, *found: Found) -> float:
+    def _size(self, *found: Values) -> float:
         """Find the largest value on any rank."""
         values = np.concatenate([np.abs(each[0]) for each in found])
         largest = float(values[np.isfinite(values)].max(initial=0.0))
         return float(self.mesh.comm.allreduce(largest, op=MPI.MAX))
 
-    def _first(self, wrong: BoolArray, x: FloatArray, words: str, *found: Found) -> str | None:
+    def _first(self, wrong: BoolArray, x: FloatArray, words: str, *found: Values) -> str | None:
         complaints: list[Complaint] = []
         for i in np.flatnonzero(wrong):
             where = place(x[i], self.mesh)
@@ -221,5 +221,5 @@ class _Solution:
         return first(self.mesh.comm, complaints)
 
 
-def _difference(a: Found, b: Found) -> Found:
+def _difference(a: Values, b: Values) -> Values:
     return a[0] - b[0], a[1] + b[1]

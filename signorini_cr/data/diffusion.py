@@ -182,7 +182,7 @@ class DiffusionOnMesh:
         self.compiled, self.forms, self.domain = compiled, compiled.forms, domain
         self.V: fem.FunctionSpace
         if earlier is None:
-            self.forms.insist_on_data(domain)
+            self.forms.carry_data(domain)
             if self.forms.problem.form is None and isinstance(compiled.kappa, Tensor):
                 check_symmetry(compiled.kappa, domain)
             self.V = function_space(domain.mesh, self.forms.element)

@@ -264,7 +264,7 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
     for each in (conditions, others):
         marks.x.array[:] = 0.0
         marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, each))] = 1.0
-        seen = shared_sum(mesh.comm, V.dofmap.index_map, marks.x.array)
+        seen = shared_sum(mesh, V.dofmap.index_map, marks.x.array)
         parts.append(np.flatnonzero(seen > 0).astype(np.int32))
     chosen, rest = parts
     both, zeros = mesh.comm.allreduce(np.array([len(np.intersect1d(chosen, rest)), len(rest)]))

@@ -70,7 +70,7 @@ def nearest(
     held = np.zeros_like(b.x.array)
     held[dofs[: d + 1][~free_vertices[vertices]]] = 1.0
     held[dofs[d + 1 :][~free_facets[facets]]] = 1.0
-    shared_maximum(V, held)
+    shared_maximum(mesh, V.dofmap.index_map, held)
     fixed = np.flatnonzero(held > 0.0).astype(np.int32)
     # A nodal function of a vertex is λ_i less half the bumps of the two facets it belongs to
     pull = slopes.facets[:, patch]

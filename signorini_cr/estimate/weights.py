@@ -22,8 +22,9 @@ from ..data.pieces import Pieces
 from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
 from ..fem.conditions import Condition, Data, facets_of
-from ..fem.problem import Forms, as_expression
+from ..fem.problem import Forms, as_expression, functions_in
 from ..fem.space import function_space, shared_sum
+from ..mesh.domain import Domain
 from .certificate import Made
 from .lifting import JUMP, Cubic, Lift, lift
 
@@ -92,14 +93,14 @@ class Weight:
             InputError: It is no scalar, or not 0 where the parts meet the rest of Γ0 and Γ1.
         """
         domain, data = cells.domain, diffusion(made.level.data)
-        trace = data.compiled.trace(scalar(weight, data.forms))
+        trace = data.compiled.trace(scalar(weight, data.forms, domain))
         parts = OnParts.of([OnFacets.of(each, trace, domain) for each in conditions], cells)
         V, side, ends = function_space(domain.mesh, "P1"), parts.side, parts.ends
         own = V.dofmap.list[side.cells[:, None], cells.others[side.local]].T
         values, marks = fem.Function(V), fem.Function(V)
         for function, amounts in ((values, ends), (marks, np.ones_like(ends))):
             np.add.at(function.x.array, own, amounts)
-            shared_sum(domain.mesh.comm, V.dofmap.index_map, function.x.array)
+            shared_sum(domain.mesh, V.dofmap.index_map, function.x.array)
         chosen = marks.x.array > 0.0
         values.x.array[chosen] /= marks.x.array[chosen]
         known = (*conditions, *free)
@@ -108,7 +109,7 @@ class Weight:
         )
         marks.x.array[:] = 0.0
         marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, others)] = 1.0
-        rest = shared_sum(domain.mesh.comm, V.dofmap.index_map, marks.x.array) > 0.0
+        rest = shared_sum(domain.mesh, V.dofmap.index_map, marks.x.array) > 0.0
         found = [np.ravel(row) for p in parts.parts for row in (p.ends, p.middle, p.inside)]
         seen = np.concatenate(found or [np.zeros(0)])
         largest = float(np.abs(seen[np.isfinite(seen)]).max(initial=0.0))
@@ -167,8 +168,13 @@ class Weight:
         )
 
 
-def scalar(weight: Data, forms: Forms) -> ufl.core.expr.Expr:
+def scalar(weight: Data, forms: Forms, domain: Domain) -> ufl.core.expr.Expr:
     """Write a weight as an expression in the coordinates of the mesh that the forms are on.
+
+    Args:
+        weight: The weight.
+        forms: The forms.
+        domain: Where it will be asked for; collective, as what it holds is carried there.
 
     Raises:
         InputError: It is no scalar, or on another mesh.
@@ -178,6 +184,8 @@ def scalar(weight: Data, forms: Forms) -> ufl.core.expr.Expr:
         raise InputError(f"the weight has the shape {found.ufl_shape}; a scalar is needed")
     if any(each != forms.mesh.ufl_domain() for each in ufl.domain.extract_domains(found)):
         raise InputError("the weight is given on another mesh than the data")
+    for function in functions_in([found]):
+        domain.carried(function)
     return found
 
 

@@ -21,7 +21,7 @@ from scipy.sparse import csc_array
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import DIRICHLET, Domain, Refinement
-from .space import facet_entities, largest, shared_sum
+from .space import facet_entities, shared_maximum, shared_sum
 from .space import measures as simplex_measures
 
 BLOCK = 1 << 15
@@ -447,7 +447,7 @@ class Cells:
         """Sum the ranks' shares of facet dofs, or of vertices (``dim`` = 0), in place."""
         topology = self.domain.mesh.topology
         index_map = self.V.dofmap.index_map if dim is None else topology.index_map(dim)
-        return shared_sum(self.comm, index_map, values)
+        return shared_sum(self.domain.mesh, index_map, values)
 
     def largest_at_vertices(self, ends: IndexArray, values: FloatArray) -> FloatArray:
         """Find the largest value that any rank's facets give each vertex, with ghosts; collective.
@@ -462,7 +462,7 @@ class Cells:
         index_map = self.domain.mesh.topology.index_map(0)
         found: FloatArray = np.full(index_map.size_local + index_map.num_ghosts, -np.inf)
         np.maximum.at(found, ends, values)
-        return largest(self.comm, index_map, found)
+        return shared_maximum(self.domain.mesh, index_map, found)
 
     @cached_property
     def between(self) -> IndexArray:

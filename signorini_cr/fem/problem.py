@@ -318,7 +318,7 @@ def _constants_in(data: Iterable[Expr]) -> dict[fem.Constant, None]:
     return {e: None for each in data for e in ufl.algorithms.analysis.extract_constants(each)}
 
 
-def _functions_in(data: Iterable[Expr]) -> dict[fem.Function, None]:
+def functions_in(data: Iterable[Expr]) -> dict[fem.Function, None]:
     """Collect the Functions in expressions, each once."""
     return {e: None for each in data for e in ufl.algorithms.extract_coefficients(each)}
 
@@ -492,19 +492,19 @@ class Forms:
         u, v = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
         return Kernel(self._bilinear(u, v), self.mesh)
 
-    def insist_on_data(self, domain: Domain) -> None:
-        """Refuse a mesh on which the data are not to be had.
+    def carry_data(self, domain: Domain) -> None:
+        """Carry the Functions in the data to a mesh, with the values they have now; collective.
 
         Raises:
             InputError: The data hold a Function on another mesh that can't be carried to this one.
         """
         for function in self.functions:
-            domain.own(function)
+            domain.carried(function)
 
     @cached_property
     def functions(self) -> list[fem.Function]:
         """The Functions that the data hold, each once."""
-        found = _functions_in(self._data.values())
+        found = functions_in(self._data.values())
         if self.problem.form is not None:
             for kernel in (self.a, self.own_load):
                 found |= dict.fromkeys([] if kernel is None else kernel.own)
@@ -527,7 +527,7 @@ class Forms:
 
     def snapshot_of_holding(self) -> Snapshot:
         """Note what Constants and Functions in these are at present, on the coarsest mesh."""
-        return Snapshot(list(_constants_in(self.holding)), _functions_in(self.holding))
+        return Snapshot(list(_constants_in(self.holding)), functions_in(self.holding))
 
     def snapshot(self, domains: Sequence[Domain]) -> Snapshot:
         """Note what the Constants and Functions are at present, on some meshes."""

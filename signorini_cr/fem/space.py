@@ -6,7 +6,9 @@ facet's midpoint, which is its mean over the facet.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import basix
 import basix.ufl
@@ -19,8 +21,14 @@ from petsc4py import PETSc
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes, facet_vertices
 from ..errors import InputError
+from ..garbage import release
 
 ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
+
+KEPT = 8
+"""For so many index maps of a mesh it is kept how its ranks share them, see `shared_sum`."""
+
+_exchanges: WeakKeyDictionary[Mesh, OrderedDict[tuple[Any, int], PETSc.Vec]] = WeakKeyDictionary()
 
 
 def ufl_element(mesh: Mesh, element: str) -> Any:
@@ -198,21 +206,47 @@ def ghosted_vector(V: fem.FunctionSpace, array: FloatArray) -> PETSc.Vec:
     return ghosted(V.mesh.comm, V.dofmap.index_map, array, V.dofmap.index_map_bs)
 
 
-def shared_sum(comm: MPI.Comm, index_map: Any, array: FloatArray, block: int = 1) -> FloatArray:
-    """Sum up, in place, what the ranks have for each shared entity.
+def shared_sum(mesh: Mesh, index_map: Any, array: FloatArray, block: int = 1) -> FloatArray:
+    """Sum up, in place, what the ranks have for each shared entity; collective.
 
     Args:
-        comm: The ranks.
-        index_map: How they share the entities.
+        mesh: The mesh.
+        index_map: How its ranks share the entities.
         array: The numbers of each local entity, ghosts included.
         block: How many numbers an entity has.
     """
-    if comm.size > 1:
-        vector = ghosted(comm, index_map, array, block)
-        vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
-        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-        vector.destroy()
+    _gather(mesh, index_map, array, block, PETSc.InsertMode.ADD_VALUES)
     return array
+
+
+def shared_maximum(mesh: Mesh, index_map: Any, array: FloatArray, block: int = 1) -> FloatArray:
+    """Find, in place, the largest of what ranks have for each shared entity; see `shared_sum`."""
+    _gather(mesh, index_map, array, block, PETSc.InsertMode.MAX_VALUES)
+    return array
+
+
+def _gather(mesh: Mesh, index_map: Any, array: FloatArray, block: int, mode: Any) -> None:
+    """Gather what ranks have for each shared entity at its owner's, and hand out what comes of it.
+
+    To find out who has what of whom takes a dozen collective calls, in each of which all ranks wait
+    for the last one; so it is kept for the index maps that a mesh was asked for last.
+    """
+    if mesh.comm.size == 1:
+        return
+    kept, key = _exchanges.setdefault(mesh, OrderedDict()), (index_map, block)
+    if key not in kept:
+        if len(kept) == KEPT:
+            release(kept.popitem(last=False)[1])
+        kept[key] = ghosted(mesh.comm, index_map, np.empty(len(array)), block)
+    kept.move_to_end(key)
+    vector = kept[key]
+    # petsc4py wants the owned part alone, but the ghosts behind it are put in place as well
+    vector.placeArray(array[: vector.getLocalSize()])
+    try:
+        vector.ghostUpdate(mode, PETSc.ScatterMode.REVERSE)
+        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+    finally:
+        vector.resetArray()
 
 
 def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
@@ -220,18 +254,3 @@ def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:
     facet = basix.cell.subentity_types(mesh.basix_cell())[-2][0]
     points, weights = basix.make_quadrature(facet, degree)
     return points, weights / weights.sum()
-
-
-def shared_maximum(V: fem.FunctionSpace, array: FloatArray) -> None:
-    """Give every copy of a shared dof, in place, the largest value any rank has for it."""
-    largest(V.mesh.comm, V.dofmap.index_map, array, V.dofmap.index_map_bs)
-
-
-def largest(comm: MPI.Comm, index_map: Any, array: FloatArray, block: int = 1) -> FloatArray:
-    """Find, in place, the largest of what ranks have for each shared entity; see `shared_sum`."""
-    if comm.size > 1:
-        vector = ghosted(comm, index_map, array, block)
-        vector.ghostUpdate(PETSc.InsertMode.MAX_VALUES, PETSc.ScatterMode.REVERSE)
-        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-        vector.destroy()
-    return array

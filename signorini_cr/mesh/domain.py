@@ -165,17 +165,23 @@ class Domain:
         return {}
 
     def own(self, function: fem.Function) -> fem.Function:
+        """Return a function of this mesh for one of a coarser mesh, as `carried` has made it last.
+
+        Collective where it has not.
+        """
+        return self._own[function] if function in self._own else self.carried(function)
+
+    def carried(self, function: fem.Function) -> fem.Function:
         """Carry a function that is constant on each cell of a coarser mesh to this one; collective.
 
         Args:
-            function: Of degree 0, on this mesh or on one that it was refined from.
+            function: Of degree 0, on this mesh or on one that it was refined from. What it is
+                counts: whoever begins to work with it has its values carried anew.
 
         Raises:
             InputError: It is of another degree, or on another mesh.
         """
         V = function.function_space
-        if function in self._own:
-            return self._own[function]
         if V.mesh is self.mesh:
             return function
         above = [i for i, step in enumerate(self.descent) if step.mesh() is V.mesh]
@@ -187,9 +193,11 @@ class Domain:
         values = get_by_cells(function)
         for step in self.descent[above[0] :]:
             values = step.carry(values)
-        fine = fem.Function(fem.functionspace(self.mesh, V.ufl_element()), name=function.name)
+        fine = self._own.get(function)
+        if fine is None:
+            V_fine = fem.functionspace(self.mesh, V.ufl_element())
+            fine = self._own[function] = fem.Function(V_fine, name=function.name)
         set_by_cells(fine, values)
-        self._own[function] = fine
         return fine
 
     def instead(self, function: fem.Function) -> fem.Function:

@@ -308,7 +308,7 @@ def read(
                 "this describes a domain and is no mesh yet; `gmsh -2 "
                 f"{path.name}` makes {path.stem}.msh of it, which is needed here"
             )
-        return _read(mshfile.load(path), parts, needed, materials)
+        return _read(mshfile.read(path), parts, needed, materials)
 
 
 def _read(

@@ -236,7 +236,7 @@ class _Binary:
         return self.numbers(rows * columns, kind).reshape(rows, columns)
 
 
-def load(path: Path) -> MshFile:
+def read(path: Path) -> MshFile:
     """Read a mesh file.
 
     Args:

@@ -22,7 +22,7 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.physics import Imposed
-from ..fem.space import facet_corners, facet_entities, function_space, shared_sum
+from ..fem.space import facet_corners, facet_entities, function_space, shared_maximum, shared_sum
 from ..mesh.exchange import Exchange
 
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
@@ -104,7 +104,11 @@ class Layout:
 
     def shared_sum(self, array: FloatArray) -> FloatArray:
         """Sum up, in place, what the ranks have for each shared dof."""
-        return shared_sum(self.mesh.comm, self.index_map, array, self.block)
+        return shared_sum(self.mesh, self.index_map, array, self.block)
+
+    def shared_maximum(self, array: FloatArray) -> FloatArray:
+        """Find, in place, the largest of what the ranks have for each shared dof."""
+        return shared_maximum(self.mesh, self.index_map, array, self.block)
 
 
 class Parents:

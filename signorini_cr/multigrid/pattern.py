@@ -35,8 +35,8 @@ def empty_matrix(dofs: Layout) -> PETSc.Mat:
         there = cells[np.unique(np.flatnonzero(cells.ravel() >= owned) // (d + 1))]
         apart = owner[there][:, :, None] != owner[there][:, None, :]
         np.add.at(outside, there, apart.sum(axis=2))
-        inside = shared_sum(comm, dofs.index_map, inside - outside)
-        shared_sum(comm, dofs.index_map, outside)
+        inside = shared_sum(dofs.mesh, dofs.index_map, inside - outside)
+        shared_sum(dofs.mesh, dofs.index_map, outside)
 
     def lengths(entries: FloatArray, columns: int) -> IndexArray:
         """Count for each unknown; PETSc refuses more than there are columns."""

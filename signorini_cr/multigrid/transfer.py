@@ -222,4 +222,4 @@ def _sums(layout: Layout, values: FloatArray) -> FloatArray:
     vector.setValues(dofs, values, PETSc.InsertMode.ADD_VALUES)
     vector.assemble()
     vector.destroy()
-    return shared_sum(layout.mesh.comm, layout.index_map, result)
+    return shared_sum(layout.mesh, layout.index_map, result)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import io
-import os
 import textwrap
 from collections import defaultdict
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..arrays import FloatArray
-from .files import disk_errors
+from .files import Where, disk_errors
 from .units import PLAIN, Units
 
 if TYPE_CHECKING:
@@ -27,8 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.transforms import Transform
-
-Where = str | os.PathLike[str]
 
 # Told apart by colour-blind eyes and in grey
 BLUE, RED, YELLOW, GREY = "#004488", "#BB5566", "#DDAA33", "#777777"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from mpi4py import MPI
 from ..errors import InputError, on_root
 from ..reading import insist_on_end
 from ..restart import Restart
-from .files import disk_errors
+from .files import Where, disk_errors
 
 NAME, MOMENTS = "restart.npz", "moments.npz"
 
@@ -49,9 +48,7 @@ def write_checkpoint(path: Path, restart: Restart, facts: dict[str, Any], comm: 
     on_root(comm, write)
 
 
-def read_checkpoint(
-    folder: str | os.PathLike[str], comm: MPI.Comm
-) -> tuple[Restart, dict[str, Any]] | None:
+def read_checkpoint(folder: Where, comm: MPI.Comm) -> tuple[Restart, dict[str, Any]] | None:
     """Read the file of a folder; collective.
 
     Returns:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 
 from .. import compat
@@ -12,9 +10,8 @@ from ..fem.space import facet_measures
 from ..rounding import at_most
 from ..solution import Solution
 from .canvas import RED, chains, draw_lines, headline, legend, log_ticks, plane_axes, save
+from .files import Where
 from .touching import contact_lines
-
-Where = str | os.PathLike[str]
 
 
 def plot_error(solution: Solution, path: Where, title: str = "") -> None:

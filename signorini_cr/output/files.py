@@ -14,6 +14,9 @@ from mpi4py import MPI
 
 from ..errors import InputError, on_root
 
+Where = str | os.PathLike[str]
+"""A path."""
+
 Writer = Callable[[Path], object]
 """Writes one file; called on every rank, and raises on every rank if at all."""
 
@@ -31,7 +34,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def check_writable(
-    folder: str | os.PathLike[str], names: Iterable[str] = (), comm: MPI.Comm = MPI.COMM_WORLD
+    folder: Where, names: Iterable[str] = (), comm: MPI.Comm = MPI.COMM_WORLD
 ) -> None:
     """Raise InputError on all ranks if files could not be put into a folder; leave no trace.
 
@@ -67,7 +70,7 @@ def check_writable(
 
 
 def write_files(
-    folder: str | os.PathLike[str],
+    folder: Where,
     writers: Mapping[str, Writer],
     removed: Iterable[str] = (),
     comm: MPI.Comm = MPI.COMM_WORLD,

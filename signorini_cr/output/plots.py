@@ -10,7 +10,6 @@ None elsewhere, and a notebook shows it.
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -51,6 +50,7 @@ from .canvas import (
     short_numbers,
 )
 from .contactpage import contact_page
+from .files import Where
 from .raster import averaged, raster
 from .touching import contact_lines, in_words
 from .units import PLAIN
@@ -62,8 +62,6 @@ if TYPE_CHECKING:
 
     from ..fem.problem import Problem
     from ..solution import Solution
-
-Where = str | os.PathLike[str]
 
 STYLES: dict[int, dict[str, Any]] = {
     DIRICHLET: {"color": BLUE, "linewidth": 2.5, "label": r"$\Gamma_0$: Dirichlet"},

@@ -11,7 +11,6 @@ import functools
 import importlib.metadata
 import json
 import math
-import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -30,8 +29,9 @@ from ..estimate.certificate import SHARES
 from ..estimate.force import NO_BOUNDS
 from ..means import NO_MEAN
 from ..memory import ran_out_of_memory
+from ..options import OptionRefused
 from . import checkpoint, plots
-from .files import Writer, write_files, write_text
+from .files import Where, Writer, write_files, write_text
 from .strip import Moment, plot_strip
 from .tables import contact_csv, levels_csv, markdown_table
 from .tables import table_header as table_header
@@ -156,6 +156,8 @@ def _bounded(solution: Solution, what: Quantity | None) -> Record:
             return {**what.of(solution)._asdict(), "reason": None}
         lower, upper = solution.force_bounds()
         return {"lower": lower, "upper": upper, "reason": None}
+    except OptionRefused:  # is no matter of this figure
+        raise
     except InputError as error:
         value = {} if what is None else {"value": None}
         reason = str(error).removeprefix(f"{NO_BOUNDS}: ").removeprefix(f"{NO_MEAN}: ")
@@ -213,7 +215,7 @@ def plain(value: Any) -> Any:
 
 
 def write_levels(
-    folder: str | os.PathLike[str],
+    folder: Where,
     report: Record,
     solution: Solution,
     restart: Restart,
@@ -246,14 +248,14 @@ def write_levels(
     return list(writers)
 
 
-def of_former_runs(folder: str | os.PathLike[str], comm: MPI.Comm) -> set[str]:
+def of_former_runs(folder: Where, comm: MPI.Comm) -> set[str]:
     """Find the names of what runs leave, in time or not; collective."""
     found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
     return {*FILES, *found}
 
 
 def write_output(
-    folder: str | os.PathLike[str],
+    folder: Where,
     report: Record,
     solution: Solution,
     pictures: bool = True,

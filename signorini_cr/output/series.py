@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from mpi4py import MPI
 from ..errors import on_root
 from ..rounding import at_most, counted, interval, known
 from . import checkpoint
-from .files import Writer, write_files, write_text
+from .files import Where, Writer, write_files, write_text
 from .meanings import OF_STEPS
 from .report import FIELDS, bounded, energy_bounds, of_former_runs, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
@@ -213,7 +212,7 @@ def is_kept(step: int) -> bool:
     return step % (1 + step // 200) == 0
 
 
-def write_step(folder: str | os.PathLike[str], step: int, solution: Solution) -> None:
+def write_step(folder: Where, step: int, solution: Solution) -> None:
     """Write a step's field; collective.
 
     Args:
@@ -229,7 +228,7 @@ def write_step(folder: str | os.PathLike[str], step: int, solution: Solution) ->
 
 
 def write_search(
-    folder: str | os.PathLike[str],
+    folder: Where,
     report: Mapping[str, Any],
     restart: Restart,
     said: Mapping[str, Any],
@@ -259,7 +258,7 @@ def write_search(
 
 
 def write_steps(
-    folder: str | os.PathLike[str],
+    folder: Where,
     report: Mapping[str, Any],
     solution: Solution,
     restart: Restart,
@@ -303,7 +302,7 @@ def write_steps(
     write_files(folder, writers, removed=removed, comm=comm)
 
 
-def read_moments(folder: str | os.PathLike[str], comm: MPI.Comm) -> list[Moment]:
+def read_moments(folder: Where, comm: MPI.Comm) -> list[Moment]:
     """Read the moments of a run that is resumed; collective.
 
     Raises:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
@@ -26,6 +25,7 @@ from .canvas import (
     save,
     short_numbers,
 )
+from .files import Where
 from .raster import averaged, raster
 from .touching import contact_lines, in_words
 from .units import PLAIN, Units
@@ -105,7 +105,7 @@ def moment(time: float, solution: Solution) -> Moment:
 
 def plot_strip(
     moments: Sequence[Moment],
-    path: str | os.PathLike[str] | None = None,
+    path: Where | None = None,
     title: str = "",
     units: Units = PLAIN,
 ) -> Figure:

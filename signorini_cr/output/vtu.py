@@ -28,7 +28,7 @@ from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root, raise_together
 from ..fem.space import facet_corners, facet_entities, vertex_values
-from .files import disk_errors
+from .files import Where, disk_errors
 
 if TYPE_CHECKING:
     from ..solution import Solution
@@ -48,7 +48,7 @@ TAIL = "</Piece></UnstructuredGrid>\n</VTKFile>\n"
 Fields = Mapping[str, npt.NDArray]
 
 
-def write_vtu(u: fem.Function, path: str | os.PathLike[str], name: str = "u") -> None:
+def write_vtu(u: fem.Function, path: Where, name: str = "u") -> None:
     """Write a CR or P1 function as a piecewise affine field; collective.
 
     Args:
@@ -65,7 +65,7 @@ def write_vtu(u: fem.Function, path: str | os.PathLike[str], name: str = "u") ->
     _write(mesh.comm, Path(path), [x], {name: vertex_values(u, owned).ravel()}, {})
 
 
-def write_solution(solution: Solution, path: str | os.PathLike[str]) -> None:
+def write_solution(solution: Solution, path: Where) -> None:
     """Write u_h and what is known about it; collective.
 
     At the corners of each cell, and of each facet of Γ1: `u`, and `companion`, the vertex values

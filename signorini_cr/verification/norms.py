@@ -32,6 +32,8 @@ def rates(h: Sequence[float], errors: Sequence[float]) -> FloatArray:
 def errors(solution: Solution, degree: int) -> tuple[float, float]:
     """Compute `Solution.errors` with a quadrature of another degree; collective.
 
+    What u depends on, as the time, is what it was when the solution was made.
+
     Returns:
         ‖u − u_h‖_h in the broken norm (1.6) and ‖u − u_h‖ in L2.
     """
@@ -43,7 +45,8 @@ def errors(solution: Solution, degree: int) -> tuple[float, float]:
         solution.domain.parts,
         solution.domain.materials,
     )
-    return forms.errors(solution.domain, solution.u)
+    with solution.level.as_made():
+        return forms.errors(solution.domain, solution.u)
 
 
 def pressure_error(solution: Solution, pressure: Data, degree: int = 12) -> float:

@@ -1,11 +1,11 @@
-"""Which dofs the obstacle holds, for everyone who asks.
+"""Which dofs the obstacle holds, for everyone who asks: all rules are here.
 
-While it solves SNES decides, and `ActiveSet.without` takes that over. `ActiveSet.of` is the same
-criterion for an iterate as it is, `ReducedSystem.indicator` for one as CG sees it coming: the three
-must agree. Two go on from such a set by other rules: `ReducedSolver`, where the primal-dual method
-goes round in circles, holds what is on its bound; `Extended` moves single dofs to the other side
-where double precision does not tell. Who knows a solution only by its gaps and forces goes by
-`touching`. From dofs to facets leads `contact_facts`.
+It is one criterion, that of the primal-dual method: active is what force − A_ii gap > 0. While it
+solves SNES decides, and `ActiveSet.without` takes that over; `ActiveSet.of` is the same for an
+iterate as it is, and `ActiveSet.indicator` for the solution of a reduced system, where forces are
+on active dofs and gaps on others alone. Who knows a solution only by its gaps and forces goes by
+`touching`. One rule is another: `ActiveSet.on_bounds`, where the primal-dual method goes round in
+circles. From dofs to facets leads `contact_facts`.
 """
 
 from __future__ import annotations
@@ -62,6 +62,25 @@ class ActiveSet:
         return cls(bounded, (gap <= 0.0) & (force > 0.0))
 
     @classmethod
+    def none(cls, bounded: Int32Array) -> ActiveSet:
+        """Take none of them."""
+        return cls(bounded, np.zeros(len(bounded), dtype=bool))
+
+    @classmethod
+    def on_bounds(cls, bounded: Int32Array, gap: FloatArray, freed: int | None) -> ActiveSet:
+        """Hold what is on its bound, whatever the force, as the primal method does.
+
+        Args:
+            bounded: Owned dofs with a bound, local numbers, ascending, shape (n,).
+            gap: u − α there, shape (n,).
+            freed: The place of one that is let go.
+        """
+        mask = gap <= 0.0
+        if freed is not None:
+            mask[freed] = False
+        return cls(bounded, mask)
+
+    @classmethod
     def without(
         cls, bounded: Int32Array, inactive: npt.NDArray[np.integer], first: int
     ) -> ActiveSet:
@@ -83,3 +102,16 @@ class ActiveSet:
     def dofs(self) -> Int32Array:
         """The active dofs, local numbers, ascending."""
         return self.bounded[self.mask]
+
+    def indicator(self, force: FloatArray, gap: FloatArray) -> FloatArray:
+        """Return forces on active dofs and minus gaps on others: what is above 0 is to be active.
+
+        Args:
+            force: A u − b in the bounded dofs, shape (n,).
+            gap: u − α there, or A_ii times that, shape (n,).
+        """
+        return np.where(self.mask, force, -gap)
+
+    def exchanged(self, force: FloatArray, gap: FloatArray) -> ActiveSet:
+        """Return the set that the solution in this one asks for; see `indicator`."""
+        return ActiveSet(self.bounded, self.indicator(force, gap) > 0.0)

@@ -150,11 +150,11 @@ class Extended:
         """
         for _ in range(SETS):
             left = self._refine(share)
-            mask = self._wanted()
-            wrong = self._misclassified(mask)
+            wanted = self.active.exchanged(self._pushes(), self._gap())
+            wrong = self._misclassified(wanted)
             if wrong.sum() <= share * self._bottom:
                 return left + wrong
-            self.active = ActiveSet(self.active.bounded, mask)
+            self.active = wanted
         if wrong.sum() <= TOUCHING * self._flow():
             return left + wrong
         raise NotConverged(f"no active set is that of its own solution, of {SETS} tried")
@@ -210,17 +210,12 @@ class Extended:
         """Return the forces on active dofs, 0 on others, shape (n,)."""
         return np.where(self.active.mask, self._pushes(), 0.0)
 
-    def _wanted(self) -> BoolArray:
-        """Find which dofs are to be active."""
-        wanted: BoolArray = np.where(self.active.mask, self._pushes() > 0.0, self._gap() < 0.0)
-        return wanted
-
-    def _misclassified(self, wanted: BoolArray) -> FloatArray:
+    def _misclassified(self, wanted: ActiveSet) -> FloatArray:
         """Sum the forces that are to go, or come, with another active set, by class; collective."""
         pulls = np.maximum(-self._pushes(), 0.0)
         missing = self._operator.diagonal * np.maximum(-self._gap(), 0.0)
         wrong = np.where(self.active.mask, pulls, missing)
-        return self._stiffness.totals(np.where(wanted != self.active.mask, wrong, 0.0))
+        return self._stiffness.totals(np.where(wanted.mask != self.active.mask, wrong, 0.0))
 
     def _flow(self) -> float:
         """Sum what the rows are made of where the domain is softest; collective."""

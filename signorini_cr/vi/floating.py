@@ -19,7 +19,6 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import raise_together
-from ..fem.space import shared_maximum
 from ..mesh.planar import pieces
 from ..multigrid.parents import Layout
 from .active import ActiveSet
@@ -209,5 +208,5 @@ def _labels(V: fem.FunctionSpace) -> FloatArray:
         largest = np.full(len(dofs), -1.0)
         np.maximum.at(largest, piece, labels[dofs].max(axis=1, initial=-1.0))
         labels[dofs] = largest[piece][:, None]
-        shared_maximum(V, labels)
+        layout.shared_maximum(labels)
     return labels

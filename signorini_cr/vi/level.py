@@ -25,13 +25,13 @@ class Level:
 
     Attributes:
         meshes: The meshes up to this one, coarsest first.
-        held: Whether every piece of the domain is known to have a Dirichlet facet, which
+        has_dirichlet: Whether every piece of the domain is known to have a Dirichlet facet, which
             refinement keeps.
         like: A system with the same matrix, if there is one.
     """
 
     meshes: tuple[NestedMesh, ...]
-    held: bool = False
+    has_dirichlet: bool = False
     like: System | None = None
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ class Level:
     @cached_property
     def floating(self) -> Floating | None:
         """Pieces without a Dirichlet facet, None if there are none."""
-        if self.held:
+        if self.has_dirichlet:
             return None
         found = Floating.of(self.V, self.system.dirichlet)
         if found.count:  # what else may hold them takes a form of its own to be known

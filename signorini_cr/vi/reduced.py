@@ -131,7 +131,7 @@ class ReducedSolver:
         self._cycle, self.bounds, self._snes = cycle, bounds, snes
         self._x, self._residual, self._b = vectors.x, vectors.residual, vectors.b
         self._stiffness, self._share = stiffness, slack * FORCES
-        self.active = ActiveSet(cycle.operator.dofs, np.zeros(len(bounds.lower), dtype=bool))
+        self.active = ActiveSet.none(cycle.operator.dofs)
         self.reached, self.reduction, self.iterations = np.inf, SET_SHARE, 0
         self._cut, self._comm = True, snes.getComm().tompi4py()
         self.force_errors: FloatArray = np.full(stiffness.number, np.inf)
@@ -212,10 +212,10 @@ class ReducedSolver:
         bounded = self.active.bounded
         forces, gap = self.forces(), self.bounds.gap(self._x.array_r[bounded])
         pull = np.where(gap <= 0.0, -forces, 0.0)
-        most, held = float(pull.max(initial=0.0)), gap <= 0.0
-        if most == max(self._comm.allgather(most)) > 0.0 and not self._cut:
-            held[pull.argmax()] = False
-        self.active = ActiveSet(bounded, held)
+        most = float(pull.max(initial=0.0))
+        pulls_most = most == max(self._comm.allgather(most)) > 0.0
+        freed = int(pull.argmax()) if pulls_most and not self._cut else None
+        self.active = ActiveSet.on_bounds(bounded, gap, freed)
 
     def _shorten(self) -> None:
         """Halve the step until ½ x·A x − b·x falls along the way that the bounds leave of it."""
@@ -337,9 +337,7 @@ class ReducedSystem:
     forces: FloatArray
 
     def indicator(self, step: PETSc.Vec | None = None) -> FloatArray:
-        """Compute forces on active dofs, minus gaps times the diagonal on others, shape (n,).
-
-        What is positive will be active.
+        """Compute what will be active, as `ActiveSet.indicator` has it, in forces, shape (n,).
 
         Args:
             step: What is subtracted from the iterate; None for nothing.
@@ -349,9 +347,7 @@ class ReducedSystem:
         if step is not None:
             x, forces = x - step.array_r[operator.dofs], forces - operator.times(step)
         bounds = self.bounds
-        return np.where(
-            self.active.mask, bounds.side(x) * forces, -operator.diagonal * bounds.gap(x)
-        )
+        return self.active.indicator(bounds.side(x) * forces, operator.diagonal * bounds.gap(x))
 
     def outlook(self, now: FloatArray, before: FloatArray) -> Outlook:
         """Judge a step by its indicator and by that of the step before; collective."""

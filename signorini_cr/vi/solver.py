@@ -93,7 +93,7 @@ class Iterations:
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class SystemData:
     """What is known of the data that make the system.
 
     Attributes:
@@ -122,7 +122,7 @@ def solve_vi(
     *,
     tolerance: float = 1e-8,
     monitor: Monitor | None = None,
-    data: Data | None = None,
+    data: SystemData | None = None,
 ) -> Iterations:
     """Solve the variational inequality in place; collective.
 
@@ -279,7 +279,7 @@ class NewtonTest:
         linear: ReducedSolver,
         stiffness: Stiffness,
         target: float,
-        data: Data | None,
+        data: SystemData | None,
     ):
         """Start the tests; target is what the residual may be unless options say otherwise."""
         self._cycle, self._b, self._target = cycle, b, target

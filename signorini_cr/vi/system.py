@@ -17,7 +17,7 @@ from scipy.linalg.blas import dasum
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
 from ..errors import InputError, raise_together
 from ..fem.physics import Imposed, OnMesh
-from ..fem.space import facet_measures, ghosted_vector, shared_maximum, unknowns
+from ..fem.space import facet_measures, ghosted_vector, unknowns
 from ..fem.walk import Walk
 from ..garbage import release
 from ..multigrid.constrained import ConstrainedMatrix, with_entries
@@ -31,8 +31,14 @@ ROUNDING = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
 
 TINY = 1e-130
-"""What is smaller counts as 0: its square is multiplied with small numbers, and is lost. A bound of
-the error counts it, and what it can't count, see `estimate.certificate.LOST`."""
+"""Loads that are smaller count as 0: their squares are multiplied with small numbers, and are lost.
+A bound of the error counts them, and what it can't count, see `estimate.certificate.LOST`."""
+
+NOTHING = 1e-100
+"""What such a load may move u by: one that does more does so as κ is as small."""
+
+BESIDE = 1e-16
+"""The same in parts of the bounds, beside which it would be lost in rounding."""
 
 FAR = 16.0
 """Values so many times as far from 0 as from one another are told from their middle."""
@@ -254,7 +260,7 @@ class System:
         for axis in range(3):
             of_dofs: FloatArray = np.full(len(self.u_D.x.array), -np.inf)
             np.maximum.at(of_dofs, self.contact_dofs, midpoints[:, axis, None])
-            shared_maximum(V, of_dofs)
+            Layout.of_space(V).shared_maximum(of_dofs)
             places[:, axis] = of_dofs[self.bounded]
         return windows(V.mesh.comm, places)
 
@@ -304,7 +310,27 @@ class System:
         largest = max(
             float(max(each.max(initial=0.0), -each.min(initial=0.0))) for each in residuals
         )
-        return scale if max(comm.allgather(largest)) >= TINY else 0.0
+        if max(comm.allgather(largest)) >= TINY:
+            return scale
+        self._insist_on_nothing(residuals)
+        return 0.0
+
+    def _insist_on_nothing(self, residuals: Sequence[FloatArray]) -> None:
+        """Insist on loads that make no difference, as they are to count as 0; collective.
+
+        Raises:
+            InputError: They would move u, or hold it on the obstacle.
+        """
+        given = np.abs(np.concatenate([self.lower, self.upper]))
+        given = given[given < PETSc.INFINITY]
+        with np.errstate(over="ignore"):
+            moves = [np.abs(each) / self.operator.whole_diagonal for each in residuals]
+        found = [max(float(each.max(initial=0.0)) for each in moves), given.max(initial=0.0)]
+        moved, size = np.max(self._data.V.mesh.comm.allgather(found), axis=0)
+        # in a step in time, whose matrix is known, all may have come to rest
+        drowned = size < NOTHING**2 or self._like is not None or moved <= BESIDE * size
+        if moved > NOTHING or not drowned:
+            raise InputError("data: so small that their squares are lost; choose other units")
 
     @property
     def owned_dirichlet(self) -> Int32Array:
@@ -510,7 +536,7 @@ def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArra
         on_part[dofs] = 1.0
     # A rank may own a dof of the part without owning any of its facets
     for array in (values.x.array, on_part):
-        shared_maximum(V, array)
+        Layout.of_space(V).shared_maximum(array)
     values.x.array[on_part == 0.0] = 0.0
     return on_part > 0.0, values
 

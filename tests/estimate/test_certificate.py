@@ -136,6 +136,21 @@ def test_loads_whose_squares_are_lost_are_bounded(power):
     assert held.lower <= a / 2 <= held.upper
 
 
+@pytest.mark.parametrize("power", [100, 120, 130, 145])
+def test_loads_that_matter_are_not_lost(power):
+    """With κ, or with α, as small: contact everywhere, or a refusal, and never u = 0 for it."""
+    a = 10.0**-power
+    small = Problem(f=-3 * a, obstacle=-0.3, coefficient=a), Problem(f=-3 * a, obstacle=-0.3 * a)
+    for problem in small:
+        try:
+            solution = solve(problem, HELD_ABOVE.mesh(0.5))
+        except InputError as error:
+            assert power > 120 and "so small that their squares are lost" in str(error)
+            continue
+        assert power <= 120 and solution.contact.number_active == solution.contact.number
+        assert solution.contact.force == pytest.approx(1.8 * a, rel=1e-6)
+
+
 @pytest.mark.parametrize("power", [100, 158, 160, 162, 164, 170, 200, 300])
 def test_weights_whose_squares_are_lost(power):
     """−Δu = −1 is (y² − y)/2 where contact holds it, and λ = 1/2, on a unit square."""

@@ -177,6 +177,6 @@ def test_other_byte_order_and_crlf(texts, tmp_path: Path) -> None:
     path.write_bytes(
         big + b"$Nodes\n" + nodes + b"\n$EndNodes\n$Elements\n" + cells + b"\n$EndElements\n"
     )
-    found = mshfile.load(path)
+    found = mshfile.read(path)
     assert found.points.tolist() == np.eye(3).tolist()
     assert found.elements(2).tolist() == [[1, 2, 3]]
