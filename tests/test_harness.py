@@ -69,6 +69,18 @@ def test_every_case_of_one_solve_is_in_its_picture(monkeypatch):
         sys.modules.pop(name)
 
 
+@pytest.mark.parametrize("name", ["pcmg", "submatrix"])
+def test_the_cycle_and_what_it_is_compared_with(name, tmp_path):
+    """A cycle of PCMG, whatever its transfers are, has the same result as the program's."""
+    few = "--cases", "S1", "--dofs", "2e4", "--repeats", "1"
+    done = start(ROOT / "benchmarks" / f"{name}.py", *few, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / f"{name}.md").read_text().splitlines()
+    if name == "pcmg":
+        differences = [float(each.split("|")[-2]) for each in lines[2:4]]
+        assert max(differences) < 1e-13
+
+
 def test_turns_and_medians():
     harness = load("benchmarks/harness.py")
     calls = []
