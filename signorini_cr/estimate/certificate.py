@@ -260,7 +260,7 @@ def certify(solution: Found, sweeps: int = 2, flux_from: Found | None = None) ->
     try:
         with base.level.as_made():
             known = _equilibrated(solution, base)
-            certificate = _best(known, _companions(solution, known, sweeps))
+            certificate = _best(_companions(solution, known, sweeps))
     except _NoBound as why:
         certificate = Certificate(reason=str(why))
     return replace(certificate, seconds=time.perf_counter() - began)
@@ -460,11 +460,12 @@ def _seen_from(
     return own
 
 
-def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[tuple[Companion, Sums]]:
-    """Make v, on thin cells in other ways as well, and y with it; integrate the gaps; collective.
+_Way = tuple[_Known, Companion, Sums]
+"""y, v, and what their gap is made of."""
 
-    y is changed when the next way is asked for.
-    """
+
+def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[_Way]:
+    """Make v, on thin cells in other ways as well, each with its y, and add up; collective."""
     cells, kappa, flux = known.cells, known.kappa, known.flux
     if solution.element != "CR":
         sweeps = 0  # v is the solution itself
@@ -476,18 +477,21 @@ def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[tuple[C
     functional = _functional(known, plain)
     for touching in (False, True):
         v = companion(functional, flux, u_D, alpha, sweeps, goal, highest, touching)
-        flux.beyond = None
         sums = _integrated(known, v)
         of_y, of_alpha = promising(cells, kappa.mean, flux, v, sums)
-        yield v, sums
+        _complete(known, v, sums)
+        yield known, v, sums
         ways = []
         if of_y and (v.cusps is not None or not plain or kappa.values is not None):
             ways.append(v)
         if of_y and plain and kappa.values is None:
             ways.append(cubed(cells, kappa.mean, flux, replace(v, cusps=None)))
         for way in ways:
-            improve(cells, kappa, known.certain.load, known.segments, flux, way, known.c.low)
-            yield way, _integrated(known, way)
+            y = improve(cells, kappa, known.certain.load, known.segments, flux, way, known.c.low)
+            other = replace(known, flux=y)
+            sums = _integrated(other, way)
+            _complete(other, way, sums)
+            yield other, way, sums
         if not of_alpha:
             return
 
@@ -504,16 +508,40 @@ def _integrated(known: _Known, v: Companion) -> Sums:
     return sums
 
 
-def _best(known: _Known, ways: Iterator[tuple[Companion, Sums]]) -> Certificate:
+def _complete(known: _Known, v: Companion, sums: Sums) -> None:
+    """Add to what was integrated over cells what facets, ℓ, and c and b that vary have of it."""
+    cells, kappa, segments, totals = known.cells, known.kappa, known.segments, sums.totals
+    load = known.certain.load
+    integrate_edge(cells, kappa, known.w, load, segments, known.flux, v, sums, known.c.low)
+    totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
+    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
+    lost, unsure = half(known.squares)
+    totals.energy -= lost + float(
+        segments.measure @ (segments.weights @ (segments.values * on_edge))
+    )
+    totals.energy_slack += more_energy + unsure
+    if known.square is not None:
+        means = known.square.load.mean
+        own = 1e-14 * cells.volume * np.abs(means)
+        if known.square.missed is not None:
+            own += known.square.missed
+        totals.energy -= 0.5 * float(cells.volume @ means)
+        totals.energy_slack += 0.5 * float(np.sum(own))
+    totals.contact = float(np.sum(v.contact))
+    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
+    totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
+
+
+def _best(ways: Iterator[_Way]) -> Certificate:
     """Take the way with the least bound, and of all what they know of J(u) and ∇u; collective.
 
     Raises:
         _NoBound: With the first one's reason.
     """
     found, reasons = [], []
-    for v, sums in ways:
+    for way in ways:
         try:
-            found.append(_added_up(known, v, sums))
+            found.append(_added_up(*way))
         except _NoBound as why:
             reasons.append(why)
     if not found:
@@ -546,7 +574,6 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
         _NoBound: With the reason.
     """
     cells, kappa = known.cells, known.kappa
-    _complete(known, v, sums)
     hidden, hidden_energy = _hidden(known, v, sums)
     rounding = _rounding(cells, kappa, known.c.high, known.w, known.certain.load, known.flux)
     total = sums.totals.over_ranks(cells)
@@ -574,30 +601,6 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
         indicators=sums.indicators,
         _made=_made(known, v, ball, lift),
     )
-
-
-def _complete(known: _Known, v: Companion, sums: Sums) -> None:
-    """Add to what was integrated over cells what facets, ℓ, and c and b that vary have of it."""
-    cells, kappa, segments, totals = known.cells, known.kappa, known.segments, sums.totals
-    load = known.certain.load
-    integrate_edge(cells, kappa, known.w, load, segments, known.flux, v, sums, known.c.low)
-    totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
-    on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
-    lost, unsure = half(known.squares)
-    totals.energy -= lost + float(
-        segments.measure @ (segments.weights @ (segments.values * on_edge))
-    )
-    totals.energy_slack += more_energy + unsure
-    if known.square is not None:
-        means = known.square.load.mean
-        own = 1e-14 * cells.volume * np.abs(means)
-        if known.square.missed is not None:
-            own += known.square.missed
-        totals.energy -= 0.5 * float(cells.volume @ means)
-        totals.energy_slack += 0.5 * float(np.sum(own))
-    totals.contact = float(np.sum(v.contact))
-    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
-    totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ has the mathematics.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..arrays import FloatArray
@@ -70,15 +72,15 @@ def improve(
     flux: Flux,
     v: Companion,
     reaction: FloatArray = NOTHING,
-) -> None:
-    """Give y the curl and τ; collective.
+) -> Flux:
+    """Make y with the curl and τ; collective.
 
     Args:
         cells: The mesh, d = 2.
         kappa: The coefficient.
         load: Moments of f.
         edge: Values of g.
-        flux: y, changed in place.
+        flux: y.
         v: v; its cusps do not count.
         reaction: c, shape (cells,) or ().
     """
@@ -96,11 +98,11 @@ def improve(
     for known in (v.boundary.alpha.side, side):
         held[known.dofs] = 1.0
     given, free = cells.share(given), cells.share(held) == 0.0
-    flux.beyond = Beyond(given, rise)
+    flux = replace(flux, beyond=Beyond(given, rise))
     slopes = Slopes(np.zeros((3, cells.number)), _pull(cells, kappa.mean, flux, v), np.zeros(0))
     none = np.zeros(len(v.vertices), dtype=bool)
     _, heights = nearest(cells, np.asarray(1.0 / kappa.mean), slopes, none, free)
-    flux.beyond = Beyond(np.where(free, heights, given), rise)
+    return replace(flux, beyond=Beyond(np.where(free, heights, given), rise))
 
 
 def _pull(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> FloatArray:

@@ -481,16 +481,15 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
             setattr(sums.totals, name, getattr(sums.totals, name) + share * value)
         return sums
 
-    make = module._companions
+    complete = module._complete
 
-    def unknown_above(solution, known, sweeps):
+    def unknown_above(known, *others):
         """What is known of κ from above makes no difference to gradients."""
-        made = list(make(solution, known, sweeps))
         known.kappa.high = 2 * known.kappa.high
-        yield from made
+        complete(known, *others)
 
     monkeypatch.setattr(module, "integrate", unsure)
-    monkeypatch.setattr(module, "_companions", unknown_above)
+    monkeypatch.setattr(module, "_complete", unknown_above)
     solution = solve(Problem(f=-12.0, obstacle=bowl, coefficient=kappa), square(4, 0.0))
     certificate = certify(solution)
     found = again(solution, certificate, kappa, -12.0, 0.0)
