@@ -54,10 +54,41 @@ def integrate(
     """
     sums = Sums.empty(cells.number, reacts(reaction))
     most = reaction if most is None else most
-    gap = _Gap(cells, kappa, w, load, flux, v, reaction, most, sums)
+    duality_gap = _DualityGap(cells, kappa, w, load, flux, v, reaction, most, sums)
     for block in blocks(cells.number):
-        gap.add(block)
+        duality_gap.add(block)
     return sums
+
+
+def integrate_edge(
+    cells: Cells,
+    kappa: Coefficient,
+    w: FloatArray,
+    load: VolumeMoments,
+    edge: Segments,
+    flux: Flux,
+    v: Companion,
+    sums: Sums,
+    reaction: FloatArray = NOTHING,
+) -> None:
+    """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
+
+    σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
+    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f. Where b
+    is large it takes up g − g_F, as c does with f.
+
+    Args:
+        cells: The mesh.
+        kappa: The coefficient.
+        w: u_h at the cells' vertices, shape (d + 1, cells).
+        load: Moments of f.
+        edge: Values of g − b u_h.
+        flux: y.
+        v: v.
+        sums: What to add to.
+        reaction: c, shape (cells,) or ().
+    """
+    _DualityGap(cells, kappa, w, load, flux, v, reaction, reaction, sums).add_edge(edge)
 
 
 @dataclass(frozen=True)
@@ -84,7 +115,7 @@ class _Products:
 
 
 @dataclass(frozen=True, eq=False)
-class _Gap:
+class _DualityGap:
     """The gap between y and v, which is added up range by range of cells.
 
     Attributes but for the last are the arguments of `integrate`.
@@ -125,8 +156,8 @@ class _Gap:
         if kappa.tensor is None:
             return found
         square, cross = found.pp + found.bb, 2.0 * found.pb
-        gap = square - cross, square + cross
-        vv, far, near, energy = _of_tensor(cells, kappa, block, flux, v, w, gap)
+        squares = square - cross, square + cross
+        vv, far, near, energy = _of_tensor(cells, kappa, block, flux, v, w, squares)
         return replace(
             found,
             vv=vv,
@@ -297,6 +328,101 @@ class _Gap:
                 totals.energy_slack += float(np.sum(volume * np.sqrt(left[block]) * size))
         totals.energy += float(np.sum(0.5 * vv - volume * fv))
 
+    # what there is on facets
+
+    def add_edge(self, edge: Segments) -> None:
+        """Add what facets have of the gap, see `integrate_edge`."""
+        cells, kappa, flux, sums = self.cells, self.kappa, self.flux, self.sums
+        jump = apart(cells, self.w, edge, self.v.vertices, self.v.bumps)
+        at, sizes = edge.oscillation(flux.beyond is not None)
+        low = pick(kappa.low, at)
+        squares = sizes**2 / low
+        sums.indicators[at] += squares
+        sums.totals.neumann = float(np.sum(squares))
+        if edge.most.any():
+            self._add_loss(edge, jump)
+        if edge.given.any() and (cells.tdim != 2 or flux.beyond is not None):
+            # σ is known by its norm alone; what b takes up has a product with v − u_h all the same
+            taken = edge.measure * edge.weights[:, None] * edge.tau(flux.beyond is not None)
+            sums.totals.load_companion += float(np.sum(taken * jump))
+        if cells.tdim != 2:
+            sums.totals.loose = sums.totals.neumann
+            return
+        if flux.beyond is not None:
+            sums.totals.load += sums.totals.neumann
+            _add_by_size(sums, at, squares)
+            return
+        # σ has been counted for f: ‖σ_f + σ_g‖² is at most ‖σ_f‖² and this more
+        more = (2.0 * self._size_of_oscillation(at) * sizes + sizes**2) / low
+        sums.totals.load += float(np.sum(more))
+        for row in (sums.middle, sums.across):
+            row[at] += more
+        self._add_edge_products(edge, jump)
+        if kappa.varies:
+            slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], self.w[:, at])
+            sums.totals.slack += float(np.sum(slack))
+            for row in (sums.middle, sums.across):
+                row[at] += 2.0 * slack
+
+    def _add_loss(self, edge: Segments, jump: FloatArray) -> None:
+        """Add b‖v − u_h‖²_F, and ‖q − g_F‖²_F/b where b takes that up.
+
+        Where b varies within the facet, −½∫_F b u_h² is left to the caller.
+
+        Args:
+            edge: Values of g − b u_h.
+            jump: v − u_h at its points, shape (q, n).
+        """
+        cells, flux, sums = self.cells, self.flux, self.sums
+        if sums.zeroth is None:
+            sums.zeroth = np.zeros(cells.number)
+        steady, (least, most) = edge.steady[edge.place] * edge.measure, edge.of_loss * edge.measure
+        squares = edge.weights @ jump**2
+        apart = most * squares
+        own = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, self.w))
+        size = 0.5 * float(np.sum(steady * (edge.weights @ own**2)))
+        sums.totals.energy += 0.5 * float(np.sum(apart)) - size
+        sums.totals.energy_slack += EPS * size
+        sums.totals.energy_slack += 0.5 * float(np.sum((most - least) * squares))
+        sums.totals.companion += float(np.sum(apart))
+        given = edge.taken(flux.shed, flux.beyond is not None)
+        if flux.shed is not None:
+            n, whole = len(edge.loss), edge.measure * (edge.weights @ jump)
+            area = np.bincount(edge.place, edge.measure, minlength=n)
+            means = np.bincount(edge.place, whole, minlength=n) / area
+            sums.totals.load_companion += float(flux.shed @ means)
+        sums.totals.load += float(np.sum(given))
+        for at, amounts in ((edge.side.cells, apart), (edge.facets.cells, given)):
+            np.add.at(sums.indicators, at, amounts)
+            np.add.at(sums.zeroth, at, amounts)
+
+    def _size_of_oscillation(self, at: IndexArray) -> FloatArray:
+        """Bound ‖σ‖_T on some cells, of what f has beyond its mean and c does not take up."""
+        cells, load = self.cells, self.load
+        if load.variance is None:
+            return np.zeros(len(at))
+        square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
+        size: FloatArray = poincare(cells.tdim) * np.sqrt(square)
+        taken = taken_up(cells, load, self.kappa.low, at, self.reaction)
+        return size if taken is None else np.where(taken, 0.0, size)
+
+    def _add_edge_products(self, edge: Segments, jump: FloatArray) -> None:
+        """Add σ's products with p and b: ∫_F (g − g_F) φ with the potentials φ of both, d = 2.
+
+        Args:
+            edge: Values of g − b u_h.
+            jump: v − u_h at its points, shape (q, n).
+        """
+        sums, at = self.sums, edge.side.cells
+        weights = edge.measure * edge.weights[:, None] * edge.rest
+        sums.totals.load_companion += float(np.sum(weights * jump))
+        potential = _edge_potential(self.cells, self.kappa, edge, self.flux)
+        # where b takes up g − g_F there is no σ
+        weights = np.where(edge.given[edge.place], 0.0, weights)
+        sums.totals.load_flux += float(np.sum(weights * potential))
+        np.add.at(sums.middle, at, 2.0 * (weights * (potential + jump)).sum(axis=0))
+        np.add.at(sums.across, at, 2.0 * (weights * (potential - jump)).sum(axis=0))
+
 
 def _add_by_size(sums: Sums, where: slice | IndexArray, squares: FloatArray) -> None:
     """Add a part of σ to the cells' squares of which no more than the norm is known.
@@ -336,130 +462,6 @@ def taken_up(
     return np.asarray(variance * pick(low, where) < pick(reaction, where) * square)
 
 
-def integrate_edge(
-    cells: Cells,
-    kappa: Coefficient,
-    w: FloatArray,
-    load: VolumeMoments,
-    edge: Segments,
-    flux: Flux,
-    v: Companion,
-    sums: Sums,
-    reaction: FloatArray = NOTHING,
-) -> None:
-    """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
-
-    σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
-    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f. Where b
-    is large it takes up g − g_F, as c does with f.
-
-    Args:
-        cells: The mesh.
-        kappa: The coefficient.
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        load: Moments of f.
-        edge: Values of g − b u_h.
-        flux: y.
-        v: v.
-        sums: What to add to.
-        reaction: c, shape (cells,) or ().
-    """
-    at, sizes = edge.oscillation(flux.beyond is not None)
-    low = pick(kappa.low, at)
-    squares = sizes**2 / low
-    sums.indicators[at] += squares
-    sums.totals.neumann = float(np.sum(squares))
-    if edge.most.any():
-        _add_loss(cells, w, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
-    if edge.given.any() and (cells.tdim != 2 or flux.beyond is not None):
-        # σ is known by its norm alone; what b takes up has a product with v − u_h all the same
-        taken = edge.measure * edge.weights[:, None] * edge.tau(flux.beyond is not None)
-        jump = apart(cells, w, edge, v.vertices, v.bumps)
-        sums.totals.load_companion += float(np.sum(taken * jump))
-    if cells.tdim != 2:
-        sums.totals.loose = sums.totals.neumann
-        return
-    if flux.beyond is not None:
-        sums.totals.load += sums.totals.neumann
-        _add_by_size(sums, at, squares)
-        return
-    # σ has been counted for f: ‖σ_f + σ_g‖² is at most ‖σ_f‖² and this more
-    of_f = _size_of_oscillation(cells, kappa, load, at, reaction)
-    more = (2.0 * of_f * sizes + sizes**2) / low
-    sums.totals.load += float(np.sum(more))
-    for row in (sums.middle, sums.across):
-        row[at] += more
-    _add_edge_products(cells, kappa, edge, flux, apart(cells, w, edge, v.vertices, v.bumps), sums)
-    if kappa.varies:
-        slack = sizes * _twist(cells, kappa, at, flux.excess[:, at], w[:, at])
-        sums.totals.slack += float(np.sum(slack))
-        for row in (sums.middle, sums.across):
-            row[at] += 2.0 * slack
-
-
-def _size_of_oscillation(
-    cells: Cells, kappa: Coefficient, load: VolumeMoments, at: IndexArray, reaction: FloatArray
-) -> FloatArray:
-    """Bound ‖σ‖_T of what f has beyond its mean and c does not take up, shape (n,).
-
-    Args:
-        cells: The mesh.
-        kappa: The coefficient.
-        load: Moments of f.
-        at: Which cells, shape (n,).
-        reaction: c, shape (cells,) or ().
-    """
-    if load.variance is None:
-        return np.zeros(len(at))
-    square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
-    size: FloatArray = poincare(cells.tdim) * np.sqrt(square)
-    taken = taken_up(cells, load, kappa.low, at, reaction)
-    return size if taken is None else np.where(taken, 0.0, size)
-
-
-def _add_edge_products(
-    cells: Cells,
-    kappa: Coefficient,
-    edge: Segments,
-    flux: Flux,
-    jump: FloatArray,
-    sums: Sums,
-) -> None:
-    """Add σ's products with p and b: ∫_F (g − g_F) φ with the potentials φ of both, d = 2.
-
-    Args:
-        cells: The mesh.
-        kappa: The coefficient.
-        edge: Values of g − b u_h.
-        flux: y.
-        jump: v − u_h at its points, shape (q, n).
-        sums: What to add to.
-    """
-    at, weights = edge.side.cells, edge.measure * edge.weights[:, None] * edge.rest
-    sums.totals.load_companion += float(np.sum(weights * jump))
-    potential = _edge_potential(cells, kappa, edge, flux)
-    # where b takes up g − g_F there is no σ
-    weights = np.where(edge.given[edge.place], 0.0, weights)
-    sums.totals.load_flux += float(np.sum(weights * potential))
-    np.add.at(sums.middle, at, 2.0 * (weights * (potential + jump)).sum(axis=0))
-    np.add.at(sums.across, at, 2.0 * (weights * (potential - jump)).sum(axis=0))
-
-
-def _edge_potential(cells: Cells, kappa: Coefficient, edge: Segments, flux: Flux) -> FloatArray:
-    """Find φ with ∇φ = κ_T⁻¹ y − ∇u_h, as in `_against_potential`, at points, shape (q, n)."""
-    side, d = edge.side, cells.tdim
-    P = flux.excess[:, side.cells]
-    s, row = sum_rows(P), np.arange(len(side.cells))
-    apex, base = corner_points(cells, side, stretched=True)
-    middle = (apex + base.sum(axis=0)) / (d + 1)
-    pull = P[side.local, row][:, None] * (apex - middle)
-    pull += np.einsum("in,ink->nk", P[cells.others[side.local].T, row], base - middle)
-    x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
-    potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
-    potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
-    return potential
-
-
 def apart(
     cells: Cells, w: FloatArray, edge: Segments, vertices: FloatArray, bumps: FloatArray
 ) -> FloatArray:
@@ -467,44 +469,6 @@ def apart(
     jump = on_facet(cells, edge.side, edge.hats, vertices, bumps)
     jump -= np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
     return jump
-
-
-def _add_loss(
-    cells: Cells, w: FloatArray, edge: Segments, flux: Flux, jump: FloatArray, sums: Sums
-) -> None:
-    """Add b‖v − u_h‖²_F, and ‖q − g_F‖²_F/b where b takes that up.
-
-    Where b varies within the facet, −½∫_F b u_h² is left to the caller.
-
-    Args:
-        cells: The mesh.
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        edge: Values of g − b u_h.
-        flux: y.
-        jump: v − u_h at its points, shape (q, n).
-        sums: What to add to.
-    """
-    if sums.zeroth is None:
-        sums.zeroth = np.zeros(cells.number)
-    steady, (least, most) = edge.steady[edge.place] * edge.measure, edge.of_loss * edge.measure
-    squares = edge.weights @ jump**2
-    apart = most * squares
-    own = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, w))
-    size = 0.5 * float(np.sum(steady * (edge.weights @ own**2)))
-    sums.totals.energy += 0.5 * float(np.sum(apart)) - size
-    sums.totals.energy_slack += EPS * size
-    sums.totals.energy_slack += 0.5 * float(np.sum((most - least) * squares))
-    sums.totals.companion += float(np.sum(apart))
-    given = edge.taken(flux.shed, flux.beyond is not None)
-    if flux.shed is not None:
-        n = len(edge.loss)
-        area = np.bincount(edge.place, edge.measure, minlength=n)
-        means = np.bincount(edge.place, edge.measure * (edge.weights @ jump), minlength=n) / area
-        sums.totals.load_companion += float(flux.shed @ means)
-    sums.totals.load += float(np.sum(given))
-    for at, amounts in ((edge.side.cells, apart), (edge.facets.cells, given)):
-        np.add.at(sums.indicators, at, amounts)
-        np.add.at(sums.zeroth, at, amounts)
 
 
 def _swollen(squares: FloatArray, more: FloatArray) -> FloatArray:
@@ -625,7 +589,7 @@ def _of_tensor(
     flux: Flux,
     v: Companion,
     w: FloatArray,
-    gap: tuple[FloatArray, FloatArray],
+    mean_squares: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Bound what a tensor that varies within cells does to the gap.
 
@@ -640,7 +604,7 @@ def _of_tensor(
         flux: y.
         v: v.
         w: u_h at the cells' vertices, shape (d + 1, cells).
-        gap: ∫_T |p − b|² and ∫_T |p + b|² as they are for κ_T.
+        mean_squares: ∫_T |p − b|² and ∫_T |p + b|² as they are for κ_T.
 
     Returns:
         ∫_T κ|∇v|² by the rule; what the gap has beyond that of κ_T; and what the rule may have
@@ -667,7 +631,7 @@ def _of_tensor(
                 vv += weight * (flow * slope).sum(axis=1)
     rough, mean = kappa.rough[block], k[:, 0]
     found = np.sqrt(volume / mean * squares) + 2.0 * rough * np.sqrt(volume * mean * steep)
-    far, near = found**2 / (1.0 - theta) - np.stack(gap)
+    far, near = found**2 / (1.0 - theta) - np.stack(mean_squares)
     return volume * vv, far, near, rough * mean * volume * steep[0]
 
 
@@ -828,6 +792,21 @@ def _at_points(
         for row, value in zip(rows, values, strict=True):
             row += weight * value
     return rows
+
+
+def _edge_potential(cells: Cells, kappa: Coefficient, edge: Segments, flux: Flux) -> FloatArray:
+    """Find φ with ∇φ = κ_T⁻¹ y − ∇u_h, as in `_against_potential`, at points, shape (q, n)."""
+    side, d = edge.side, cells.tdim
+    P = flux.excess[:, side.cells]
+    s, row = sum_rows(P), np.arange(len(side.cells))
+    apex, base = corner_points(cells, side, stretched=True)
+    middle = (apex + base.sum(axis=0)) / (d + 1)
+    pull = P[side.local, row][:, None] * (apex - middle)
+    pull += np.einsum("in,ink->nk", P[cells.others[side.local].T, row], base - middle)
+    x = np.einsum("qin,ink->qnk", edge.hats, base) - middle
+    potential = 0.5 * s * (x**2).sum(axis=-1) - np.einsum("qnk,nk->qn", x, pull)
+    potential /= d * cells.volume[side.cells] * pick(kappa.mean, side.cells)
+    return potential
 
 
 def _against_potential(

@@ -1335,7 +1335,9 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     edge = Segments.of(data.edges[0], data.cells, kappa.low, 1.0)
     before = {name: getattr(sums, name).copy() for name in ("indicators", "middle", "across")}
     fluxes = SimpleNamespace(beyond=Beyond(np.zeros(len(cells.exterior)), None))
-    duality.integrate_edge(data.cells, kappa, None, None, edge, fluxes, None, sums)
+    none, w = np.zeros(len(cells.exterior)), np.zeros((3, cells.number))
+    v = SimpleNamespace(vertices=none, bumps=none)
+    duality.integrate_edge(data.cells, kappa, w, None, edge, fluxes, v, sums)
     at, sizes = edge.oscillation(True)
     assert sums.totals.loose == 0.0 and len(at) == 4 and sizes.min() > 1e-3
     norms = np.zeros(cells.number)
