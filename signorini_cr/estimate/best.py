@@ -40,6 +40,10 @@ LEFT = 0.04
 0.2 on thin cells where v needs to be solved for on all of the mesh."""
 
 
+Near = tuple[BoolArray, BoolArray, IndexArray]
+"""Which values at vertices and which heights to solve for, and the cells that know of these."""
+
+
 def solved(
     functional: Functional, draft: Draft, floors: Floors
 ) -> tuple[FloatArray, FloatArray, Cusps | None]:
@@ -81,31 +85,90 @@ def _best(
     Returns:
         As `solved`, E, and whether v is settled, as far as more of the mesh would make it so.
     """
-    cells, kappa, bounded = functional.cells, functional.kappa, floors.side.dofs
-    v, bumps, free_vertices, free_facets = (
-        draft.vertices,
-        draft.bumps,
-        draft.free_vertices,
-        draft.free_facets,
-    )
-    excess = functional.excess(v)
-    slopes = Slopes.of(functional, excess, bumps)
-    cusps: Cusps | None = None
-    near = promise.near(slopes, free_vertices, free_facets, layers)
+    cells, search = functional.cells, _Search.of(functional, draft, floors)
+    near = promise.near(search.slopes, search.v, layers)
     if near is not None:
         # v is good enough but for some places; elsewhere cusps would be for what v is to become
-        cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
-        cusps = _fitted(functional, cusps, excess, bumps, slopes)
-    best, least = (v, bumps, cusps), cells.total(np.sum(slopes.energies))[0]
+        search.choose_cusps()
+    best, least = search.found, cells.total(np.sum(search.slopes.energies))[0]
     local = falling = False
     for turn in range(ROUNDS):
         if turn > 0:
-            near = promise.near(slopes, free_vertices, free_facets, layers)
+            near = promise.near(search.slopes, search.v, layers)
+        held = search.solve(near)
+        if turn == 0:  # where v is good otherwise
+            search.choose_cusps()
+        else:
+            search.fit_cusps()
+        energy, changes = cells.total(np.sum(search.slopes.energies), held)
         local |= near is not None
-        some, heights, at = near or (free_vertices, free_facets, slice(None))
-        step = nearest(cells, kappa, slopes, some, heights, functional.masses)
-        v, bumps, free_facets = v + step[0], bumps + step[1], free_facets.copy()
-        down = np.zeros_like(free_vertices)
+        settled = near is None or energy > (1.0 - LITTLE) * least
+        falling = near is not None and energy < (1.0 - MUCH) * least
+        if energy < least:
+            best, least = search.found, energy
+        if settled and changes == 0.0 and search.cusps is None:
+            break
+    if not local:
+        return best, least, True
+    left = promise.total(search.slopes, search.v)
+    return best, least, not falling and left <= LEFT * least
+
+
+@dataclass(eq=False)
+class _Search:
+    """v on the way from round to round.
+
+    Attributes:
+        functional: E.
+        floors: What the bounds ask of v.
+        v: v without cusps, and what of it may be changed.
+        excess: v − u_h at the cells' vertices without bumps and cusps, shape (3, cells).
+        slopes: Those of v with its cusps.
+        cusps: These, if there are any.
+    """
+
+    functional: Functional
+    floors: Floors
+    v: Draft
+    excess: FloatArray
+    slopes: Slopes
+    cusps: Cusps | None = None
+
+    @classmethod
+    def of(cls, functional: Functional, draft: Draft, floors: Floors) -> _Search:
+        """Begin with a draft, which is left as it is."""
+        excess = functional.excess(draft.vertices)
+        return cls(functional, floors, draft, excess, Slopes.of(functional, excess, draft.bumps))
+
+    @property
+    def found(self) -> tuple[FloatArray, FloatArray, Cusps | None]:
+        """Values at vertices, heights, and cusps."""
+        return self.v.vertices, self.v.bumps, self.cusps
+
+    def solve(self, near: Near | None) -> float:
+        """Solve for some of v, within its bounds; slopes are without cusps then; collective.
+
+        Returns:
+            How many values this rank holds at their bounds from now on.
+        """
+        functional, v = self.functional, self.v
+        cells = functional.cells
+        some, heights, at = near or (v.free_vertices, v.free_facets, slice(None))
+        step = nearest(cells, functional.kappa, self.slopes, some, heights, functional.masses)
+        held = self._move(step, some, heights)
+        if self.cusps is not None and not isinstance(at, slice):
+            at = np.union1d(at, self.cusps.at)
+        self.excess[:, at] = self.v.vertices[cells.vertices[:, at]] - functional.w[:, at]
+        self.slopes.renew(functional, self.excess, self.v.bumps, at)
+        return held
+
+    def _move(
+        self, step: tuple[FloatArray, FloatArray], some: BoolArray, heights: BoolArray
+    ) -> float:
+        """Move v by a step as far as the bounds allow, and hold what reaches them, see `solve`."""
+        floors, bounded = self.floors, self.floors.side.dofs
+        v, bumps = self.v.vertices + step[0], self.v.bumps + step[1]
+        down = np.zeros_like(some)
         for sign, limit in floors.at_vertices:
             down |= some & (sign * v <= limit)
             v = np.where(some, sign * np.maximum(sign * v, limit), v)
@@ -113,55 +176,31 @@ def _best(
         out = np.unique(bounded[heights[bounded] & ((bumps <= low) | (bumps >= high))[bounded]])
         # also where they are held since an earlier round: the facet's ends may have come down
         bumps[bounded] = np.clip(bumps, low, high)[bounded]
+        free_facets = self.v.free_facets.copy()
         free_facets[out] = False
-        free_vertices = free_vertices & ~down
-        if cusps is not None and not isinstance(at, slice):
-            at = np.union1d(at, cusps.at)
-        excess[:, at] = v[cells.vertices[:, at]] - functional.w[:, at]
-        slopes.renew(functional, excess, bumps, at)
-        if turn == 0:  # where v is good otherwise
-            cusps = Cusps.of(cells, kappa, functional.steady, slopes.energies)
-        cusps = _fitted(functional, cusps, excess, bumps, slopes)
-        energy, changes = cells.total(np.sum(slopes.energies), float(len(out) + down.sum()))
-        settled = near is None or energy > (1.0 - LITTLE) * least
-        falling = near is not None and energy < (1.0 - MUCH) * least
-        if energy < least:
-            best, least = (v, bumps, cusps), energy
-        if settled and changes == 0.0 and cusps is None:
-            break
-    if not local:
-        return best, least, True
-    return (
-        best,
-        least,
-        not falling and promise.total(slopes, free_vertices, free_facets) <= LEFT * least,
-    )
+        self.v = Draft(v, bumps, self.v.free_vertices & ~down, free_facets)
+        return float(len(out) + down.sum())
 
+    def choose_cusps(self) -> None:
+        """Choose where v gets cusps, slopes being those without; collective."""
+        functional = self.functional
+        self.cusps = Cusps.of(
+            functional.cells, functional.kappa, functional.steady, self.slopes.energies
+        )
+        self.fit_cusps()
 
-def _fitted(
-    functional: Functional,
-    cusps: Cusps | None,
-    excess: FloatArray,
-    bumps: FloatArray,
-    slopes: Slopes,
-) -> Cusps | None:
-    """Find the best heights of cusps, and add what these do to E and its slopes; collective.
-
-    Args:
-        functional: E.
-        cusps: The cusps, if there are any.
-        excess: v − u_h at the cells' vertices without bumps and cusps, shape (3, cells).
-        bumps: Heights of v's bumps by facet dof.
-        slopes: Those of v without cusps, changed in place.
-    """
-    if cusps is None:
-        return None
-    cells = functional.cells
-    cusps = cusps.fitted(cells, excess, bumps)
-    slopes.energies[cusps.at] += cusps.gains(cells, excess, bumps)
-    for rows, pull in zip((slopes.vertices, slopes.facets), cusps.pulls(cells), strict=True):
-        rows[:, cusps.at] -= pull
-    return cusps
+    def fit_cusps(self) -> None:
+        """Find the cusps' best heights, and add what they do to E and its slopes; collective."""
+        if self.cusps is None:
+            return
+        cells, slopes, v = self.functional.cells, self.slopes, (self.excess, self.v.bumps)
+        self.cusps = self.cusps.fitted(cells, *v)
+        at = self.cusps.at
+        slopes.energies[at] += self.cusps.gains(cells, *v)
+        for rows, pull in zip(
+            (slopes.vertices, slopes.facets), self.cusps.pulls(cells), strict=True
+        ):
+            rows[:, at] -= pull
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,60 +222,45 @@ class Promise:
         """Make it; collective."""
         return cls(functional.cells, *curvatures(functional))
 
-    def of_values(
-        self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Compute what each value promises, ghosts included; collective.
-
-        Args:
-            slopes: Those of v.
-            free_vertices: Which values at vertices may be changed.
-            free_facets: Which heights may be changed.
-
-        Returns:
-            By vertex and by facet dof.
-        """
+    def of_values(self, slopes: Slopes, v: Draft) -> tuple[FloatArray, FloatArray]:
+        """Compute what each value of v promises, by vertex and by facet dof; collective."""
         cells = self.cells
         promises = cells.over_vertices(slopes.vertices), cells.over_facets(slopes.facets)
         for promise, weight, may in zip(
-            promises, (self.vertices, self.facets), (free_vertices, free_facets), strict=True
+            promises, (self.vertices, self.facets), (v.free_vertices, v.free_facets), strict=True
         ):
             promise *= promise
             promise /= weight
             promise *= may
         return promises
 
-    def total(self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray) -> float:
+    def total(self, slopes: Slopes, v: Draft) -> float:
         """Sum what all of them promise; collective."""
-        vertices, facets = self.of_values(slopes, free_vertices, free_facets)
+        vertices, facets = self.of_values(slopes, v)
         own = (
             vertices[: self.cells.owned_vertices()].sum()
             + facets[: self.cells.owned_facets()].sum()
         )
         return float(self.cells.total(float(own))[0])
 
-    def near(
-        self, slopes: Slopes, free_vertices: BoolArray, free_facets: BoolArray, layers: int | None
-    ) -> tuple[BoolArray, BoolArray, IndexArray] | None:
+    def near(self, slopes: Slopes, v: Draft, layers: int | None) -> Near | None:
         """Choose values that are worth being solved for; collective.
 
         They are those that hold `FOREMOST` of all promise, and all within some layers around them.
 
         Args:
             slopes: Those of v.
-            free_vertices: Which values at vertices may be changed.
-            free_facets: Which heights may be changed.
+            v: v.
             layers: How many layers of cells around them; None for all.
 
         Returns:
-            Which of them are to be, and the cells of this rank that know of these; None if that is
-            most of the mesh, or nothing is promised.
+            None if that is most of the mesh, or nothing is promised.
         """
         if layers is None:
             return None
         cells = self.cells
         owned = cells.owned_vertices(), cells.owned_facets()
-        promises = self.of_values(slopes, free_vertices, free_facets)
+        promises = self.of_values(slopes, v)
         limit = _limit(cells, *(p[:n] for p, n in zip(promises, owned, strict=True)))
         chosen, much = (promise > limit for promise in promises)
         local, at = np.nonzero(much[cells.facets])
@@ -247,10 +271,10 @@ class Promise:
             return None
         at = np.flatnonzero(chosen[cells.vertices].any(axis=0))
         facets, inside = cells.facets[:, at], chosen[cells.vertices[:, at]]
-        there = np.zeros(len(free_facets), dtype=bool)
+        there = np.zeros_like(v.free_facets)
         for facet, (j, k) in zip(facets, cells.others, strict=True):
             there[facet[inside[j] | inside[k]]] = True
-        return free_vertices & chosen, free_facets & there, at
+        return v.free_vertices & chosen, v.free_facets & there, at
 
 
 def _limit(cells: Cells, *promises: FloatArray) -> float:
