@@ -6,17 +6,18 @@ system is as small as that.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
-from dolfinx.la import InsertMode
 from petsc4py import PETSc
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..fem.cells import Cells, on_cells, sum_rows
-from ..fem.space import ghosted_vector, shared_maximum
+from ..fem.space import ghosted_vector, shared_maximum, shared_sum
 from ..garbage import release
 from ..jit import compiled
 from ..options import COMPANION, ESTIMATE_PREFIX, solve_once
@@ -54,81 +55,97 @@ def nearest(
     Returns:
         What is to be added to v's values at the vertices and to the heights of its bumps.
     """
-    mesh, d = cells.domain.mesh, cells.tdim
-    patch: slice | IndexArray = slice(None)
-    some = np.flatnonzero(
-        free_vertices[cells.vertices].any(axis=0) | free_facets[cells.facets].any(axis=0)
-    )
-    few, all_ = cells.total(float(len(some)), float(cells.number))
-    if 0.0 < few <= LARGEST * all_:
-        mesh, parents = compat.submesh(mesh, d, some.astype(np.int32))
-        patch = parents.astype(np.intp)
-    vertices, facets = cells.vertices[:, patch], cells.facets[:, patch]
-    V = fem.functionspace(mesh, ("Lagrange", 2))
-    dofs = V.dofmap.list[: vertices.shape[1]].T
-    b, x = fem.Function(V), fem.Function(V)
-    held = np.zeros_like(b.x.array)
-    held[dofs[: d + 1][~free_vertices[vertices]]] = 1.0
-    held[dofs[d + 1 :][~free_facets[facets]]] = 1.0
-    shared_maximum(mesh, V.dofmap.index_map, held)
-    fixed = np.flatnonzero(held > 0.0).astype(np.int32)
-    # A nodal function of a vertex is λ_i less half the bumps of the two facets it belongs to
-    pull = slopes.facets[:, patch]
-    rows = np.concatenate([slopes.vertices[:, patch] - 0.5 * (sum_rows(pull) - pull), pull])
-    b.x.array[:] = np.bincount(dofs.ravel(), rows.ravel(), minlength=len(held))
-    b.x.scatter_reverse(InsertMode.add)
-    b.x.array[fixed] = 0.0
-    k = cells.coefficient(kappa, mesh, patch)
-    u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
-    energy = ufl.inner(k * ufl.grad(u), ufl.grad(w))
-    if masses is not None and masses.reacts:
-        energy += on_cells(mesh, np.broadcast_to(masses.reaction, cells.number)[patch]) * u * w
-    form = compiled(mesh.comm, fem.form, energy * ufl.dx)
-    A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
-    A.assemble()
-    if masses is not None and masses.some:
-        _add_losses(A, cells, masses, patch, dofs, held > 0.0)
-    load, found = (ghosted_vector(V, function.x.array) for function in (b, x))
+    patch = _Patch.of(cells, free_vertices, free_facets)
+    A, x = patch.matrix(kappa, masses), fem.Function(patch.V)
+    load, found = (ghosted_vector(patch.V, array) for array in (patch.fall(slopes), x.x.array))
     solve_once(A, load, found, COMPANION | {"ksp_rtol": SHARE}, ESTIMATE_PREFIX)
     release(A, load, found)
     # aggregates of fixed and free values mix what an iteration leaves of both
-    x.x.array[fixed] = 0.0
+    x.x.array[patch.held] = 0.0
     x.x.scatter_forward()
-    nodal = x.x.array[dofs]
-    corners, middles = nodal[: d + 1], nodal[d + 1 :]
+    corners, middles = np.split(x.x.array[patch.dofs], 2)
     at_vertices, heights = np.zeros(len(free_vertices)), np.zeros(len(free_facets))
-    at_vertices[vertices] = corners
-    heights[facets] = middles - 0.5 * (sum_rows(corners) - corners)
+    at_vertices[cells.vertices[:, patch.at]] = corners
+    heights[cells.facets[:, patch.at]] = middles - 0.5 * (sum_rows(corners) - corners)
     return at_vertices, heights
 
 
-def _add_losses(
-    A: PETSc.Mat,
-    cells: Cells,
-    masses: Masses,
-    patch: slice | IndexArray,
-    dofs: Int32Array,
-    held: BoolArray,
-) -> None:
-    """Add ∫ b u w over facets; collective.
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """The functions of degree 2 on the cells that know of free values, or on all.
 
-    Args:
-        A: The matrix, in whose pattern this is.
-        cells: The mesh.
-        masses: b.
-        patch: Which cells the matrix is of.
-        dofs: Their dofs, shape (6, n).
-        held: Which dofs have rows and columns of the identity.
+    Attributes:
+        cells: All cells.
+        at: Which of them these are.
+        V: The functions.
+        dofs: Dofs of the cells' vertices and facets, shape (6, n).
+        held: Which dofs are not free, ghosts included.
     """
-    row = np.full(cells.number, -1)
-    row[patch] = np.arange(dofs.shape[1])
-    side, at = masses.side, row[masses.side.cells]
-    near = at >= 0
-    local, at, loss = side.local[near], at[near], masses.loss[near]
-    of_facet = np.vstack([dofs[cells.others[local].T, at], dofs[3 + local, at]]).T
-    of_facet = np.where(held[of_facet], -1, of_facet).astype(PETSc.IntType)  # which are passed over
-    start = np.arange(0, 3 * of_facet.size + 1, 3, dtype=PETSc.IntType)
-    columns = np.repeat(of_facet, 3, axis=0).ravel()
-    values = (loss[:, None, None] * OF_FACET).ravel()
-    A.setValuesLocalIJV(start, columns, values, addv=True, rowmap=of_facet.ravel())
-    A.assemble()
+
+    cells: Cells
+    at: slice | IndexArray
+    V: fem.FunctionSpace
+    dofs: Int32Array
+    held: BoolArray
+
+    @classmethod
+    def of(cls, cells: Cells, free_vertices: BoolArray, free_facets: BoolArray) -> _Patch:
+        """Make the cells that know of free values a mesh if they are few; collective."""
+        mesh, number = cells.domain.mesh, cells.number
+        at: slice | IndexArray = slice(None)
+        some = np.flatnonzero(
+            free_vertices[cells.vertices].any(axis=0) | free_facets[cells.facets].any(axis=0)
+        )
+        few, all_ = cells.total(float(len(some)), float(number))
+        if 0.0 < few <= LARGEST * all_:
+            mesh, parents = compat.submesh(mesh, cells.tdim, some.astype(np.int32))
+            at, number = parents.astype(np.intp), len(parents)
+        V = fem.functionspace(mesh, ("Lagrange", 2))
+        dofs = V.dofmap.list[:number].T
+        free = free_vertices[cells.vertices[:, at]], free_facets[cells.facets[:, at]]
+        held = np.zeros_like(fem.Function(V).x.array)
+        held[dofs[~np.concatenate(free)]] = 1.0
+        shared_maximum(mesh, V.dofmap.index_map, held)
+        return cls(cells, at, V, dofs, held > 0.0)
+
+    def fall(self, slopes: Slopes) -> FloatArray:
+        """Compute how fast E falls by values at dofs, 0 for those held; collective."""
+        # A nodal function of a vertex is λ_i less half the bumps of the two facets it belongs to
+        pull = slopes.facets[:, self.at]
+        rows = [slopes.vertices[:, self.at] - 0.5 * (sum_rows(pull) - pull), pull]
+        own = np.bincount(self.dofs.ravel(), np.concatenate(rows).ravel(), len(self.held))
+        found = shared_sum(self.V.mesh, self.V.dofmap.index_map, own.astype(np.float64))
+        return np.where(self.held, 0.0, found)
+
+    def matrix(self, kappa: FloatArray, masses: Masses | None) -> PETSc.Mat:
+        """Assemble E's matrix, where values are held that of the identity; collective."""
+        V, mesh = self.V, self.V.mesh
+        u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
+        k = self.cells.coefficient(kappa, mesh, self.at)
+        energy = ufl.inner(k * ufl.grad(u), ufl.grad(w))
+        if masses is not None and masses.reacts:
+            reaction = np.broadcast_to(masses.reaction, self.cells.number)
+            energy += on_cells(mesh, reaction[self.at]) * u * w
+        form = compiled(mesh.comm, fem.form, energy * ufl.dx)
+        fixed = np.flatnonzero(self.held).astype(np.int32)
+        A = assemble_matrix(form, [fem.dirichletbc(fem.Function(V), fixed)])
+        A.assemble()
+        if masses is not None and masses.some:
+            self._add_losses(A, masses)
+        return A
+
+    def _add_losses(self, A: PETSc.Mat, masses: Masses) -> None:
+        """Add ∫ b u w over facets to a matrix, in whose pattern this is; collective."""
+        row, side = np.full(self.cells.number, -1), masses.side
+        row[self.at] = np.arange(self.dofs.shape[1])
+        at = row[side.cells]
+        near = at >= 0
+        local, at, loss = side.local[near], at[near], masses.loss[near]
+        ends, middle = self.dofs[self.cells.others[local].T, at], self.dofs[3 + local, at]
+        of_facet = np.vstack([ends, middle]).T
+        of_facet = np.where(self.held[of_facet], -1, of_facet).astype(PETSc.IntType)  # passed over
+        start = np.arange(0, 3 * of_facet.size + 1, 3, dtype=PETSc.IntType)
+        columns = np.repeat(of_facet, 3, axis=0).ravel()
+        values = (loss[:, None, None] * OF_FACET).ravel()
+        A.setValuesLocalIJV(start, columns, values, addv=True, rowmap=of_facet.ravel())
+        A.assemble()
