@@ -9,7 +9,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
-from dolfinx.la import InsertMode
 
 from ..arrays import FloatArray, Int32Array
 from ..data.diffusion import diffusion
@@ -291,12 +290,12 @@ def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Functio
     """
     V = values.function_space
     bc, form, phi = fem.dirichletbc(values, known), _form(V, made), fem.Function(V)
-    A, b = assemble_matrix(form, [bc]), fem.Function(V)
+    A, b = assemble_matrix(form, [bc]), np.zeros_like(phi.x.array)
     A.assemble()
-    fem.apply_lifting(b.x.array, [form], [[bc]])
-    b.x.scatter_reverse(InsertMode.add)
-    b.x.array[known] = values.x.array[known]
-    load, found = (ghosted_vector(V, function.x.array) for function in (b, phi))
+    fem.apply_lifting(b, [form], [[bc]])
+    shared_sum(V.mesh.comm, V.dofmap.index_map, b)
+    b[known] = values.x.array[known]
+    load, found = (ghosted_vector(V, array) for array in (b, phi.x.array))
     solve_once(A, load, found, DUAL, ESTIMATE_PREFIX)
     release(A, load, found)
     # Exactly so, whatever the solver did
