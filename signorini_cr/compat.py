@@ -54,6 +54,12 @@ def coordinate_map(mesh: Mesh) -> Any:
     return cmap._cpp_object
 
 
+def interpolation_points(V: fem.FunctionSpace) -> FloatArray:
+    """Return the points on the reference cell whose values an interpolant is made of."""
+    points = V.element.interpolation_points
+    return np.asarray(points() if callable(points) else points)  # a property since 0.10
+
+
 def index_map(
     comm: MPI.Comm, owned: int, ghosts: Int64Array, owners: Int32Array
 ) -> cpp.common.IndexMap:

@@ -111,8 +111,7 @@ class Certificate:
         if beyond is not None:
             field += beyond.field(cells)
         y = fem.Function(fem.functionspace(mesh, ("RT", 1 if beyond is None else 2)))
-        points = y.function_space.element.interpolation_points
-        points = points() if callable(points) else points
+        points = compat.interpolation_points(y.function_space)
         y.interpolate(compiled(mesh.comm, fem.Expression, field, points))
         return y
 

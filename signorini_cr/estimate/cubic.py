@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import fem
 
+from .. import compat
 from ..arrays import FloatArray
 from ..data.moments import OnFacets
 from ..fem.cells import Cells, blocks, dot_rows, pick
@@ -62,8 +63,7 @@ def with_cubics(
     mesh = cells.domain.mesh
     pieces = fem.Function(fem.functionspace(mesh, ("DG", 3)))
     pieces.interpolate(v)
-    points = pieces.function_space.element.interpolation_points
-    points = points() if callable(points) else points
+    points = compat.interpolation_points(pieces.function_space)
     hats = np.column_stack([1.0 - points.sum(axis=1), points])
     values = np.stack(
         [hats[:, j] * hats[:, k] * (hats[:, j] - hats[:, k]) for j, k in cells.others]
