@@ -293,7 +293,7 @@ def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Functio
     A, b = assemble_matrix(form, [bc]), np.zeros_like(phi.x.array)
     A.assemble()
     fem.apply_lifting(b, [form], [[bc]])
-    shared_sum(V.mesh.comm, V.dofmap.index_map, b)
+    shared_sum(V.mesh, V.dofmap.index_map, b)
     b[known] = values.x.array[known]
     load, found = (ghosted_vector(V, array) for array in (b, phi.x.array))
     solve_once(A, load, found, DUAL, ESTIMATE_PREFIX)

@@ -483,8 +483,8 @@ def test_the_range_of_a_weight():
     other = fem.Function(fem.functionspace(square(2).mesh, ("Lagrange", 1)))
     for weight in (lambda _: other, lambda x: other + x[0]):
         with pytest.raises(InputError, match="another mesh"):
-            weights.scalar(weight, forms)
-    assert weights.scalar(lambda x: x[0], forms) == forms.x[0]
+            weights.scalar(weight, forms, level.domain)
+    assert weights.scalar(lambda x: x[0], forms, level.domain) == forms.x[0]
 
 
 @pytest.mark.serial
