@@ -6,7 +6,7 @@ limit = timeout --kill-after=20 2400
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz endurance docs quick test test-alone test-pair quick-pair coverage \
+.PHONY: demo studies verify fuzz endurance docs quick quick-alone test test-alone test-pair quick-pair coverage \
     mutants ranks ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
 
 demo:
@@ -39,8 +39,11 @@ endurance:
 docs:
 	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
 
-# While one works: lint, types, and the tests that take next to no time
-quick: lint types
+# While one works: lint and types, beside them the tests that take next to no time
+quick:
+	@$(MAKE) --no-print-directory --keep-going --jobs 2 lint types quick-alone
+
+quick-alone:
 	$(run) $(limit) python3 -m pytest -q -m 'not slow'
 
 test: test-alone test-pair
