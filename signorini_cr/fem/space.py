@@ -7,7 +7,7 @@ facet's midpoint, which is its mean over the facet.
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import basix
@@ -28,7 +28,7 @@ ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
 KEPT = 8
 """For so many index maps of a mesh it is kept how its ranks share them, see `shared_sum`."""
 
-_exchanges: WeakKeyDictionary[Mesh, OrderedDict[tuple[Any, int], PETSc.Vec]] = WeakKeyDictionary()
+_exchanges: WeakKeyDictionary[Mesh, OrderedDict[tuple[Any, int], _Exchange]] = WeakKeyDictionary()
 
 
 def ufl_element(mesh: Mesh, element: str) -> Any:
@@ -236,17 +236,36 @@ def _gather(mesh: Mesh, index_map: Any, array: FloatArray, block: int, mode: Any
     kept, key = _exchanges.setdefault(mesh, OrderedDict()), (index_map, block)
     if key not in kept:
         if len(kept) == KEPT:
-            release(kept.popitem(last=False)[1])
-        kept[key] = ghosted(mesh.comm, index_map, np.empty(len(array)), block)
+            release(kept.popitem(last=False)[1].vector)
+        memory = np.empty(len(array))
+        kept[key] = _Exchange(ghosted(mesh.comm, index_map, memory, block), memory)
     kept.move_to_end(key)
-    vector = kept[key]
-    # petsc4py wants the owned part alone, but the ghosts behind it are put in place as well
-    vector.placeArray(array[: vector.getLocalSize()])
-    try:
-        vector.ghostUpdate(mode, PETSc.ScatterMode.REVERSE)
-        vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
-    finally:
-        vector.resetArray()
+    kept[key].run(array, mode)
+
+
+class _Exchange(NamedTuple):
+    """What is kept of how ranks share entities: a vector with room for ghosts, and its memory."""
+
+    vector: PETSc.Vec
+    memory: FloatArray
+
+    def run(self, array: FloatArray, mode: Any) -> None:
+        """Gather and hand out what there is in an array, in place; collective."""
+        # with an array in its memory's place, which takes no time, it does not work with copies;
+        # petsc4py asks for the owned part of that, and has no memory where a rank owns nothing
+        owned = self.vector.getLocalSize()
+        if owned:
+            self.vector.placeArray(array[:owned])
+        else:
+            self.memory[:] = array
+        try:
+            self.vector.ghostUpdate(mode, PETSc.ScatterMode.REVERSE)
+            self.vector.ghostUpdate(PETSc.InsertMode.INSERT_VALUES, PETSc.ScatterMode.FORWARD)
+        finally:
+            if owned:
+                self.vector.resetArray()
+            else:
+                array[:] = self.memory
 
 
 def facet_quadrature(mesh: Mesh, degree: int) -> tuple[FloatArray, FloatArray]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from dolfinx.mesh import GhostMode, create_rectangle, locate_entities_boundary
+from helpers import HELD_ABOVE
 from mpi4py import MPI
 
 from signorini_cr.compat import cell_nodes
@@ -110,6 +111,22 @@ def test_shared_sums_of_more_index_maps_than_are_kept(mesh):
         copies = np.bincount(everywhere, minlength=index_map.size_global)[numbers]
         sums = shared_sum(mesh, index_map, np.ones(block * len(nodes)), block)
         assert np.array_equal(sums.reshape(-1, block), np.tile(copies, (block, 1)).T)
+
+
+@pytest.mark.ranks
+def test_sums_where_a_rank_owns_nothing():
+    """Some cells: on three ranks one has nodes of others alone."""
+    mesh = HELD_ABOVE.mesh(1.0).mesh
+    index_map = mesh.geometry.index_map()
+    nodes = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
+    numbers = index_map.local_to_global(nodes)
+    everywhere = np.concatenate(mesh.comm.allgather(numbers))
+    copies = np.bincount(everywhere, minlength=index_map.size_global)[numbers]
+    for _ in range(2):
+        assert np.array_equal(shared_sum(mesh, index_map, np.ones(len(nodes))), copies)
+        most = shared_maximum(mesh, index_map, np.full(len(nodes), float(mesh.comm.rank)))
+        held = mesh.comm.allgather(numbers)
+        assert most.tolist() == [max(r for r, own in enumerate(held) if n in own) for n in numbers]
 
 
 def test_unknown_element_is_named(mesh):
