@@ -29,6 +29,7 @@ from .diffusion import Diffusion
 from .errors import InputError, insist_on_count, insist_on_kind, raise_together
 from .fem.conditions import Data
 from .fem.problem import Problem, as_expression, functions_in
+from .fem.snapshot import Snapshot
 from .levels import LevelMonitor, Start, check_arguments, solve_level
 from .limits import Limits
 from .mesh.balance import Refined
@@ -98,11 +99,12 @@ class Solver:
         physics.check(domain)
         self._checked = physics.snapshot_of_holding()
         self.refined = [*known, *_uniform(domain, more)]
-        self._stack, self._solved, self._closed = ExitStack(), 0, False
+        self._stack, self._solved, self._solving, self._closed = ExitStack(), 0, 0, False
         self._set_up()
 
     def _set_up(self) -> None:
         """Assemble the matrix with the data as they are, and set up multigrid; collective."""
+        self._assembled: Snapshot | None = None  # for whoever goes on where this was not finished
         self._hierarchy = Hierarchy(self.physics, self._domain)
         for refined in self.refined:
             self._hierarchy.add(*refined)
@@ -128,7 +130,8 @@ class Solver:
     def _have_changed(self) -> tuple[bool, bool]:
         """Tell whether a_h, and u_D or bounds, would be others by now; collective."""
         comm, moments = self._domain.mesh.comm, (self._assembled, self._checked)
-        changed = summed(comm, np.array([not moment.lasts for moment in moments], dtype=float))
+        lasts = [moment is not None and moment.lasts for moment in moments]
+        changed = summed(comm, np.array(np.logical_not(lasts), dtype=float))
         return bool(changed[0]), bool(changed[1])
 
     def __repr__(self) -> str:
@@ -151,9 +154,10 @@ class Solver:
         self.close()
 
     def close(self) -> None:
-        """Free matrix and multigrid; collective."""
+        """Free matrix and multigrid, at the end of a solve that is under way; collective."""
         self._closed = True
-        self._stack.close()
+        if not self._solving:
+            self._stack.close()
 
     @property
     def V(self) -> fem.FunctionSpace:
@@ -196,7 +200,14 @@ class Solver:
         data = diffusion(self._level.data).renewed(own, rates)
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
         level = Level((*meshes[:-1], renewed), self._has_dirichlet, self._level.system)
-        return solve_level(level, lambda _: nullcontext(self._cycle), start, monitor, {"mesh": 0.0})
+        self._solving += 1
+        try:
+            lend = nullcontext(self._cycle)
+            return solve_level(level, lambda _: lend, start, monitor, {"mesh": 0.0})
+        finally:
+            self._solving -= 1
+            if self._closed:  # by the monitor
+                self.close()
 
     def _of_this(
         self,
@@ -216,8 +227,8 @@ class Solver:
         if self._closed:
             raise InputError("the solver is closed, and what it had is freed")
         known = before.u if isinstance(before, Solution) else before
-        size, comm = len(self._level.system.u_D.x.array), self._domain.mesh.comm
-        words = _unfit_rate(rate, diffusion(self._level.data).cells.number)
+        size, comm = Layout.of_space(self.V).local, self._domain.mesh.comm
+        words = _unfit_rate(rate, self._owned_cells)
         if len(set(comm.allgather(source is None))) > 1:
             words = "source: a Function is given on some ranks, and none on others"
         for name, given in (("source", source), ("before", known)):
@@ -229,13 +240,18 @@ class Solver:
         own = None if source is None else source.x.array.copy()
         return own, np.array(rate, dtype=np.float64), Start(known=known)
 
+    @property
+    def _owned_cells(self) -> int:
+        """Number of cells that this rank owns of the mesh that is solved on."""
+        topology = self.V.mesh.topology
+        return int(topology.index_map(topology.dim).size_local)
+
     def by_material(self, usual: float, own: Mapping[str, float]) -> FloatArray:
         """Spread materials' numbers over owned cells, shape (cells,), or () if all are the same."""
         if not own:
             return np.array(usual)
         domain = self._level.domain
-        index_map = domain.mesh.topology.index_map(domain.mesh.topology.dim)
-        found = np.full(index_map.size_local, usual)
+        found = np.full(self._owned_cells, usual)
         for name, value in own.items():
             found[domain.materials.where(name)[: len(found)]] = value
         return found
@@ -363,6 +379,7 @@ def solve_in_time(
             f"time is {time!r}; it must be a dolfinx Constant, a float64, which data hold"
         )
     check_arguments(problem, domain)
+    problem = problem.called_once()  # though a scheme may take a second solver
     own = _capacities(problem, capacity)
     if problem.exact is not None and problem.f is None:
         raise InputError("f: a problem in time derives none from exact, which tells no ∂u/∂t")

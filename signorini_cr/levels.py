@@ -283,8 +283,8 @@ def solve_level(
     if system.offset:  # the solver works with u less a number, where that is large
         u.x.array[:] += system.offset
     owned = system.A.getLocalSize()[0]
-    energy = level.domain.mesh.comm.allreduce(
-        0.5 * level.data.squared_energy_norm(u) - system.chi[:owned] @ u.x.array[:owned]
-    )
+    with level.as_made():  # whatever a monitor has done to the data
+        square = level.data.squared_energy_norm(u)
+    energy = level.domain.mesh.comm.allreduce(0.5 * square - system.chi[:owned] @ u.x.array[:owned])
     seconds["estimate"] = time.perf_counter() - clock
     return Solution(level, u, residual, contact, float(energy), iterations, seconds)

@@ -15,6 +15,7 @@ from signorini_cr import (
     Dirichlet,
     Form,
     InputError,
+    Material,
     Neumann,
     NotConverged,
     Polygon,
@@ -22,6 +23,7 @@ from signorini_cr import (
     Robin,
     Solver,
     adapt_to_run,
+    evolution,
     limits,
     norms,
     solve,
@@ -692,3 +694,99 @@ def test_errors_of_another_degree_are_those_of_their_time():
     wanted = [solution.errors for solution in run]
     t.value = 77.0
     assert [norms.errors(solution, 8) for solution in run] == pytest.approx(wanted, rel=1e-12)
+
+
+def test_bounds_are_those_of_the_data_that_were_solved():
+    """u = 1.5 (y² − 1), whatever variables and dictionaries of the data hold later."""
+    domain, k, air = SQUARE.mesh(0.3), 1.0, {}
+    free = HELD_ABOVE | {"floor": Neumann()}
+    given = {"coefficient": lambda x: k, "exact": lambda x: k * 1.5 * (x[1] ** 2 - 1.0)}
+    solution = solve(Problem(f=-3.0, conditions=free, materials=air, **given), domain)
+    errors, flux = solution.errors, solution.flux("top")
+    k, air["none"], free["top"] = 0.01, Material(coefficient=9.0), Neumann()
+    for found, exact in ((solution.mean(), -1.0), (solution.integral(), -1.0), (flux, 3.0)):
+        assert found.lower <= exact <= found.upper <= found.lower + 0.1
+    assert solution.flux("top") == pytest.approx(flux, rel=1e-9)
+    assert norms.errors(solution, 6) == pytest.approx(errors, rel=1e-9)
+
+
+@pytest.mark.parametrize("scheme", ["euler", "bdf2"])
+def test_functions_are_called_once_for_all_steps(scheme):
+    """Though a scheme of second order takes two solvers: with 1 all the way, or 0.01 later."""
+    domain, runs = SQUARE.mesh(0.5), []
+    for later in (1.0, 0.01):
+        k = 1.0
+        problem = Problem(
+            f=lambda x: -3.0 * k,
+            coefficient=lambda x: k,
+            conditions={**HELD_ABOVE, "floor": Contact(lambda x: -0.1 * k)},
+        )
+        energies = []
+        for _, solution in solve_in_time(problem, domain, end=0.1, steps=3, scheme=scheme):
+            energies.append(solution.energy)
+            k = later
+        runs.append(energies)
+    assert runs[0] == pytest.approx(runs[1], rel=1e-12)
+
+
+class Interrupted(Exception):
+    pass
+
+
+def test_a_solver_goes_on_where_setting_up_was_not_finished(monkeypatch):
+    """With data that it refuses, or by an interruption, and then the former data again."""
+    domain = SQUARE.mesh(0.5)
+    c = fem.Constant(domain.mesh, 1.0)
+    problem = Problem(f=-3.0, coefficient=lambda x: c * (1 + x[0]), conditions=HELD_ABOVE)
+    with Solver(problem, domain, levels=2) as solver:
+        first = solver.solve().energy
+        for value in (np.inf, 1e308, -1.0):
+            c.value = value
+            with pytest.raises(InputError):
+                solver.solve()
+            c.value = 1.0
+            assert solver.solve().energy == pytest.approx(first, rel=1e-8)
+        for where in ("add", "multigrid"):
+            c.value = 2.0
+            with monkeypatch.context() as patch:
+                patch.setattr(evolution.Hierarchy, where, raising(Interrupted))
+                with pytest.raises(Interrupted):
+                    solver.solve()
+            c.value = 1.0
+            assert solver.solve().energy == pytest.approx(first, rel=1e-8)
+
+
+def raising(error):
+    def function(*_, **__):
+        raise error
+
+    return function
+
+
+def test_what_a_monitor_does_to_the_solver_it_watches():
+    """J(u_h) is that of the data that were solved; a solver that it closes is freed afterwards."""
+    domain = SQUARE.mesh(0.5)
+    c = fem.Constant(domain.mesh, 1.0)
+    problem = Problem(f=-3.0, coefficient=lambda x: c * (1 + x[0]), conditions=HELD_ABOVE)
+
+    def change(*_):
+        c.value = 3.0
+
+    with Solver(problem, domain, levels=2) as solver:
+        usual = solver.solve().energy
+        solution = solver.solve(monitor=change)
+        c.value = 1.0
+        low, high = solution.certificate.energy
+        assert solution.energy == pytest.approx(usual, rel=1e-8) and low < solution.energy < high
+        closing = solver.solve(monitor=lambda *_: solver.close())
+        assert closing.energy == pytest.approx(usual, rel=1e-8)
+        with pytest.raises(InputError, match="the solver is closed"):
+            solver.solve()
+
+
+def test_weights_that_are_no_numbers():
+    solution = solve(Problem(f=-3.0, conditions=HELD_ABOVE), SQUARE.mesh(0.5))
+    for weight in (np.nan, np.inf):
+        for figure in (solution.integral, lambda weight: solution.flux("top", weight=weight)):
+            with pytest.raises(InputError, match=f"the weight is {weight}; it must be finite"):
+                figure(weight=weight)

@@ -63,8 +63,11 @@ def read_case(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[Prob
     case = problemfile.load(args.file, comm)
     if getattr(args, "levels", None) is not None:
         case = replace(case, levels=args.levels)
-    if case.time is not None and getattr(args, "element", "cr") != "cr":
-        raise InputError("--element: problems in time are solved with cr")
+    if getattr(args, "element", "cr") != "cr":
+        if case.time is not None:
+            raise InputError("--element: problems in time are solved with cr")
+        if case.mode == "adaptive":
+            raise InputError("--element: meshes are adapted by bounds, which only cr has")
     screen.progress("making the mesh")
     domain = case.mesh(comm)
     for doubt in case.check(domain):

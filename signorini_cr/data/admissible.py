@@ -609,7 +609,7 @@ def _bad_coefficient(forms: Forms, domain: Domain) -> list[Complaint]:
     skew = np.abs(values - values.transpose(0, 2, 1))
     allowed = SKEW * size[:, None, None] + SAFETY * (errors + errors.transpose(0, 2, 1))
     crooked = np.asarray((skew > allowed).any(axis=(1, 2)))
-    least = np.linalg.eigvalsh(0.5 * (values + values.transpose(0, 2, 1)))[:, 0]
+    least = np.linalg.eigvalsh(0.5 * values + 0.5 * values.transpose(0, 2, 1))[:, 0]
     wrong = np.flatnonzero(crooked | ~(least > 0))
     if not len(wrong):
         return []

@@ -21,7 +21,7 @@ from ..data.moments import OnFacets, OnParts, Trace
 from ..data.pieces import Pieces
 from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
-from ..fem.conditions import Condition, Data, facets_of
+from ..fem.conditions import Condition, Data, as_number, facets_of
 from ..fem.problem import Forms, as_expression, functions_in
 from ..fem.space import function_space, shared_sum
 from ..mesh.domain import Domain
@@ -182,6 +182,8 @@ def scalar(weight: Data, forms: Forms, domain: Domain) -> ufl.core.expr.Expr:
     found = as_expression(weight, forms.x, "weight")
     if found.ufl_shape != ():
         raise InputError(f"the weight has the shape {found.ufl_shape}; a scalar is needed")
+    if (number := as_number(found)) is not None and not np.isfinite(number):
+        raise InputError(f"the weight is {number:g}; it must be finite")
     if any(each != forms.mesh.ufl_domain() for each in ufl.domain.extract_domains(found)):
         raise InputError("the weight is given on another mesh than the data")
     for function in functions_in([found]):

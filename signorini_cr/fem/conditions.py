@@ -26,6 +26,43 @@ Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
 
 
+class Once:
+    """A function of x in the data that is called once for each mesh.
+
+    What it returns may hang on variables that have other values later, when a bound is asked for,
+    say, or another solver is made for steps in time. A solution is that of the data as they were.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]):
+        """Take it."""
+        self._function = function
+        self._found: dict[Expr, Any] = {}
+        self.__name__ = getattr(function, "__name__", repr(function))
+
+    def __repr__(self) -> str:
+        """Write the function."""
+        return repr(self._function)
+
+    def __call__(self, x: Any) -> Any:
+        """Return what the function has returned for these coordinates."""
+        if not isinstance(x, Expr):
+            return self._function(x)
+        if x not in self._found:
+            self._found[x] = self._function(x)
+        return self._found[x]
+
+
+def once(data: Any) -> Any:
+    """Let functions in a dataclass of data be called once for each mesh, and leave all else."""
+    given = {each.name: getattr(data, each.name) for each in fields(data)}
+    own = {
+        name: Once(value)
+        for name, value in given.items()
+        if callable(value) and not isinstance(value, Expr | Once)
+    }
+    return replace(data, **own)
+
+
 def in_short(data: Any) -> str:
     """Write a dataclass with what differs from its defaults, functions by their names.
 

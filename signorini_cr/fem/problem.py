@@ -45,6 +45,7 @@ from .conditions import (
     as_number,
     in_short,
     is_by_cells,
+    once,
 )
 from .simplified import simplified
 from .snapshot import Snapshot
@@ -146,10 +147,21 @@ class Problem:
         insist_on_kind("conditions", self.conditions, Mapping, "a dictionary by parts")
         insist_on_kind("materials", self.materials, Mapping, "a dictionary by names")
         insist_on_kind("form", self.form, (Form, NoneType), "a Form")
+        for name in ("conditions", "materials"):  # whoever made the dictionary may change it
+            object.__setattr__(self, name, dict(getattr(self, name)))
         for name in ("quadrature_degree", "error_degree"):
             degree = getattr(self, name)
             if not isinstance(degree, int | np.integer) or degree < 0:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
+
+    def called_once(self) -> Problem:
+        """Make the same problem, whose functions of x are called once for each mesh."""
+        kinds = ((self.conditions, Condition), (self.materials, Material))
+        conditions, materials = (
+            {key: once(each) if isinstance(each, kind) else each for key, each in given.items()}
+            for given, kind in kinds
+        )
+        return replace(once(self), conditions=conditions, materials=materials)
 
     def linear(
         self,
@@ -334,6 +346,7 @@ class Forms:
         materials: What the mesh's cells consist of.
 
     Attributes:
+        problem: The data; functions among them have been called, and say the same from then on.
         f: Volume load.
         reaction: c.
         asked: The load that an exact solution asks for; None if there is none, or a constant.
@@ -351,7 +364,8 @@ class Forms:
         materials: Materials | None = None,
     ):
         materials = materials or Materials()
-        self.problem, self.mesh, self.element, self._parts = problem, mesh, element, parts
+        self.problem = problem = problem.called_once()
+        self.mesh, self.element, self._parts = mesh, element, parts
         self._numbers = materials.numbers
         cell = mesh.ufl_domain()
         self.space = ufl.FunctionSpace(cell, ufl_element(mesh, element))

@@ -121,8 +121,24 @@ class Domain:
     descent: tuple[Refinement, ...] = ()
 
     def __post_init__(self) -> None:
-        """Free what meshes before have left; collective."""
+        """Free what meshes before have left; collective.
+
+        Raises:
+            InputError: A facet between two cells has the value of a part.
+        """
         watch(self.mesh)
+        if not self.descent:
+            raise_together(self.mesh.comm, self._inside())
+
+    def _inside(self) -> str | None:
+        """Say that a facet of a part lies inside, if one does."""
+        topology = self.mesh.topology
+        topology.create_connectivity(topology.dim - 1, topology.dim)
+        outer = exterior_facet_indices(topology)
+        for name, value in self.parts.items():
+            if len(np.setdiff1d(self.facets(value), outer)):
+                return f"tags: a facet between two cells is {name}, which is a part of the boundary"
+        return None
 
     def __repr__(self) -> str:
         """Describe the domain in a line; the facets are those of this rank."""

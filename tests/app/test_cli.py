@@ -1128,6 +1128,17 @@ def test_petsc_takes_them(write) -> None:
     options.delValue("signorini_cr_probe")
 
 
+def test_meshes_are_not_adapted_with_another_element(write) -> None:
+    """As is clear before anything is solved: nothing is written."""
+    adaptive = write(CASE.replace('"uniform"', '"adaptive"'))
+    status, _, error = run("solve", adaptive, "--element", "p1", "--out", "out")
+    assert status == 2 and not Path("out").exists()
+    if COMM.rank == 0:
+        assert "--element: meshes are adapted by bounds, which only cr has" in " ".join(
+            error.split()
+        )
+
+
 def test_options_that_end_the_solver_early_are_told(write) -> None:
     """The start of the finer mesh counts as solved then, and what is left of the load is told."""
     from petsc4py import PETSc

@@ -604,6 +604,7 @@ def test_own_tags_that_do_not_fit():
     inside = dolfinx.mesh.locate_entities(mesh, 1, lambda x: np.isclose(x[1], 0.5))
     wall = dolfinx.mesh.meshtags(mesh, 1, inside, np.full(len(inside), 1, dtype=np.int32))
     assert "inside the domain" in fails_alike(lambda: Domain.from_tags(mesh, wall))
+    assert "between two cells is contact" in fails_alike(lambda: Domain(mesh, wall))
 
 
 def test_own_meshes_that_are_none():
