@@ -249,4 +249,4 @@ def _harmonic(
             found[each.part] = Dirichlet(value if each in chosen else 0.0)
         else:
             found[each.part] = Robin(0.0, coefficient=0.0 if each.loss is None else each.loss)
-    return forms.problem.linear(0.0, found)
+    return forms.called.linear(0.0, found)

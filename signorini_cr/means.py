@@ -164,8 +164,8 @@ def _dual(forms: Forms, where: str | None, weight: Data, held: Sequence[Conditio
             g, b = weight if each.part == where else 0.0, 0.0 if each.loss is None else each.loss
             conditions[each.part] = Robin(g, coefficient=b)
     if where is None:
-        return forms.problem.linear(weight, conditions)
-    return forms.problem.linear(0.0, conditions, {} if where in conditions else {where: weight})
+        return forms.called.linear(weight, conditions)
+    return forms.called.linear(0.0, conditions, {} if where in conditions else {where: weight})
 
 
 def _paired(z: Dual, made: Made, cells: Cells, where: str | None, width: float) -> Pairing:

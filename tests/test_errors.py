@@ -79,6 +79,21 @@ def on_a_part(condition: Any, part: str = "neumann") -> Problem:
     return Problem(conditions={part: condition})
 
 
+class OfOnesOwn(Robin):
+    """A condition whose loss fails on one rank."""
+
+    @property
+    def loss(self) -> Any:
+        return failing(one)(0)
+
+
+class MadeOnesOwn(Robin):
+    """A condition that can't be made on one rank."""
+
+    def made(self, *arguments: Any) -> Any:
+        return failing(super().made)(*arguments)
+
+
 PROBLEMS = {
     **{
         key: Problem(**{key: failing(one)})
@@ -87,6 +102,8 @@ PROBLEMS = {
     "b": on_a_part(Robin(coefficient=failing(one))),
     "u_ext": on_a_part(Robin(coefficient=1.0, external=failing(one))),
     "upper": on_a_part(Contact(-1.0, upper=failing(one)), "contact"),
+    "loss": on_a_part(OfOnesOwn(coefficient=1.0)),
+    "made": on_a_part(MadeOnesOwn(coefficient=1.0)),
     "form": Problem(form=Form(failing(laplace))),
     "load": Problem(form=Form(laplace, failing(lambda v, dx, ds: v * dx))),
 }

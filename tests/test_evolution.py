@@ -710,16 +710,25 @@ def test_bounds_are_those_of_the_data_that_were_solved():
     assert norms.errors(solution, 6) == pytest.approx(errors, rel=1e-9)
 
 
+def of_ones_own(size):
+    return Form(
+        lambda u, v, dx, ds: size() * ufl.inner(ufl.grad(u), ufl.grad(v)) * dx,
+        lambda v, dx, ds: -size() * v * dx,
+    )
+
+
+@pytest.mark.parametrize("form", [False, True], ids=["", "form"])
 @pytest.mark.parametrize("scheme", ["euler", "bdf2"])
-def test_functions_are_called_once_for_all_steps(scheme):
+def test_functions_are_called_once_for_all_steps(scheme, form):
     """Though a scheme of second order takes two solvers: with 1 all the way, or 0.01 later."""
     domain, runs = SQUARE.mesh(0.5), []
     for later in (1.0, 0.01):
         k = 1.0
+        given = {"form": of_ones_own(lambda: k)} if form else {"coefficient": lambda x: k}
         problem = Problem(
             f=lambda x: -3.0 * k,
-            coefficient=lambda x: k,
             conditions={**HELD_ABOVE, "floor": Contact(lambda x: -0.1 * k)},
+            **given,
         )
         energies = []
         for _, solution in solve_in_time(problem, domain, end=0.1, steps=3, scheme=scheme):
@@ -790,3 +799,31 @@ def test_weights_that_are_no_numbers():
         for figure in (solution.integral, lambda weight: solution.flux("top", weight=weight)):
             with pytest.raises(InputError, match=f"the weight is {weight}; it must be finite"):
                 figure(weight=weight)
+
+
+def test_a_solution_knows_the_problem_as_it_was_given():
+    """Who solves it again has its functions called anew; a class may have arguments of its own."""
+
+    class Ours(Problem):
+        def __init__(self, load):
+            super().__init__(f=load, conditions=HELD_ABOVE)
+
+    domain, k = SQUARE.mesh(0.5), 1.0
+    for problem in (Problem(f=lambda x: -3.0 * k, conditions=HELD_ABOVE), Ours(lambda x: -3.0 * k)):
+        k = 1.0
+        solution = solve(problem, domain)
+        assert solution.problem is problem and solution.mean().lower < solution.mean().upper
+        k = 2.0
+        again, other = solve(solution.problem, domain), solve(Ours(-6.0), domain)
+        assert again.energy == pytest.approx(other.energy, rel=1e-10)
+
+
+def test_small_loads_of_later_solves_matter_as_well():
+    domain = SQUARE.mesh(0.5)
+    f = fem.Constant(domain.mesh, -3e10)
+    small = {**HELD_ABOVE, "floor": Contact(-1e-113)}
+    with Solver(Problem(f=f, coefficient=1e-20, conditions=small), domain) as solver:
+        assert solver.solve().contact.number_active > 0
+        f.value = -1e-131  # which holds u on the obstacle
+        with pytest.raises(InputError, match="so small that their squares are lost"):
+            solver.solve()

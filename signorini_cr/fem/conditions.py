@@ -7,11 +7,12 @@ condition for what it adds, and none for its kind; so one more kind is one more 
 
 from __future__ import annotations
 
+import copy
 import re
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 import ufl
@@ -22,45 +23,67 @@ from ..arrays import Int32Array
 from ..mesh import domain
 from ..mesh.domain import Domain
 
+T = TypeVar("T")
+
 Data: TypeAlias = float | Expr | Callable[[Expr], Any]
 """A number, a UFL expression, or a function of x = ufl.SpatialCoordinate that returns one."""
 
 
+MESHES = 4
+"""For so many meshes, or arguments, a function is called once, if it is used on many in turn."""
+
+
 class Once:
-    """A function of x in the data that is called once for each mesh.
+    """A function in the data that is called once for a mesh.
 
     What it returns may hang on variables that have other values later, when a bound is asked for,
     say, or another solver is made for steps in time. A solution is that of the data as they were.
     """
 
-    def __init__(self, function: Callable[[Any], Any]):
+    def __init__(self, function: Callable[..., Any]):
         """Take it."""
         self._function = function
-        self._found: dict[Expr, Any] = {}
-        self.__name__ = getattr(function, "__name__", repr(function))
+        self._known: dict[tuple[Expr, ...], Any] = {}
 
     def __repr__(self) -> str:
         """Write the function."""
         return repr(self._function)
 
-    def __call__(self, x: Any) -> Any:
-        """Return what the function has returned for these coordinates."""
-        if not isinstance(x, Expr):
-            return self._function(x)
-        if x not in self._found:
-            self._found[x] = self._function(x)
-        return self._found[x]
+    def __getattr__(self, name: str) -> Any:
+        """Have all else that the function has, its name for one."""
+        if name == "_function":  # before there is one, as in a copy
+            raise AttributeError(name)
+        return getattr(self._function, name)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return what the function has returned for these coordinates, or arguments of a form."""
+        given = tuple(each for each in arguments if isinstance(each, Expr))
+        if not given:
+            return self._function(*arguments)
+        if given not in self._known:
+            if len(self._known) == MESHES:  # each of which lives as long as what is known of it
+                self._known.clear()
+            self._known[given] = self._function(*arguments)
+        return self._known[given]
 
 
-def once(data: Any) -> Any:
-    """Let functions in a dataclass of data be called once for each mesh, and leave all else."""
-    given = {each.name: getattr(data, each.name) for each in fields(data)}
+def changed(data: T, **others: Any) -> T:
+    """Copy a dataclass of data with other values of some fields, however its class is made."""
+    made = copy.copy(data)
+    for name, value in others.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def once(data: T) -> T:
+    """Copy a dataclass of data, whose functions are called once for a mesh."""
+    given = {each.name: getattr(data, each.name) for each in fields(cast(Any, data))}
     own = {
         name: Once(value)
         for name, value in given.items()
         if callable(value) and not isinstance(value, Expr | Once)
     }
-    return replace(data, **own)
+    return changed(data, **own)
 
 
 def in_short(data: Any) -> str:
@@ -168,7 +191,8 @@ class Condition:
         }
         if left_out and (derived := self._derived(given, expressions)) is not None:
             expressions[main], source = derived, "exact.u"
-        return replace(self, part=part, number=number, label=label, source=source, **expressions)
+        own = {"part": part, "number": number, "label": label, "source": source, **expressions}
+        return changed(self, **own)
 
     @classmethod
     def names(cls) -> tuple[str, ...]:

@@ -43,6 +43,7 @@ from .conditions import (
     Given,
     Neumann,
     as_number,
+    changed,
     in_short,
     is_by_cells,
     once,
@@ -155,13 +156,14 @@ class Problem:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
 
     def called_once(self) -> Problem:
-        """Make the same problem, whose functions of x are called once for each mesh."""
+        """Make the same problem, whose functions are called once for a mesh."""
         kinds = ((self.conditions, Condition), (self.materials, Material))
         conditions, materials = (
             {key: once(each) if isinstance(each, kind) else each for key, each in given.items()}
             for given, kind in kinds
         )
-        return replace(once(self), conditions=conditions, materials=materials)
+        form = None if self.form is None else once(self.form)
+        return changed(once(self), conditions=conditions, materials=materials, form=form)
 
     def linear(
         self,
@@ -180,7 +182,7 @@ class Problem:
         for name, load in own.items():
             materials[name] = replace(materials.get(name, Material()), f=load)
         unused = Problem()
-        return replace(
+        return changed(
             self,
             f=f,
             g=unused.g,
@@ -206,26 +208,27 @@ def as_expression(data: Data, x: Expr, called: str = "data", in_cells: bool = Fa
     Raises:
         InputError: That is not possible.
     """
-
-    def made() -> Expr:
-        try:
-            found = ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
-            for each in unique_pre_traversal(found):
-                for kind, words in _NO_DATA.items():
-                    if isinstance(each, kind) and (in_cells or kind is not GeometricFacetQuantity):
-                        raise ValueError(f"it holds {words}")
-                if isinstance(each, IntValue):
-                    float(each)  # which may be too large
-            return found
-        except (TypeError, ValueError, OverflowError) as error:
-            text = "expressions as text are for problem files; " if isinstance(data, str) else ""
-            raise InputError(
-                f"{called}: {data!r} does not give a number or a UFL expression ({error}); {text}"
-                "functions of x take theirs from ufl, as in ufl.sin(x[0])"
-            ) from error
-
     mesh = extract_unique_domain(x).ufl_cargo()
-    return together(mesh.comm, made)
+    return together(mesh.comm, _expression, data, x, called, in_cells)
+
+
+def _expression(data: Data, x: Expr, called: str, in_cells: bool = False) -> Expr:
+    """Do what `as_expression` does on this rank."""
+    try:
+        found = ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+        for each in unique_pre_traversal(found):
+            for kind, words in _NO_DATA.items():
+                if isinstance(each, kind) and (in_cells or kind is not GeometricFacetQuantity):
+                    raise ValueError(f"it holds {words}")
+            if isinstance(each, IntValue):
+                float(each)  # which may be too large
+        return found
+    except (TypeError, ValueError, OverflowError) as error:
+        text = "expressions as text are for problem files; " if isinstance(data, str) else ""
+        raise InputError(
+            f"{called}: {data!r} does not give a number or a UFL expression ({error}); {text}"
+            "functions of x take theirs from ufl, as in ufl.sin(x[0])"
+        ) from error
 
 
 _NO_DATA: dict[type, str] = {
@@ -346,7 +349,8 @@ class Forms:
         materials: What the mesh's cells consist of.
 
     Attributes:
-        problem: The data; functions among them have been called, and say the same from then on.
+        problem: The data as they were given.
+        called: The same, whose functions have been called.
         f: Volume load.
         reaction: c.
         asked: The load that an exact solution asks for; None if there is none, or a constant.
@@ -364,7 +368,7 @@ class Forms:
         materials: Materials | None = None,
     ):
         materials = materials or Materials()
-        self.problem = problem = problem.called_once()
+        self.problem, self.called = problem, (problem := problem.called_once())
         self.mesh, self.element, self._parts = mesh, element, parts
         self._numbers = materials.numbers
         cell = mesh.ufl_domain()
@@ -402,8 +406,8 @@ class Forms:
             self.asked = gain if self.asked is None else simplified(self.asked + gain)
         derived = 0.0 if self.asked is None else self.asked
         self.f = self._by_material("f", derived if problem.f is None else problem.f, materials)
-        given = Given(partial(as_expression, x=self.x), self.exact, outward)
-        self.conditions = _conditions(problem, given, parts)
+        given = Given(partial(_expression, x=self.x), self.exact, outward)
+        self.conditions = together(mesh.comm, _conditions, problem, given, parts)
         d = mesh.geometry.dim
         for key, data in self._data.items():
             if data.ufl_shape != () and (key, data.ufl_shape) != ("coefficient", (d, d)):
@@ -416,7 +420,7 @@ class Forms:
         base = as_expression(usual, self.x, name, in_cells=True)
         own = {
             material: as_expression(datum, self.x, f"materials[{material!r}].{name}", in_cells=True)
-            for material, data in self.problem.materials.items()
+            for material, data in self.called.materials.items()
             if (datum := getattr(data, name)) is not None
         }
         if any(each.ufl_shape for each in (base, *own.values())):
@@ -577,7 +581,7 @@ class Forms:
     @cached_property
     def own_load(self) -> Kernel | None:
         """The load of the user's own form, if it has one."""
-        own = self.problem.form
+        own = self.called.form
         if own is None or own.load is None:
             return None
         return Kernel(self._own("load", 1, ufl.TestFunction(self.space)), self.mesh)
@@ -604,8 +608,10 @@ class Forms:
             one = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name="1")
             one.x.array[:] = 1.0
             own = self._called("a", one, v)
-            if not compute_form_data(own, complex_mode=False).preprocessed_form.empty():
-                terms.append(own)
+            if not own.empty():  # UFL knows some gradients to be 0 at once, others only here
+                own = compute_form_data(own, complex_mode=False).preprocessed_form
+            if not own.empty():
+                terms.append(self._called("a", one, v))
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:
@@ -643,11 +649,20 @@ class Forms:
         return _Cells(self._numbers, self.mesh.ufl_domain()), ds
 
     def _called(self, name: str, *arguments: Expr) -> Any:
-        """Call a function of the user's that makes a form; what one rank raises all do."""
+        """Call a function of the user's that makes a form; what one rank raises all do.
+
+        It is called with the arguments of `a` alone, which others then take the place of: a is
+        needed at several times, and is to be the same.
+        """
+        own = ufl.TrialFunction(self.space), ufl.TestFunction(self.space)
+        given = own if name == "a" else own[1:]
 
         def made() -> object:
             try:
-                return getattr(self.problem.form, name)(*arguments, *self._measures)
+                found = getattr(self.called.form, name)(*given, *self._measures)
+                if not isinstance(found, ufl.Form):
+                    return found
+                return ufl.replace(found, dict(zip(given, arguments, strict=True)))
             except (TypeError, ValueError) as error:  # of UFL, or of what the function takes
                 raise InputError(f"form: {name} makes no form: {error}") from error
 
@@ -799,4 +814,6 @@ def _conditions(problem: Problem, given: Given, parts: Mapping[str, int]) -> tup
         else:
             raise InputError(f"conditions: the part {name!r} of the boundary has none")
         made.append(condition.made(given, name, value, label))
+        for said in ("fixed", "bounds", "flux", "loss"):  # properties of the user's own, perhaps
+            getattr(made[-1], said)
     return tuple(made)

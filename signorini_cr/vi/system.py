@@ -327,8 +327,7 @@ class System:
             moves = [np.abs(each) / self.operator.whole_diagonal for each in residuals]
         found = [max(float(each.max(initial=0.0)) for each in moves), given.max(initial=0.0)]
         moved, size = np.max(self._data.V.mesh.comm.allgather(found), axis=0)
-        # in a step in time, whose matrix is known, all may have come to rest
-        drowned = size < NOTHING**2 or self._like is not None or moved <= BESIDE * size
+        drowned = size < NOTHING**2 or moved <= BESIDE * size
         if moved > NOTHING or not drowned:
             raise InputError("data: so small that their squares are lost; choose other units")
 

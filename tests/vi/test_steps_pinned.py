@@ -191,7 +191,7 @@ TODAY: dict[str, tuple[str, ...]] = {
 """
 Newton steps and linear iterations on one rank, mesh by mesh, or step by step in time.
 """
-MORE, ANYHOW = 1.5, 12
+MORE, ANYHOW = (1.5 if MPI.COMM_WORLD.size < 3 else 2.0), 12
 """Linear iterations that several ranks may take: by their number on one rank, and at least. Rows
 of others are not up to date within a sweep, and what one rank factors several do not."""
 
