@@ -1,10 +1,10 @@
 """The reduced systems of the active set method, solved without extracting them.
 
-Extracting the reduced matrix costs as much as a dozen products with A, and a new size each time
-throws the linear solver away. Neither is needed: SNES is given a Jacobian whose submatrices have a
-size and nothing else, and a linear solver that works in the full space, with the identity in the
-rows and columns of the active dofs. That is the reduced system exactly. What is behind the prefix
-`signorini_ksp_` and `signorini_pc_` is this inner solver.
+Extracting the reduced matrix costs as much as seven products with A (`benchmarks/submatrix.py`), and
+a new size each time throws the linear solver away. Neither is needed: SNES is given a Jacobian whose
+submatrices have a size and nothing else, and a linear solver that works in the full space, with the
+identity in the rows and columns of the active dofs. That is the reduced system exactly. What is
+behind the prefix `signorini_ksp_` and `signorini_pc_` is this inner solver.
 
 It stops when its residual is a small part of what the active set's errors will leave anyway, so a
 Newton step with a wrong set ends early and one with the right set is the last; but not before it is
@@ -64,7 +64,7 @@ class FullJacobian:
 
     SNES takes a submatrix from it for the inactive dofs and hands that to its linear solver, which
     is a `ReducedSolver` and needs none. A virtual submatrix, which PETSc makes where there is no
-    other, takes as long to set up as five products with A.
+    other, takes no less to set up than a real one.
     """
 
     def __init__(self, A: PETSc.Mat):
