@@ -2,10 +2,10 @@
 
 The reduced systems of the active set method leave dofs out. Extracting them costs as much as seven
 products with the matrix (`benchmarks/submatrix.py`), a copy that has the identity in their rows and
-columns its memory. Only dofs with a bound can ever be constrained, and they are few: their rows and columns are
-kept here, and the matrix itself is changed for the length of a `with` block. Each rank writes its
-own rows and says nothing to the others when it puts them back, so that the matrix is whole after
-the block whatever fails in it, and on whichever rank.
+columns its memory. Only dofs with a bound can ever be constrained, and they are few: their rows and
+columns are kept here, and the matrix itself is changed for the length of a `with` block. Each rank
+writes its own rows and says nothing to the others when it puts them back, so that the matrix is
+whole after the block whatever fails in it, and on whichever rank.
 """
 
 from __future__ import annotations

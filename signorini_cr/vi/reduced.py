@@ -1,10 +1,10 @@
 """The reduced systems of the active set method, solved without extracting them.
 
-Extracting the reduced matrix costs as much as seven products with A (`benchmarks/submatrix.py`), and
-a new size each time throws the linear solver away. Neither is needed: SNES is given a Jacobian whose
-submatrices have a size and nothing else, and a linear solver that works in the full space, with the
-identity in the rows and columns of the active dofs. That is the reduced system exactly. What is
-behind the prefix `signorini_ksp_` and `signorini_pc_` is this inner solver.
+Extracting the reduced matrix costs as much as seven products with A (`benchmarks/submatrix.py`),
+and a new size each time throws the linear solver away. Neither is needed: SNES is given a Jacobian
+whose submatrices have a size and nothing else, and a linear solver that works in the full space,
+with the identity in the rows and columns of the active dofs. That is the reduced system exactly.
+What is behind the prefix `signorini_ksp_` and `signorini_pc_` is this inner solver.
 
 It stops when its residual is a small part of what the active set's errors will leave anyway, so a
 Newton step with a wrong set ends early and one with the right set is the last; but not before it is
