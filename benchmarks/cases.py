@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 
 from mpi4py import MPI  # first: the PETSc of the wheels finds the MPI that is loaded
 
@@ -31,6 +32,8 @@ from signorini_cr import (  # noqa: E402
 )
 from signorini_cr.fem.space import ghosted_vector  # noqa: E402
 from signorini_cr.mesh.domain import Domain  # noqa: E402
+from signorini_cr.multigrid.cycle import Multigrid  # noqa: E402
+from signorini_cr.multigrid.hierarchy import Hierarchy  # noqa: E402
 from signorini_cr.solution import Solution  # noqa: E402
 
 comm = MPI.COMM_WORLD
@@ -128,6 +131,19 @@ def meshes(
         yield solution
         if 4 * solution.dofs > 1.1 * dofs:
             return
+
+
+@contextmanager
+def cycle_of(solution: Solution) -> Iterator[Multigrid]:
+    """Lend a cycle for a solution's matrix, on its meshes."""
+    level = solution.level
+    hierarchy = Hierarchy(level.physics, solution.domain)
+    hierarchy.meshes = level.meshes
+    try:
+        with hierarchy.multigrid(level.system.operator, level.system.owned_dirichlet) as cycle:
+            yield cycle
+    finally:
+        hierarchy.free()
 
 
 def finest(name: str, dofs: float, nested: bool = True) -> Solution:

@@ -31,12 +31,11 @@ from collections.abc import Callable, Sequence
 from statistics import median, quantiles
 
 import numpy as np
-from cases import comm, finest, timed
+from cases import comm, cycle_of, finest, timed
 from harness import command_line, head, in_turns, keep, keep_memory, line
 from petsc4py import PETSc
 
 from signorini_cr.multigrid.cycle import LONG_SWEEPS, SWEEPS, Grid, Multigrid, TwoGrids
-from signorini_cr.multigrid.hierarchy import Hierarchy
 from signorini_cr.multigrid.smoothing import OVER_RELAXATION
 from signorini_cr.multigrid.transfer import Transfer
 from signorini_cr.options import SMALL_FACTORS, defaults
@@ -211,12 +210,9 @@ def rows(name: str, dofs: float, repeats: int) -> list[tuple[str, str]]:
     rounds = []
     for _ in range(ROUNDS):
         solution = finest(name, dofs)
-        level, hierarchy = solution.level, Hierarchy(solution.level.physics, solution.domain)
-        hierarchy.meshes = level.meshes
-        with hierarchy.multigrid(level.system.operator, level.system.owned_dirichlet) as cycle:
+        with cycle_of(solution) as cycle:
             rounds.append(compared(solution, cycle, repeats))
             grids = len(cycle.grids)
-        hierarchy.free()
         rounds[-1]["solve"] = [1e3 * solution.seconds["solve"]]
     found = {key: [value for each in rounds for value in each[key]] for key in rounds[0]}
     newton, cg = solution.iterations.newton, solution.iterations.linear

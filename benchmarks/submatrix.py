@@ -20,14 +20,13 @@ from functools import partial
 from statistics import median
 
 import numpy as np
-from cases import by_case, comm, finest, slowest, timed
+from cases import by_case, comm, cycle_of, finest, slowest, timed
 from harness import in_turns
 from petsc4py import PETSc
 
 from signorini_cr.garbage import release
 from signorini_cr.multigrid.constrained import numbers_of
 from signorini_cr.multigrid.cycle import Multigrid
-from signorini_cr.multigrid.hierarchy import Hierarchy
 from signorini_cr.solution import Solution
 
 Way = Callable[[PETSc.Mat, PETSc.IS, PETSc.Mat], PETSc.Mat]
@@ -110,11 +109,8 @@ def row(name: str, dofs: float, repeats: int) -> list[str]:
     rounds = []
     for _ in range(repeats):
         solution = finest(name, dofs)
-        level, hierarchy = solution.level, Hierarchy(solution.level.physics, solution.domain)
-        hierarchy.meshes = level.meshes
-        with hierarchy.multigrid(level.system.operator, level.system.owned_dirichlet) as cycle:
+        with cycle_of(solution) as cycle:
             rounds.append(measured(solution, cycle))
-        hierarchy.free()
         rounds[-1]["solve"] = [1e3 * slowest(solution.seconds["solve"])]
     found = {key: median(v for each in rounds for v in each[key]) for key in rounds[0]}
     newton, product = solution.iterations.newton, found["product"]

@@ -28,12 +28,12 @@ from .data.moments import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError, insist_on_count, insist_on_kind, raise_together
 from .fem.conditions import Data
-from .fem.problem import Problem, as_expression, functions_in
+from .fem.problem import Problem, as_expression, carry
 from .fem.snapshot import Snapshot
 from .levels import LevelMonitor, Start, check_arguments, solve_level
 from .limits import Limits
 from .mesh.balance import Refined
-from .mesh.domain import Domain, get_by_cells, set_by_cells
+from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.hierarchy import Hierarchy, NestedMesh
 from .multigrid.parents import Layout
@@ -121,11 +121,8 @@ class Solver:
 
     def _carry_down(self) -> None:
         """Give the data's Functions of degree 0 on all meshes the values they have by now."""
-        for function in self.physics.functions:
-            values = get_by_cells(function)
-            for fine, *_ in self.refined:
-                values = fine.descent[-1].carry(values)
-                set_by_cells(fine.own(function), values)
+        for fine, *_ in self.refined:
+            self.physics.carry_data(fine)
 
     def _have_changed(self) -> tuple[bool, bool]:
         """Tell whether a_h, and u_D or bounds, would be others by now; collective."""
@@ -268,8 +265,7 @@ class Solver:
                 raise InputError(
                     f"initial has the shape {expression.ufl_shape}; a scalar is needed"
                 )
-            for function in functions_in([expression]):
-                self._level.domain.carried(function)
+            carry([expression], self._level.domain)
             volume = Volume(expression, forms.mesh, rule)
             moments = chi(VolumeMoments.of(volume, on_mesh.cells), (), on_mesh.cells)
             sums.append(Layout.of_space(V).shared_sum(moments))

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from dolfinx.mesh import Mesh, exterior_facet_indices
+from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from . import compat
@@ -22,7 +22,7 @@ from .arrays import BoolArray, FloatArray, Int32Array
 from .errors import InputError
 from .fem.space import shared_maximum
 from .mesh.balance import Refined, balance
-from .mesh.domain import Domain
+from .mesh.domain import Domain, exterior_facets
 from .mesh.refinement import refine, refine_edges
 from .multigrid.hierarchy import NestedMesh
 from .multigrid.parents import Layout
@@ -201,13 +201,11 @@ def _sides(mesh: Mesh) -> tuple[Int32Array, BoolArray, Places, Places]:
         Edges, whether they are of the boundary, their midpoints, and where they are told to be, all
         of shape (cells, 3).
     """
-    topology = mesh.topology
-    topology.create_connectivity(2, 1)
-    topology.create_connectivity(1, 2)
-    edges = topology.connectivity(2, 1).array.reshape(-1, 3)
-    index_map = topology.index_map(1)
+    exterior = exterior_facets(mesh)
+    edges = mesh.topology.connectivity(2, 1).array.reshape(-1, 3)
+    index_map = mesh.topology.index_map(1)
     outer = np.zeros(index_map.size_local + index_map.num_ghosts)
-    outer[exterior_facet_indices(topology)] = 1.0
+    outer[exterior] = 1.0
     of_boundary = shared_maximum(mesh, index_map, outer)[edges] > 0.0
     corners = _corners(mesh)
     first, second = corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]

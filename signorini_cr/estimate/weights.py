@@ -22,7 +22,7 @@ from ..data.pieces import Pieces
 from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
 from ..fem.conditions import Condition, Data, as_number, facets_of
-from ..fem.problem import Forms, as_expression, functions_in
+from ..fem.problem import Forms, as_expression, carry
 from ..fem.space import function_space, shared_sum
 from ..mesh.domain import Domain
 from .certificate import Made
@@ -186,8 +186,7 @@ def scalar(weight: Data, forms: Forms, domain: Domain) -> ufl.core.expr.Expr:
         raise InputError(f"the weight is {number:g}; it must be finite")
     if any(each != forms.mesh.ufl_domain() for each in ufl.domain.extract_domains(found)):
         raise InputError("the weight is given on another mesh than the data")
-    for function in functions_in([found]):
-        domain.carried(function)
+    carry([found], domain)
     return found
 
 

@@ -333,9 +333,19 @@ def _constants_in(data: Iterable[Expr]) -> dict[fem.Constant, None]:
     return {e: None for each in data for e in ufl.algorithms.analysis.extract_constants(each)}
 
 
-def functions_in(data: Iterable[Expr]) -> dict[fem.Function, None]:
+def _functions_in(data: Iterable[Expr]) -> dict[fem.Function, None]:
     """Collect the Functions in expressions, each once."""
     return {e: None for each in data for e in ufl.algorithms.extract_coefficients(each)}
+
+
+def carry(data: Iterable[Expr], domain: Domain) -> None:
+    """Carry the Functions in expressions to a mesh, with the values they have now; collective.
+
+    Raises:
+        InputError: One of them is on another mesh, and can't be carried to this one.
+    """
+    for function in _functions_in(data):
+        domain.carried(function)
 
 
 class Forms:
@@ -522,7 +532,7 @@ class Forms:
     @cached_property
     def functions(self) -> list[fem.Function]:
         """The Functions that the data hold, each once."""
-        found = functions_in(self._data.values())
+        found = _functions_in(self._data.values())
         if self.problem.form is not None:
             for kernel in (self.a, self.own_load):
                 found |= dict.fromkeys([] if kernel is None else kernel.own)
@@ -545,7 +555,7 @@ class Forms:
 
     def snapshot_of_holding(self) -> Snapshot:
         """Note what Constants and Functions in these are at present, on the coarsest mesh."""
-        return Snapshot(list(_constants_in(self.holding)), functions_in(self.holding))
+        return Snapshot(list(_constants_in(self.holding)), _functions_in(self.holding))
 
     def snapshot(self, domains: Sequence[Domain]) -> Snapshot:
         """Note what the Constants and Functions are at present, on some meshes."""
@@ -608,10 +618,11 @@ class Forms:
             one = fem.Function(fem.functionspace(self.mesh, ("DG", 0)), name="1")
             one.x.array[:] = 1.0
             own = self._called("a", one, v)
-            if not own.empty():  # UFL knows some gradients to be 0 at once, others only here
-                own = compute_form_data(own, complex_mode=False).preprocessed_form
-            if not own.empty():
-                terms.append(self._called("a", one, v))
+            # UFL knows some gradients to be 0 at once, others only where it prepares a form
+            if not (
+                own.empty() or compute_form_data(own, complex_mode=False).preprocessed_form.empty()
+            ):
+                terms.append(own)
         return Kernel(sum(terms[1:], terms[0]), self.mesh) if terms else None
 
     def _bilinear(self, u: Expr, v: Expr) -> ufl.Form:

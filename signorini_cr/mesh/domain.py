@@ -132,9 +132,7 @@ class Domain:
 
     def _inside(self) -> str | None:
         """Say that a facet of a part lies inside, if one does."""
-        topology = self.mesh.topology
-        topology.create_connectivity(topology.dim - 1, topology.dim)
-        outer = exterior_facet_indices(topology)
+        outer = exterior_facets(self.mesh)
         for name, value in self.parts.items():
             if len(np.setdiff1d(self.facets(value), outer)):
                 return f"tags: a facet between two cells is {name}, which is a part of the boundary"
@@ -275,7 +273,7 @@ class Domain:
             needed |= set(USUAL)
         wanted = _wanted(given, inner, needed)
         raise_together(mesh.comm, _unfit(mesh, facet_tags))
-        exterior = _exterior(mesh)
+        exterior = exterior_facets(mesh)
         raise_together(mesh.comm, folded(mesh))
         values = _values(mesh, facet_tags, exterior, wanted, inner)
         known = {int(value) for numbers in wanted.values() for value in numbers}
@@ -435,7 +433,8 @@ def _count(mesh: Mesh, dim: int) -> int:
     return index_map.size_local + index_map.num_ghosts
 
 
-def _exterior(mesh: Mesh) -> Int32Array:
+def exterior_facets(mesh: Mesh) -> Int32Array:
+    """Find the facets of the boundary that this rank owns, local indices; collective."""
     tdim = mesh.topology.dim
     mesh.topology.create_connectivity(tdim - 1, tdim)
     mesh.topology.create_connectivity(tdim, tdim - 1)
@@ -692,7 +691,7 @@ def _distribute(
         e=element,
         partitioner=by_position(raw.points, raw.triangles),
     )
-    exterior = _exterior(mesh)
+    exterior = exterior_facets(mesh)
     ends, labels = distribute_entity_data(mesh, 1, raw.facets, raw.labels)
     mesh.topology.create_connectivity(1, 0)
     found = meshtags_from_entities(mesh, 1, adjacencylist(ends), labels)

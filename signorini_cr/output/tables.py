@@ -79,14 +79,11 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
         line += f"; it begins or ends at {', '.join(points[:6])}{more}{units.after('x')}"
     left, wrong = record["kkt"]["residual"], record["kkt"]["force_error"]
     if left is None or left > LEFT or wrong is None or wrong > WRONG:
+        known_to = f"forces are known to {short(wrong)} of their sum"
         line += (
-            f"; not converged as usual, as an option ends the solver early: the residual is"
+            "; not converged as usual, as an option ends the solver early: the residual is"
             f" {short(left)} of the load, and"
-        )
-        line += (
-            " how well forces are known is not known"
-            if wrong is None
-            else f" forces are known to {short(wrong)} of their sum"
+            f" {'how well forces are known is not known' if wrong is None else known_to}"
         )
     return line
 
