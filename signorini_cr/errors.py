@@ -45,7 +45,7 @@ def naming(thing: object, rule: str = "") -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(f"{thing}: {error}" + (rule and f"; {rule}")) from None
+        raise InputError(f"{thing}: {error}" + (rule and f"; {rule}")) from error.__cause__
 
 
 def insist_on_kind(name: str, value: object, kinds: type | tuple[type, ...], needed: str) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -17,7 +18,7 @@ import struct
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import wraps
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -29,10 +30,11 @@ from typing import Any, TypeAlias, TypeVar
 import cffi
 from dolfinx import jit
 from ffcx.codegeneration import jit as ffcx_jit
+from ffcx.options import FFCX_DEFAULT_OPTIONS
 from mpi4py import MPI
 
 from . import temporary
-from .errors import InputError, on_root
+from .errors import InputError, naming, on_root
 
 T = TypeVar("T")
 Loaded: TypeAlias = tuple[list[Any], ModuleType]
@@ -62,19 +64,23 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
         What `build` returns.
 
     Raises:
-        InputError: There is no folder to compile in, or no compiler that works.
+        InputError: There is no folder to compile in, no compiler that works, or a file with options
+            that is none.
     """
     began = time.time() - 0.1  # the clock that files are dated by may lag a little
     while True:
         place = {} if _elsewhere is None else {"jit_options": {"cache_dir": _elsewhere}}
         try:
             return build(*args, **place)
-        except (OSError, RuntimeError, ImportError, cffi.VerificationError) as error:
+        except (OSError, RuntimeError, ImportError, cffi.VerificationError, *_UNUSABLE) as error:
             # With several ranks DOLFINx raises RuntimeError on all of them, rank 0's with the words
             if comm.size > 1 and not re.search("(JIT|just-in-time) compilation", str(error)):
                 raise
             if comm.bcast(comm.rank == 0 and _waited_in_vain(str(error)), root=0):
                 continue
+            on_root(comm, _check_options)
+            if isinstance(error, _UNUSABLE):
+                raise
             if not _moved(comm):
                 _tell_of_compiler(comm, error)
                 raise
@@ -82,6 +88,42 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
             if comm.rank == 0:
                 remove_unfinished(began)
             raise
+
+
+_UNUSABLE = TypeError, ValueError, AttributeError
+"""What DOLFINx and FFCx raise over a file with options that they can't use, among others."""
+
+
+def _check_options() -> None:
+    """Insist on files with options, for who has any, that DOLFINx and FFCx can use."""
+    settings = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    usual = {key: value for key, (value, _) in jit.DOLFINX_DEFAULT_JIT_OPTIONS.items()}
+    of_forms = {key: value for key, (_, value, *_) in FFCX_DEFAULT_OPTIONS.items()}
+    for library, name, known in (
+        ("dolfinx", "dolfinx_jit_options.json", usual | {"cache_dir": str(usual["cache_dir"])}),
+        ("ffcx", "ffcx_options.json", of_forms),
+    ):
+        for path in (settings / library / name, Path.cwd() / name):
+            with naming(path):
+                _check_file(path, known)
+
+
+def _check_file(path: Path, usual: Mapping[str, Any]) -> None:
+    """Insist on values of the kinds that the usual ones have, None for any kind."""
+    try:
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise InputError(f"this is no JSON that can be read ({error})") from error
+    if not isinstance(found, dict):
+        raise InputError("a JSON object is needed, a value for each option")
+    for key, value in found.items():
+        wanted = usual.get(key)
+        number = isinstance(wanted, float) and isinstance(value, int)
+        if not (wanted is None or number or isinstance(value, type(wanted))):
+            kind = type(wanted).__name__
+            raise InputError(f"{key} is {value!r}; something of the type {kind} is needed")
 
 
 def _waited_in_vain(words: str) -> bool:

@@ -34,12 +34,14 @@ _WORDS = (
 def ran_out_of_memory(error: BaseException | None) -> bool:
     """Tell whether an error, or what it was raised from, says that no memory is left."""
     petsc: Any = getattr(sys.modules.get("petsc4py.PETSc"), "Error", ())
+    refusal: Any = getattr(sys.modules.get(f"{__package__}.errors"), "InputError", ())
     while error is not None:
         if (
             isinstance(error, MemoryError)
             or (isinstance(error, petsc) and error.ierr == _PETSC_ERR_MEM)
             or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
-            or any(words in str(error) for words in _WORDS)
+            # an InputError quotes what the user has written
+            or (not isinstance(error, refusal) and any(words in str(error) for words in _WORDS))
         ):
             return True
         error = error.__cause__

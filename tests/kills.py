@@ -158,9 +158,11 @@ def killed(
     case.write_text(CASES[kind])
     if kind == "time":  # steps are shorter than levels
         wanted *= 4
-    out.mkdir()
-    for name in FILES:
-        (out / name).write_text("former")
+    new = bool(np.random.default_rng([seed, 2]).integers(3) == 0)  # what has not been there yet
+    if not new:
+        out.mkdir()
+        for name in FILES:
+            (out / name).write_text("former")
     solve = [sys.executable, "-m", "signorini_cr", "solve", str(case), "--out", str(out)]
     launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
     clean = helpers.clean_environment(XDG_CACHE_HOME=str(own_cache(folder)))
@@ -198,7 +200,7 @@ def killed(
     begun = "cli.py" in said  # before that it is Python that is interrupted
     if "Traceback" in said and begun:
         faults.append(f"traceback: {said[-600:]}")
-    levels, more_faults = _left(out)
+    levels, more_faults = _left(out, new)
     if max(levels, 0) < done:
         faults.append(f"{done} levels were finished, {levels} are left")
     if target != "mpirun" and done and number != signal.SIGKILL:
@@ -220,20 +222,22 @@ def killed(
     )
 
 
-def _left(out: Path) -> tuple[int, list[str]]:
-    """How many levels are kept, and what is wrong with the folder."""
+def _left(out: Path, new: bool) -> tuple[int, list[str]]:
+    """How many levels are kept, and what is wrong with the folder; `new` if it was not there."""
     faults = []
     looked = time.monotonic()
     check_writable(out)  # as the next run does
     while any(out.glob(STAGE + "*")) and time.monotonic() - looked < PATIENCE:
         time.sleep(0.1)  # a process that is gone may have threads that are not, with its locks
         check_writable(out)
-    there = {path.name for path in out.iterdir()}
+    there = {path.name for path in out.iterdir()} if out.exists() else set()
     fields = {path.name for path in out.glob("step_*.vtu")}
     if strange := sorted(there - set(FILES) - fields):
         faults.append(f"left over: {strange}")
     if any(path.name.startswith(STAGE) for path in out.parent.iterdir()):
         faults.append("left over beside the folder")
+    if new and not there:
+        return 0, faults
     former = {name for name in there & set(FILES) if (out / name).read_bytes() == b"former"}
     if former == set(FILES):
         return -1, faults

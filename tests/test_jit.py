@@ -9,6 +9,7 @@ import ufl
 from dolfinx import fem
 from dolfinx import jit as dolfinx_jit
 from dolfinx.mesh import create_unit_square
+from helpers import start
 from mpi4py import MPI
 
 from signorini_cr import jit
@@ -70,6 +71,39 @@ def test_who_is_still_at_work_is_waited_for(cache: Path, monkeypatch) -> None:
     began = time.time()
     make(1.0)
     assert time.time() - began > 2.5
+
+
+@pytest.mark.serial
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("ffcx_options.json", '{"scalar_type":', "ffcx_options.json: this is no JSON"),
+        ("ffcx_options.json", "[1]", "ffcx_options.json: a JSON object is needed"),
+        (
+            "dolfinx_jit_options.json",
+            '{"cffi_extra_compile_args": 5}',
+            "cffi_extra_compile_args is 5; something of the type list is needed",
+        ),
+    ],
+)
+def test_options_of_the_libraries_that_cannot_be_used(name, text, words, tmp_path) -> None:
+    (tmp_path / name).write_text(text)
+    (tmp_path / "run.py").write_text(PLAIN)
+    done = start(tmp_path / "run.py", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert done.returncode == 1 and words in done.stderr.splitlines()[-1], done.stderr
+    assert "signorini_cr.errors.InputError: " in done.stderr
+
+
+PLAIN = """
+from dolfinx.mesh import create_unit_square
+from mpi4py import MPI
+import ufl
+from signorini_cr import jit
+from dolfinx import fem
+mesh = create_unit_square(MPI.COMM_WORLD, 1, 1)
+jit.compiled(mesh.comm, fem.form, ufl.SpatialCoordinate(mesh)[0] ** 5 * ufl.dx(mesh))
+"""
 
 
 def test_other_errors_are_passed_on(cache: Path) -> None:

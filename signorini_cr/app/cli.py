@@ -71,6 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(args, screen, asked)
         except KeyboardInterrupt:  # while nothing has begun, or when all has been told
             return status_of(asked)
+        except MemoryError:  # there was no room to tell of it
+            with suppress(OSError):
+                os.write(2, f"signorini-cr: {NO_MEMORY}\n".encode())
+            if launched()[1] > 1:  # the others know nothing of it
+                os._exit(NOT_CONVERGED)
+            return NOT_CONVERGED
 
 
 @contextmanager
@@ -254,10 +260,13 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..errors import naming
     from ..output import plots
     from ..output.files import check_writable, write_files
+    from ..output.report import CHECKED, REPORT
     from .runs import read_case
     from .statement import folded, statement
 
-    folder, picture = _folder(args), "mesh.png"
+    folder = _folder(args)
+    # mesh.png beside a report is that of its run
+    picture = comm.bcast(CHECKED if (folder / REPORT).exists() else "mesh.png")
     with naming("--out"):
         check_writable(folder, [picture], comm)
     case, domain = read_case(args, screen, comm)

@@ -118,6 +118,10 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
     for option, value in pairwise(petsc):
         if (complaint := _unusable(option, value)) is not None:
             parser.error(f"{option} {value}: {complaint}")
+    ours = commands[args.command]._option_string_actions
+    for word in filter(_is_petsc_option, petsc):
+        if word != "-help" and (name := "-" + word.split("=")[0]) in ours:
+            parser.error(f"{word}, with one dash, is not known to PETSc; did you mean {name}?")
     args.petsc, args.words = petsc, list(argv)
     return args
 
@@ -170,7 +174,8 @@ def _parser() -> tuple[_Parser, dict[str, _Parser]]:
         "check",
         help="validate a problem file and draw its mesh",
         description="Read and validate FILE.toml, make the coarsest mesh and draw it with its"
-        " boundary parts as DIR/mesh.png. Nothing is solved.",
+        " boundary parts as DIR/mesh.png, or as DIR/check.png beside the results of a run. Nothing"
+        " is solved.",
         usage="signorini-cr check FILE.toml [--out DIR] [--quiet]",
         **shared,
     )

@@ -177,6 +177,8 @@ def what_is_kept(kept: list[output.Record], folder: Path) -> str:
         return "no level was finished, nothing was written"
     kind = _kind(kept[0])
     first, last = kept[0][kind], kept[-1][kind]
+    if not (folder / output.REPORT).exists():
+        return f"{folder} has been taken away, and what was kept in it"
     if first == last:
         return f"{kind} {first} is finished and kept in {folder}"
     return f"{kind}s {first} to {last} are finished and kept in {folder}"

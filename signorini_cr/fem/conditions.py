@@ -12,6 +12,7 @@ import re
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from numbers import Number
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -96,7 +97,8 @@ def in_short(data: Any) -> str:
         value = getattr(data, each.name)
         if isinstance(value, Mapping):
             value = list(value) or each.default
-        if each.repr and value is not each.default and value != each.default:
+        plain = isinstance(value, str | Number)  # others may not be compared, or not to one answer
+        if each.repr and value is not each.default and not (plain and value == each.default):
             told = getattr(value, "__name__", None) or reprlib.repr(value)
             given.append(f"{each.name}={told}")
     return f"{type(data).__name__}({', '.join(given)})"

@@ -22,10 +22,10 @@ from . import mshfile
 from .lines import arranged, sorted_out
 from .mshfile import KINDS, MshFile
 from .planar import overlap, pieces
+from .polygon import MOST_EDGES
 from .valid import too_thin
 
 _MOST_TRIANGLES = 2e7
-_MOST_FACETS = 1e5  # on the boundary
 _MOST_GRADED = 3e4  # on edges beside short ones: gmsh takes a minute for so many
 _UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
@@ -83,7 +83,7 @@ def _session() -> Iterator[Any]:
     try:
         import gmsh
     except (ImportError, OSError) as error:  # the wheel wants libraries of the system
-        raise InputError(f"this needs gmsh, which cannot be loaded: {error}") from None
+        raise InputError(f"this needs gmsh, which cannot be loaded: {error}") from error
 
     ours = not gmsh.isInitialized()
     if ours:
@@ -148,11 +148,26 @@ def triangulate(
         )
     if (narrow := too_thin(raw.points[raw.triangles])) is not None:
         raise InputError(f"the polygon is too narrow, too small or too uneven: {narrow}")
+    if not _is_bounded_by(raw.triangles, raw.facets):
+        across, shortest = np.ptp(loops[0], axis=0).max(), outline.facets.min()
+        raise InputError(
+            f"gmsh could not triangulate the polygon, {across:.3g} across with facets of"
+            f" {shortest:.3g}: it takes points as near as that for one, or fills holes"
+        )
     raw = raw._replace(points=raw.points + away)
     if not polygons:
         return raw
     middles = raw.points[raw.triangles].mean(axis=1)
     return raw._replace(materials=sorted_out(middles, polygons, numbers))
+
+
+def _is_bounded_by(triangles: Int64Array, facets: Int64Array) -> bool:
+    """Tell whether the sides that one triangle has are these facets, and others have two."""
+    most = int(triangles.max(initial=0)) + 1
+    sides, cells = np.unique(_key(triangles[:, [[1, 2], [0, 2], [0, 1]]], most), return_counts=True)
+    return bool(cells.max() <= 2) and np.array_equal(
+        sides[cells == 1], np.unique(_key(facets, most))
+    )
 
 
 def _away(outline: FloatArray) -> FloatArray:
@@ -200,7 +215,7 @@ def _outline(loops: Sequence[FloatArray], inner: FloatArray, size: float) -> _Ou
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     counts = np.maximum(1, np.ceil(lengths / size - 1e-9))
     triangles = _area(loops[0]) / 0.43 / size / size  # equilateral: √3/4
-    if counts.sum() > _MOST_FACETS or triangles > _MOST_TRIANGLES:
+    if counts.sum() > MOST_EDGES or triangles > _MOST_TRIANGLES:
         raise InputError(
             f"size is {size}: that asks for about {triangles:.1e} triangles in the coarsest mesh"
             f"; {_fitting(loops[0], lengths)}"

@@ -21,6 +21,8 @@ A facet of length l that turns by t is l tan(t/4)/2 away from its arc: here less
 """
 MOST_FACETS = 2000
 """Of one arc."""
+MOST_EDGES = 100_000
+"""Of a polygon and its holes: the coarsest mesh has no more facets on its boundary."""
 
 
 def coordinates(vertices: npt.ArrayLike, least: int = 3) -> FloatArray:
@@ -160,6 +162,8 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
         edges: What edges are called in messages, where it is not by their places in the loops.
     """
     a = np.concatenate(loops)
+    if len(a) > MOST_EDGES:
+        raise InputError(f"there are {len(a)} edges; {MOST_EDGES} are allowed")
     sizes = np.array([len(loop) for loop in loops])
     starts = np.repeat(np.cumsum(sizes) - sizes, sizes)
     local = np.arange(len(a)) - starts
@@ -203,12 +207,16 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
         )
         if crossing.any():
             raise InputError(f"{edge(i)} crosses {edge(int(at[crossing.argmax()]))}")
-    for k in range(1, len(loops)):
-        if not inside(loops[k][:1], loops[0]).any():
-            raise InputError(f"hole {k - 1} lies outside the polygon")
-        for j in range(1, len(loops)):
-            if j != k and inside(loops[k][:1], loops[j]).any():
-                raise InputError(f"hole {k - 1} lies inside hole {j - 1}")
+    first = np.stack([loop[0] for loop in loops])
+    outside = ~inside(first[1:], loops[0])
+    if outside.any():
+        raise InputError(f"hole {outside.argmax()} lies outside the polygon")
+    for j, loop in enumerate(loops[1:], start=1):
+        at = np.flatnonzero(((first >= loop.min(axis=0)) & (first <= loop.max(axis=0))).all(axis=1))
+        at = at[(at > 0) & (at != j)]
+        within = at[inside(first[at], loop)]
+        if len(within):
+            raise InputError(f"hole {within[0] - 1} lies inside hole {j - 1}")
 
 
 def _where(ring: int) -> str:

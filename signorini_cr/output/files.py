@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from mpi4py import MPI
@@ -57,7 +57,8 @@ def check_writable(
             raise InputError(f"cannot write to {path}: {error.strerror}") from error
         try:  # permissions don't tell all, of /proc for one
             _clear(anchor)
-            _leave(*_enter(anchor))
+            with _stage_in(anchor):
+                pass
         except OSError as error:
             raise InputError(
                 f"cannot write to {path}: {anchor} is not writable ({error.strerror})"
@@ -77,11 +78,11 @@ def write_files(
 ) -> list[str]:
     """Put files into a folder: all of them or, if a writer raises, none.
 
-    They are written into a hidden folder on the same file system and renamed into place. Where the
-    process is killed before it has taken that folder away, the next `check_writable` does.
+    They are written into a hidden folder inside and renamed into place. Where the process is
+    killed before it has taken that folder away, the next `check_writable` does.
 
     Args:
-        folder: Made if it is not there. Other files in it are left alone.
+        folder: Made if it is not there, and if a file is written. Other files in it are left alone.
         writers: What writes the file of each name to the path that it is given. The first file
             vouches for the others: it goes before any of `removed` and comes last, so that
             wherever it is found, there is nothing of a former run beside it. Another may leave
@@ -96,20 +97,17 @@ def write_files(
         InputError: The system refuses to write.
     """
     path = Path(folder)
-
-    held: list[int] = []
+    held = ExitStack()  # rank 0's
 
     def prepare() -> str:
         with disk_errors(path):
-            stage, lock = _enter(_nearest(path))
-        held.append(lock)
-        return str(stage)
+            held.enter_context(_there(path))
+            return str(held.enter_context(_stage_in(path)))
 
     def publish() -> list[str]:
         first, *others = written = [name for name in writers if (stage / name).exists()]
         obsolete = [path / name for name in set(removed) - set(written)]
         with disk_errors(path):
-            path.mkdir(parents=True, exist_ok=True)
             if any(map(os.path.lexists, obsolete)):
                 (path / first).unlink(missing_ok=True)
                 for each in obsolete:
@@ -118,14 +116,35 @@ def write_files(
                 os.replace(stage / name, path / name)
         return written
 
-    stage = Path(on_root(comm, prepare))
-    try:
+    with held:
+        stage = Path(on_root(comm, prepare))
         for name, write in writers.items():
             write(stage / name)
         return on_root(comm, publish)
+
+
+@contextmanager
+def _there(folder: Path) -> Iterator[None]:
+    """Make a folder, and those it is in; what is empty in the end goes again."""
+    missing = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     finally:
-        if comm.rank == 0:
-            _leave(stage, *held)
+        for place in missing:
+            with suppress(OSError):
+                place.rmdir()
+
+
+@contextmanager
+def _stage_in(folder: Path) -> Iterator[Path]:
+    """Have a hidden folder, which the next `check_writable` removes if this process is killed."""
+    stage, lock = _enter(folder)
+    try:
+        yield stage
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        os.close(lock)
 
 
 def _enter(folder: Path) -> tuple[Path, int]:
@@ -137,11 +156,6 @@ def _enter(folder: Path) -> tuple[Path, int]:
         if stage.exists():  # another run can take it away before it is locked
             return stage, lock
         os.close(lock)
-
-
-def _leave(stage: Path, lock: int) -> None:
-    shutil.rmtree(stage, ignore_errors=True)
-    os.close(lock)
 
 
 def _locks(lock: int) -> bool:

@@ -45,8 +45,12 @@ if TYPE_CHECKING:
     from ..restart import Restart
     from ..solution import Solution
 
+REPORT = "report.json"
+"""What the other files of a run lie beside."""
+CHECKED = "check.png"
+"""The mesh of a problem that is checked where the results of a run lie."""
 FILES = (
-    "report.json",
+    REPORT,
     "levels.csv",
     "levels.md",
     "contact.csv",
@@ -61,6 +65,7 @@ FILES = (
     "series.pvd",
     "strip.png",
     checkpoint.MOMENTS,
+    CHECKED,
 )
 """All that `write_output` may leave in a folder; what a run does not give is taken away."""
 FIELDS = "step_*.vtu"
@@ -350,7 +355,7 @@ def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
         return lambda path: on_root(comm, write_text, path, make)
 
     return {
-        "report.json": text(lambda: report_json(report)),
+        REPORT: text(lambda: report_json(report)),
         "levels.csv": text(lambda: levels_csv(records)),
         "levels.md": text(lambda: markdown_table(records, Units.of(report))),
         "contact.csv": text(lambda: contact_csv(table or {})),

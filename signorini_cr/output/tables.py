@@ -45,7 +45,7 @@ def explained(words: Mapping[str, str], measured: Mapping[str, str], units: Unit
         units: What is told of that.
     """
     entries = (
-        f"{name}: {short}{units.within(measured[name]) if name in measured else ''}"
+        f"{name}: {short}{units.told(measured[name]) if name in measured else ''}"
         for name, short in words.items()
         if short
     )

@@ -52,7 +52,11 @@ class Units:
 
     def within(self, key: str) -> str:
         """Return the unit as it follows a name in a picture, " in m" for one."""
-        return " in" + self.after(key).replace("$", r"\$") if self.after(key) else ""
+        return self.told(key).replace("$", r"\$")
+
+    def told(self, key: str) -> str:
+        """Return the unit as it follows a name in a text, " in m" for one."""
+        return " in" + self.after(key) if self.after(key) else ""
 
     def name(self, key: str, usual: str = "") -> str:
         """Return the name as it precedes a symbol in a picture, with a space behind it."""

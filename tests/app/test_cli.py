@@ -690,6 +690,8 @@ def test_bad_input(name: str, write) -> None:
         ),
         (["solve", "FILE", "--max-dofs", "9"], ["max_dofs is a key of [refine]"]),
         (["check", "FILE", "--levels", "2"], ["no option --levels"]),
+        (["solve", "FILE", "-levels", "2"], ["-levels, with one dash", "did you mean --levels?"]),
+        (["solve", "FILE", "--out", "DIR", "-resume"], ["did you mean --resume?"]),
         (["solve", "FILE", "-options_file", "none"], ["-options_file none", "no such file"]),
         (["solve", "FILE", "-options_file", "/dev/zero"], ["-options_file", "this is no file"]),
         (["solve", "FILE", "-history", "/proc/no/it"], ["/proc/no is no folder that can be wr"]),
@@ -921,6 +923,26 @@ def test_check(write) -> None:
         assert told["dirichlet"].endswith("; 8 facets, length 4")
         assert "neumann" not in told
         assert [file.name for file in out.iterdir()] == ["mesh.png"] or "not drawn" in text
+
+
+def test_a_check_leaves_the_results_of_a_run_alone(write) -> None:
+    """What lies beside a report is of its run; the picture goes with the next one."""
+    path, out = write(CASE), Path("out")
+    assert run("solve", path, "--out", out, "--levels", "1", drawn=True)[0] == 0
+
+    def there() -> dict[str, bytes]:
+        return {each.name: each.read_bytes() for each in out.iterdir()}
+
+    before = there()
+    write(CASE.replace("size = 0.5", "size = 1.0"))
+    status, text, _ = run("check", path, "--out", out, drawn=True)
+    assert status == 0
+    after = there()
+    drawn = after.pop("check.png", None)
+    assert after == before and drawn != before.get("mesh.png", b"")
+    assert COMM.rank > 0 or "out/check.png" in text or "not drawn" in text
+    assert run("solve", path, "--out", out, "--levels", "1", drawn=True)[0] == 0
+    assert set(there()) == set(before)
 
 
 def test_the_deck(shared_tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from petsc4py import PETSc
 
 from signorini_cr import memory
 from signorini_cr.app import cli, signals
-from signorini_cr.errors import InputError
+from signorini_cr.app.run import what_is_kept
+from signorini_cr.errors import InputError, naming
 from signorini_cr.memory import ran_out_of_memory
 from signorini_cr.output import files
 from signorini_cr.output.report import FILES
@@ -204,6 +205,11 @@ def test_errors_that_mean_memory() -> None:
     wrapped = RuntimeError("in a callback")
     wrapped.__cause__ = MemoryError()
     assert ran_out_of_memory(wrapped)
+    quoted = InputError("f: no name MemoryError")  # what the user has written
+    assert not ran_out_of_memory(quoted)
+    with pytest.raises(InputError) as caught, naming("x"):
+        raise InputError("cannot write") from OSError(12, "Cannot allocate memory")
+    assert ran_out_of_memory(caught.value)
 
 
 @pytest.mark.serial
@@ -273,6 +279,66 @@ def test_what_a_killed_run_leaves_the_next_one_removes(tmp_path: Path) -> None:
     other.communicate()
     files.check_writable(tmp_path)
     assert list(tmp_path.iterdir()) == [alien]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("last", ["levels.csv", "report.json"])
+def test_what_a_run_leaves_that_is_killed_while_it_makes_its_folder(
+    tmp_path: Path, last: str
+) -> None:
+    """The next one into that folder removes it: nothing lies beside, in a folder that stays."""
+    program = (
+        "import os, signal\n"
+        "def replace(a, b, do=os.replace):\n"
+        "    do(a, b)\n"
+        f"    if b.name == {last!r} and b.parent.name == 'out':\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "os.replace = replace"
+    )
+    case = kills.CASE.replace("9", "1")
+    before = set(tmp_path.iterdir())
+    assert helpers.altered(tmp_path, case, program, "-q").returncode == -signal.SIGKILL
+    out = tmp_path / "out"
+    assert (out / last).exists() and any(out.glob(files.STAGE + "*"))
+    files.check_writable(out)
+    assert not any(out.glob(files.STAGE + "*"))
+    made = {path.name for path in set(tmp_path.iterdir()) - before}
+    assert not any(name.startswith(files.STAGE) for name in made)
+
+
+def test_folders_that_get_no_file_are_not_made(shared_tmp_path: Path) -> None:
+    def fail(path: Path) -> None:
+        raise InputError("no")
+
+    with pytest.raises(InputError, match="no"):
+        files.write_files(shared_tmp_path / "a" / "b", {"x": fail})
+    assert not any(shared_tmp_path.iterdir())
+    COMM.Barrier()
+    write = files.write_files(shared_tmp_path / "a" / "b", {"x": lambda path: path.touch()})
+    assert write == ["x"] and [path.name for path in (shared_tmp_path / "a" / "b").iterdir()] == [
+        "x"
+    ]
+
+
+@pytest.mark.serial
+def test_where_memory_does_not_do_for_a_message(tmp_path: Path) -> None:
+    program = (
+        "import os\nfrom signorini_cr.app import cli\n"
+        "def none(*_):\n    raise MemoryError\n"
+        "cli._run = none\n"
+    )
+    for ranks in (1, 2):
+        done = helpers.altered(tmp_path, kills.CASE, program, ranks=ranks)
+        assert done.returncode == cli.NOT_CONVERGED
+        assert done.stderr.startswith("signorini-cr: out of memory\n")
+
+
+@pytest.mark.serial
+def test_what_is_kept_in_a_folder_that_is_gone(tmp_path: Path) -> None:
+    kept = [{"level": 0}, {"level": 1}]
+    assert what_is_kept(kept, tmp_path).endswith("has been taken away, and what was kept in it")
+    (tmp_path / "report.json").touch()
+    assert what_is_kept(kept, tmp_path).startswith("levels 0 to 1 are finished and kept in")
 
 
 def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypatch, capfd) -> None:

@@ -93,6 +93,7 @@ def test_python_shows_what_was_given():
         (Material(f=u), "Material(f=u)"),
         (Form(u), "Form(a=u)"),
         (Problem(conditions={"air": Robin()}), "Problem(conditions=['air'])"),
+        (Problem(f=np.ones(2), g=0, quadrature_degree=4), "Problem(f=array([1., 1.]), g=0)"),
     ):
         assert repr(made) == shown
 

@@ -17,6 +17,7 @@ from signorini_cr.errors import InputError, NotConverged, on_root, raise_togethe
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.partition import bisect
+from signorini_cr.mesh.polygon import check_loops
 from signorini_cr.mesh.valid import thinness
 
 COMM = MPI.COMM_WORLD
@@ -325,11 +326,34 @@ def test_unknown_labels_name_the_allowed_ones():
         ([0.5 + 0.5 * (np.array(SQUARE) - 0.5), SQUARE], "hole 0 lies inside hole 1"),
         ([SQUARE, SQUARE], "is the same point as"),
         ([[[-2, -1], [2, -1], [2, 2], [-2, 2]]], "hole 0 lies outside"),
+        ([SQUARE, np.add(SQUARE, [5, 0])], "hole 1 lies outside"),
     ],
 )
 def test_bad_holes(holes, message):
     holes = [Polygon(hole, ["neumann"] * 4) for hole in holes]
     assert message in fails_alike(Polygon, RECTANGLE, LABELS, holes)
+
+
+def test_many_edges_and_many_holes_are_looked_at_or_refused():
+    """A hole in one of two thousand is found, by its number; no list of edges has no end."""
+    small = 0.2 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    places = [np.array([i, j]) for i in range(1, 46) for j in range(1, 46)]
+    around = np.array([[0, 0], [46, 0], [46, 46], [0, 46.0]])
+    loops = [around, *(place + small for place in places)]
+    check_loops(loops)
+    with pytest.raises(InputError, match="hole 2025 lies inside hole 1000"):
+        check_loops([*loops, places[1000] + 0.5 * small])
+    turn = np.linspace(0, 2 * np.pi, 100_002)[1:]
+    with pytest.raises(InputError, match="there are 100001 edges; 100000 are allowed"):
+        check_loops([np.stack([np.cos(turn), np.sin(turn)], axis=1)])
+
+
+@pytest.mark.slow
+def test_a_hole_that_gmsh_does_not_see():
+    """It would be filled, or its points be one, which DOLFINx would not survive."""
+    hole = Polygon.circle((1.0, 0.5), 1e-11, "neumann", 0.4)
+    polygon = Polygon(RECTANGLE, LABELS, [hole])
+    assert "gmsh could not triangulate the polygon, 2 across" in fails_alike(polygon.mesh, 0.4)
 
 
 def test_close_but_apart_is_fine():

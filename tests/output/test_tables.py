@@ -152,6 +152,13 @@ def test_every_printed_column_has_its_word(exact):
     assert "bound: certified, ‖∇_h(u − u_h)‖ is not above it" in legend(record)  # H1 error or not
 
 
+def test_units_in_texts_are_as_they_were_given():
+    """What Matplotlib takes for the end of a formula is escaped for it alone."""
+    units = Units(x="a_b$c")
+    assert " in\u00a0a_b$c" in legend(RECORD, units) and "\\$" not in legend(RECORD, units)
+    assert units.within("x") == " in\u00a0a_b\\$c"
+
+
 def test_every_column_of_the_steps_has_its_meaning():
     head = series.header().split()
     assert head == list(OF_STEPS) and all(meaning for _, meaning in OF_STEPS.values())
