@@ -351,7 +351,7 @@ def test_many_edges_and_many_holes_are_looked_at_or_refused():
 @pytest.mark.slow
 def test_a_hole_that_gmsh_does_not_see():
     """It would be filled, or its points be one, which DOLFINx would not survive."""
-    hole = Polygon.circle((1.0, 0.5), 1e-11, "neumann", 0.4)
+    hole = Polygon.circle((0.5, 0.5), 1e-11, "neumann", 0.4)
     polygon = Polygon(RECTANGLE, LABELS, [hole])
     assert "gmsh could not triangulate the polygon, 2 across" in fails_alike(polygon.mesh, 0.4)
 
