@@ -24,7 +24,7 @@ from study import Study, canvas, column, levels_wanted, loglog, orders, run
 from signorini_cr import exact, solve, theory
 
 study = Study("demo_theorem_34", "Theorem 3.4: infinitely many critical points")
-levels = levels_wanted(8)
+levels = levels_wanted(8, least=5)
 
 # %% [markdown]
 # ## A second one, made here

@@ -71,6 +71,10 @@ FAMILIES = {
 """Kinds of mesh sequences that `run` knows."""
 
 
+LARGE = 100_000
+"""Degrees of freedom of a mesh that is not left to Python to look for, which takes a while."""
+
+
 @dataclass(frozen=True)
 class Row:
     """What is kept of a solution; None or not a number where it is not known."""
@@ -99,9 +103,14 @@ def wanted_folder(usual: str) -> Path:
     return Path(given)
 
 
-def levels_wanted(default: int) -> int:
-    """The number of meshes, limited by SIGNORINI_DEMO_LEVELS; three for a rate at least."""
-    return min(default, max(3, int(os.environ.get("SIGNORINI_DEMO_LEVELS", default))))
+def levels_wanted(default: int, least: int = 3) -> int:
+    """The number of meshes, limited by SIGNORINI_DEMO_LEVELS.
+
+    Args:
+        default: Without a limit.
+        least: With any limit; three for a rate, more where rates settle late.
+    """
+    return min(default, max(least, int(os.environ.get("SIGNORINI_DEMO_LEVELS", default))))
 
 
 def solutions(
@@ -167,7 +176,8 @@ def _run(name: str, element: str, family: str, levels: int) -> tuple[Row, ...]:
         )
         before = solution
     del before, solution
-    gc.collect()
+    if rows[-1].dofs > LARGE:
+        gc.collect()
     _dofs.append(rows[-1].dofs)
     return tuple(rows)
 
