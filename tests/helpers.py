@@ -92,6 +92,20 @@ def command(*arguments: str | Path, **options: Any) -> subprocess.CompletedProce
     return start("-m", "signorini_cr", *arguments, **options)
 
 
+UNDRAWN = """import sys
+from signorini_cr.output import plots
+plots.can_draw = lambda comm: False
+from signorini_cr.app import cli
+sys.exit(cli.main())
+"""
+"""The command that draws no pictures, which take longer than all else it does with few cells."""
+
+
+def undrawn_command(*arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Start `signorini-cr` in a process of its own, without pictures; `options` as `start`."""
+    return start("-c", UNDRAWN, *arguments, **options)
+
+
 def altered(
     folder: Path, case: str, program: str, *words: str, **options: Any
 ) -> subprocess.CompletedProcess[str]:

@@ -1232,7 +1232,8 @@ def test_on_two_ranks_the_figures_are_the_same(tmp_path: Path) -> None:
     energies = []
     for ranks in (1, 2):
         out = tmp_path / str(ranks)
-        done = helpers.command("solve", tmp_path / "case.toml", "--out", out, ranks=ranks)
+        argv = "solve", tmp_path / "case.toml", "--out", out
+        done = helpers.undrawn_command(*argv, ranks=ranks)
         assert done.returncode == 0, done.stderr
         energies.append(
             [r["energy"] for r in json.loads((out / "report.json").read_text())["levels"]]
@@ -1254,7 +1255,7 @@ def test_names_that_are_no_text(tmp_path: Path, monkeypatch) -> None:
     """Results in a folder the terminal can't spell, a problem file in a foreign encoding."""
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     (tmp_path / "case.toml").write_text(CASE)
-    done = helpers.command("solve", "case.toml", "--out", "Γ", cwd=tmp_path)
+    done = helpers.undrawn_command("solve", "case.toml", "--out", "Γ", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\\u0393" in done.stdout
     assert (tmp_path / "Γ" / "report.json").exists()
@@ -1279,8 +1280,11 @@ def test_names_that_are_no_text(tmp_path: Path, monkeypatch) -> None:
 def test_results_are_written_though_nothing_can_be_printed(
     output: str, words: str, tmp_path: Path
 ) -> None:
+    """Without pictures, but for the one that has neither stdout nor stderr."""
     (tmp_path / "case.toml").write_text(CASE)
-    command = f"{sys.executable} -m signorini_cr solve case.toml --out out; echo $? >status"
+    (tmp_path / "undrawn.py").write_text(helpers.UNDRAWN)
+    program = "-m signorini_cr" if output == ">&- 2>&-" else "undrawn.py"
+    command = f"{sys.executable} {program} solve case.toml --out out; echo $? >status"
     done = subprocess.run(
         ["sh", "-c", f"({command}) {output}"], cwd=tmp_path, capture_output=True, text=True
     )
