@@ -48,7 +48,7 @@ SEARCHED = 4
 CASES = {
     "uniform": CASE,
     "adaptive": CASE.replace("levels = 9", 'mode = "adaptive"\nlevels = 20'),
-    "time": CASE.replace("f = -3", 'f = "-3 - 20*sin(5*t)"').replace("levels = 9", "levels = 3")
+    "time": CASE.replace("f = -3", 'f = "-3 - 20*sin(5*t)"').replace("levels = 9", "levels = 2")
     + f'[time]\nend = 2\nsteps = {STEPS}\nscheme = "bdf2"\n',
     "search": CASE.replace("f = -3", 'f = "-3 - 20*sin(5*t)"')
     + f'mode = "adaptive"\n[time]\nend = 0.5\nsteps = {SEARCHED}\n',
