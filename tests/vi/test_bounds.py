@@ -101,11 +101,21 @@ def dense(system):
 
 
 def in_a_box(A, b, low, high):
-    """min ½ xᵀA x − bᵀx in a box is min |Lᵀx − L⁻¹b|, A = L Lᵀ: SciPy's, on a dense matrix."""
-    L = np.linalg.cholesky(A)
-    found = lsq_linear(L.T, np.linalg.solve(L, b), (low, high), method="bvls", tol=1e-15)
+    """min ½ xᵀA x − bᵀx in a box is min |Lᵀx − L⁻¹b|, A = L Lᵀ: SciPy's, on a dense matrix.
+
+    That has but what is bounded, and by how much the rest follows it is solved for.
+    """
+    held = np.isfinite(low) | np.isfinite(high)
+    held[0] = True  # there is to be one
+    to_rest, x = A[np.ix_(~held, held)], np.empty(len(b))
+    follows = np.linalg.solve(A[np.ix_(~held, ~held)], np.column_stack([b[~held], to_rest]))
+    small, load = A[np.ix_(held, held)] - to_rest.T @ follows[:, 1:], b[held]
+    L = np.linalg.cholesky(small)
+    rhs = np.linalg.solve(L, load - to_rest.T @ follows[:, 0])
+    found = lsq_linear(L.T, rhs, (low[held], high[held]), method="bvls", tol=1e-15)
     assert found.success
-    return found.x
+    x[held], x[~held] = found.x, follows[:, 0] - follows[:, 1:] @ found.x
+    return x
 
 
 @pytest.mark.slow
