@@ -110,7 +110,8 @@ def test_steps_with_contact_against_a_dense_solver(scheme, c):
 
         M, S = dense(u * v * ufl.dx), dense(ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx)
         if c:
-            S += dense(c(ufl.SpatialCoordinate(domain.mesh), time) * u * v * ufl.dx)
+            now = fem.Constant(domain.mesh, time)  # as a number it would be another form each time
+            S += dense(c(ufl.SpatialCoordinate(domain.mesh), now) * u * v * ufl.dx)
         if not past:
             first = fem.Function(V)
             first.interpolate(lambda x: x[1] - 1)
@@ -168,7 +169,8 @@ def test_reactions_that_vary_within_cells(c):
     for levels in (1, 2):
         steps_there = solve_in_time(problem, domain, end=1.0, steps=steps, time=t, levels=levels)
         for number, (time, solution) in enumerate(steps_there):
-            e = solution.u - time * phi(ufl.SpatialCoordinate(solution.u.function_space.mesh))
+            mesh = solution.u.function_space.mesh
+            e = solution.u - fem.Constant(mesh, time) * phi(ufl.SpatialCoordinate(mesh))
             square = fem.assemble_scalar(fem.form(ufl.inner(ufl.grad(e), ufl.grad(e)) * ufl.dx))
             error = np.sqrt(WORLD.allreduce(square))
             if number == 0:
@@ -460,7 +462,7 @@ def test_what_is_certain_of_a_solution_is_so_when_data_have_moved_on(name):
         problem = Problem(f=-3.0, conditions=conditions | MOVING[name](t))
     else:
         problem = Problem(**({"f": -3.0, "conditions": conditions} | {name: 1.0 + 5.0 * t}))
-    timing = {"end": 1.0, "steps": 3, "time": t}
+    timing = {"end": 1.0, "steps": 2, "time": t}
     at_once = [known(solution) for _, solution in solve_in_time(problem, domain, **timing)]
     steps = list(solve_in_time(problem, domain, **timing))
     for expected, (_, solution) in zip(at_once, steps, strict=True):
@@ -470,13 +472,13 @@ def test_what_is_certain_of_a_solution_is_so_when_data_have_moved_on(name):
         t.value = 0.25
         expected, first = known(solver.solve()), solver.solve()
         plain = solve(problem, domain)
-        beside = known(plain)
+        bound, bracket = plain.certificate.bound_energy_norm, plain.certificate.energy
         t.value = 1.0
         solver.solve(before=first)
         assert known(first) == pytest.approx(expected, rel=1e-6, abs=1e-9)
     again = solve(problem, domain)
     assert again.energy != pytest.approx(plain.energy, rel=1e-3)
-    assert [plain.certificate.bound_energy_norm, *plain.certificate.energy] == beside[:3]
+    assert (plain.certificate.bound_energy_norm, plain.certificate.energy) == (bound, bracket)
 
 
 CORNER = Polygon(
@@ -518,7 +520,7 @@ def test_meshes_adapted_to_a_run_reach_the_best_order():
     tried = adapt_to_run(on_meshes(problem, domain, 1.0, 3, time=t), max_dofs=3300)
     told = [(each.last.dofs, each.bound) for each in tried]
     uniform = []
-    for levels in (2, 3, 4, 5):
+    for levels in (2, 3, 4):
         run = list(on_meshes(problem, domain, 1.0, 3, time=t)(levels))
         bound = max(solution.certificate.bound_h1 for _, solution in run)
         uniform.append((run[-1][1].dofs, bound))
