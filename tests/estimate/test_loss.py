@@ -103,23 +103,26 @@ class Reference:
         inside = 0.5 * KAPPA * ufl.inner(ufl.grad(v), ufl.grad(v)) + 0.5 * self.c * v**2 - f * v
         through = KAPPA * ufl.inner(ufl.grad(v), n)
         # ½ b u² − (g + b u_ext) u
-        edge = -through * v * self.sides["left"] + self.pressure * v * self.sides["floor"]
+        edge = -through * v * self.sides["left"]
         for part, b in self.losses.items():
             edge += (-through * v - 0.5 * b * v**2) * self.sides[part]
-        return self.total(inside * self.dx + edge)
+        # the pressure by itself: what it stands beside need not be compiled for each
+        pressed = self.total(self.pressure * v * self.sides["floor"])
+        return self.total(inside * self.dx + edge) + pressed
 
 
 @pytest.mark.parametrize("floor", FLOORS)
 @pytest.mark.parametrize("name", LOSSES)
 def test_bound_and_bracket(name, floor):
-    loss, ratios = LOSSES[name], []
+    loss, ratios, brackets = LOSSES[name], [], []
     for solution in solve_levels(problem(loss, floor), SQUARE.mesh(0.2, MPI.COMM_WORLD), 3):
         certificate, known = solution.certificate, Reference(solution.domain, loss, floor)
         error = known.error(solution.u)
         assert certificate.bound_energy_norm >= error
         ratios.append(certificate.bound_energy_norm / error)
-        low, high = certificate.energy
-        assert low <= known.energy() <= high
+        brackets.append(certificate.energy)
+    energy = known.energy()
+    assert all(low <= energy <= high for low, high in brackets)
     assert max(ratios[1:]) < 1.3
 
 
@@ -128,13 +131,14 @@ def test_bound_and_bracket(name, floor):
 def test_with_a_reaction_that_varies(name, size):
     """With a large c y gives b more than what g has beyond its mean."""
     loss, c = LOSSES[name], lambda x: size * (1 + x[0] * x[1])
-    posed = problem(loss, "both", c)
-    for solution in solve_levels(posed, SQUARE.mesh(0.2, MPI.COMM_WORLD), 3):
+    posed, brackets = problem(loss, "both", c), []
+    for solution in solve_levels(posed, SQUARE.mesh(0.2, MPI.COMM_WORLD), 2):
         certificate, known = solution.certificate, Reference(solution.domain, loss, "both", c)
         error = known.error(solution.u)
         assert error <= certificate.bound_energy_norm < 1.3 * error
-        low, high = certificate.energy
-        assert low <= known.energy() <= high
+        brackets.append(certificate.energy)
+    energy = known.energy()
+    assert all(low <= energy <= high for low, high in brackets)
 
 
 @pytest.mark.parametrize("c", [0.0, 30.0])
@@ -145,12 +149,14 @@ def test_what_a_rule_misses_is_taken_up_by_a_strong_loss(floor, c):
     def loss(_):
         return 1e9
 
-    rough = replace(problem(loss, floor, c), quadrature_degree=2)
+    rough, brackets = replace(problem(loss, floor, c), quadrature_degree=2), []
     for solution in solve_levels(rough, SQUARE.mesh(0.9), 3):
         known, certificate = Reference(solution.domain, loss, floor, c), solution.certificate
         error = known.error(solution.u)
         assert error <= certificate.bound_energy_norm < 1.5 * error
-        assert certificate.energy[0] <= known.energy() <= certificate.energy[1]
+        brackets.append(certificate.energy)
+    energy = known.energy()
+    assert all(low <= energy <= high for low, high in brackets)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
