@@ -110,8 +110,8 @@ def test_energy_where_cubics_meet_a_flux(n, height, pressure):
 @pytest.mark.parametrize("name", ["S1", "A", "B", "C", "I", "S1_NEUMANN", "S1_RAISED"])
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
 def test_bound_is_above_the_error_and_near_it(name, jitter):
-    example = getattr(exact, name)
-    for solution in solve_levels(example.problem, example.structured(8, jitter=jitter), 3):
+    example, levels = getattr(exact, name), 2 if name == "I" else 3  # I takes as long on each
+    for solution in solve_levels(example.problem, example.structured(8, jitter=jitter), levels):
         certificate = certify(solution)
         effectivity = certificate.bound_h1 / solution.errors[0]
         assert 1.0 <= effectivity <= GOAL, (name, solution.cells)
@@ -464,9 +464,12 @@ def test_load_with_infinitely_many_kinks():
         certificate = solution.certificate
         assert certificate.bound_h1 / solution.errors[0] == pytest.approx(1.156, abs=0.01)
         if WORLD.size > 1:
-            alone = solve(exact.I.problem, exact.I.structured(8, MPI.COMM_SELF)).certificate
-            assert certificate.bound_h1 == pytest.approx(alone.bound_h1, rel=1e-10)
-            assert certificate.energy == pytest.approx(alone.energy, rel=1e-10)
+            figures = None
+            if WORLD.rank == 0:  # whose figures are enough
+                alone = solve(exact.I.problem, exact.I.structured(8, MPI.COMM_SELF)).certificate
+                figures = [alone.bound_h1, *alone.energy]
+            figures = WORLD.bcast(figures)
+            assert [certificate.bound_h1, *certificate.energy] == pytest.approx(figures, rel=1e-10)
     finally:
         for name in ("snes_atol", "ksp_rtol"):
             options.delValue(name)
