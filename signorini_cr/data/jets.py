@@ -275,10 +275,11 @@ class Enclosure:
         Raises:
             Unknown: It holds an operator that is not known here.
         """
-        if e not in self._known:
+        jet = self._known.get(e)
+        if jet is None:
             with np.errstate(all="ignore"):
-                self._known[e] = self._jet(e)
-        return self._known[e]
+                jet = self._known[e] = self._jet(e)
+        return jet
 
     def inverse(self, e: Any) -> Jet:
         """Compute the jet of 1/e."""
