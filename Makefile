@@ -6,8 +6,8 @@ limit = timeout --kill-after=20 2400
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz endurance docs quick quick-alone test test-alone test-pair quick-pair coverage \
-    mutants ranks ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz endurance docs quick quick-alone test test-alone test-first test-pair \
+    quick-pair coverage mutants ranks ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -50,6 +50,10 @@ test: test-alone test-pair
 
 test-alone:
 	$(run) $(limit) python3 -m pytest
+
+# Of these each test, but slow ones with the first of their parameters alone
+test-first:
+	$(run) $(limit) python3 -m pytest --first
 
 test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest

@@ -17,6 +17,24 @@ SECONDS = float(os.environ.get("SIGNORINI_TEST_SECONDS", "300"))
 _stderr = 2
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    words = "of tests that are slow run those with the first of their parameters alone"
+    parser.addoption("--first", action="store_true", help=words)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--first"):
+        return
+    begun, left_out = set(), []
+    for item in items:
+        test = item.nodeid.partition("[")[0]
+        if item.get_closest_marker("slow") and test in begun:
+            left_out.append(item)
+        begun.add(test)
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in set(left_out)]
+
+
 def pytest_configure(config: pytest.Config) -> None:
     # Here fd 2 is the real one; while a test runs it is the capture file
     global _stderr

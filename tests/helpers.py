@@ -7,7 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -224,30 +224,6 @@ def smallest_angle(mesh: Mesh) -> float:
 def integral(form: ufl.Form, comm: MPI.Comm = MPI.COMM_WORLD) -> float:
     """What the form is, over all ranks."""
     return comm.allreduce(fem.assemble_scalar(fem.form(form)))
-
-
-def widths_of(
-    problem: Problem,
-    interval: Callable[[Solution], tuple[float, float]],
-    inside: float | None = None,
-    levels: int = 4,
-    size: float = 0.25,
-) -> np.ndarray:
-    """Widths of intervals on meshes of the unit square, each twice as fine as the one before.
-
-    Args:
-        problem: What is solved.
-        interval: Of each solution, its lower and its upper end.
-        inside: What each must hold.
-        levels: How many meshes.
-        size: Of the first one.
-    """
-    found = []
-    for solution in solve_levels(problem, SQUARE.mesh(size, MPI.COMM_WORLD), levels):
-        lower, upper = interval(solution)
-        assert lower <= upper and (inside is None or lower <= inside <= upper)
-        found.append(upper - lower)
-    return np.array(found)
 
 
 def orders(found: np.ndarray) -> np.ndarray:

@@ -280,7 +280,7 @@ def test_workflows_call_what_exists():
         assert all((ROOT / file).is_file() for file in re.findall(r"container/[\w.-]+", line)), line
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     stages = set(re.findall(r"SUITE=\w+ make ([\w-]+)", script))
-    parts = {"test-alone", "test-pair", "quick-pair", "ranks-3", "ranks-4"}  # of these
+    parts = {"test-alone", "test-first", "test-pair", "quick-pair", "ranks-3", "ranks-4"}
     assert stages - {"ranks-3", "ranks-4"} <= make
     assert "docs" in stages and stages - parts | {"test", "ranks"} <= called
     for template in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"):
