@@ -114,6 +114,7 @@ def write_files(
                     each.unlink(missing_ok=True)
             for name in (*others, first):
                 os.replace(stage / name, path / name)
+        held.close()  # before another rank looks
         return written
 
     with held:
