@@ -51,16 +51,16 @@ test: test-alone test-pair
 test-alone:
 	$(run) $(limit) python3 -m pytest
 
-# Of these each test, but slow ones with the first of their parameters alone
+# Each test, but slow ones with the first of their parameters alone
 test-first:
 	$(run) $(limit) python3 -m pytest --first
 
 test-pair:
 	$(run) $(limit) mpirun -n 2 python3 -m pytest
 
-# Of these what takes next to no time, or depends on how a mesh is shared out
+# Of those of test-first what takes next to no time, or depends on how a mesh is shared out
 quick-pair:
-	$(run) $(limit) mpirun -n 2 python3 -m pytest -m 'ranks or not slow'
+	$(run) $(limit) mpirun -n 2 python3 -m pytest --first -m 'ranks or not slow'
 
 # Branches of signorini_cr/ that no test takes, on one rank and on two together
 coverage:
