@@ -148,3 +148,22 @@ def test_no_imports_in_a_circle() -> None:
         assert free, f"a circle among {sorted('.'.join(here) for here in below)}"
         for here in free:
             del below[here]
+
+
+@pytest.mark.serial
+def test_no_name_of_a_module_is_given_twice():
+    """A constant that another one takes the name of has its value where it is read, wherever."""
+    twice = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        seen = set()
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            targets = node.targets if isinstance(node, ast.Assign) else []
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
+            names = {n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)}
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names = {node.name}
+            if isinstance(node, ast.ImportFrom):
+                names = {alias.asname or alias.name for alias in node.names}
+            twice += [f"{path.relative_to(PACKAGE)}: {name}" for name in names & seen]
+            seen |= names
+    assert not twice

@@ -446,7 +446,7 @@ BESIDE = 1e-3, 1e-5
 FFCx takes what is nearer for the vertex."""
 STEP = 1e-6
 """Part of the values on the facet above which they may."""
-STEADY = 0.01
+EVEN = 0.01
 """Part of the step that they change by from one of these places to the other, at most."""
 
 
@@ -514,7 +514,7 @@ class Trace:
         with np.errstate(invalid="ignore"):  # infinite ones are refused by those who know where
             step = np.abs(near - at)
             is_step = step > STEP * np.abs(values).max(axis=0)
-            is_step &= np.abs(far - near) < STEADY * step
+            is_step &= np.abs(far - near) < EVEN * step
             limit = near + (near - far) * (BESIDE[1] / (BESIDE[0] - BESIDE[1]))
         return np.where(is_step, limit, at), middle[0], inside
 

@@ -57,6 +57,32 @@ def integral(expression, mesh, measure=ufl.dx, degree=8):
     return mesh.comm.allreduce(fem.assemble_scalar(form))
 
 
+
+@pytest.mark.parametrize(("slope", "across"), [(0.1, None), (0.3, None), (0.3, 2.0)])
+def test_a_coefficient_that_varies_by_a_hundredth_of_itself_in_a_cell(slope, across):
+    """−(κu')' = 0 with κ = 1 + sx: u = ln(1 + sx) / ln(1 + s), and J(u) = s / (2 ln(1 + s)).
+
+    A hundredth is far above rounding: κ is no constant on these cells, nor is a tensor that has
+    another entry across.
+    """
+
+    def kappa(x):
+        k = 1.0 + slope * x[0]
+        return k if across is None else ufl.as_matrix([[k, 0.0], [0.0, across]])
+
+    ends = {"left": Dirichlet(0.0), "right": Dirichlet(1.0), "floor": Neumann(), "top": Neumann()}
+    domain = structured(SQUARE, 32)
+    solution = solve(Problem(coefficient=kappa, conditions=ends), domain)
+    x = ufl.SpatialCoordinate(domain.mesh)
+    u = ufl.ln(1.0 + slope * x[0]) / np.log(1.0 + slope)
+    slip = ufl.grad(u - solution.u)
+    error = integral(ufl.inner(slip, slip), domain.mesh) ** 0.5
+    certificate = solution.certificate
+    assert error < certificate.bound_h1 < 1.4 * error
+    lower, upper = certificate.energy
+    assert lower < 0.5 * slope / np.log(1.0 + slope) < upper
+
+
 def energy_of(problem, domain):
     """J(u) from the exact solution, on a mesh."""
     x = ufl.SpatialCoordinate(domain.mesh)
