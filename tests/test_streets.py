@@ -159,7 +159,8 @@ def test_no_name_of_a_module_is_given_twice():
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             targets = node.targets if isinstance(node, ast.Assign) else []
             targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
-            names = {n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)}
+            places = [n for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
+            names = {n.id for n in places if isinstance(n.ctx, ast.Store)}
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 names = {node.name}
             if isinstance(node, ast.ImportFrom):

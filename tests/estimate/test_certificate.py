@@ -57,7 +57,6 @@ def integral(expression, mesh, measure=ufl.dx, degree=8):
     return mesh.comm.allreduce(fem.assemble_scalar(form))
 
 
-
 @pytest.mark.parametrize(("slope", "across"), [(0.1, None), (0.3, None), (0.3, 2.0)])
 def test_a_coefficient_that_varies_by_a_hundredth_of_itself_in_a_cell(slope, across):
     """−(κu')' = 0 with κ = 1 + sx: u = ln(1 + sx) / ln(1 + s), and J(u) = s / (2 ln(1 + s)).
