@@ -6,7 +6,7 @@ from functools import cached_property
 
 from .data.admissible import NOT_DEFINITE, check_data
 from .data.diffusion import DiffusionOnMesh
-from .data.moments import Compiled
+from .data.quadrature import Compiled
 from .estimate.certificate import Certificate, certify
 from .fem.problem import Forms
 from .mesh.domain import Domain

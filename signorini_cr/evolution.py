@@ -24,7 +24,7 @@ from .arrays import FloatArray, summed
 from .data.admissible import check_boundary, check_operator
 from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
-from .data.moments import Rule, Volume
+from .data.quadrature import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError, insist_on_count, insist_on_kind, raise_together
 from .fem.conditions import Data

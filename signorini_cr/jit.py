@@ -34,7 +34,7 @@ from ffcx.options import FFCX_DEFAULT_OPTIONS
 from mpi4py import MPI
 
 from . import temporary
-from .errors import InputError, naming, on_root
+from .errors import InputError, meant, naming, on_root
 
 T = TypeVar("T")
 Loaded: TypeAlias = tuple[list[Any], ModuleType]
@@ -99,8 +99,9 @@ def _check_options() -> None:
     settings = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     usual = {key: value for key, (value, _) in jit.DOLFINX_DEFAULT_JIT_OPTIONS.items()}
     of_forms = {key: value for key, (_, value, *_) in FFCX_DEFAULT_OPTIONS.items()}
+    usual |= {"cache_dir": str(usual["cache_dir"]), "cffi_libraries": []}
     for library, name, known in (
-        ("dolfinx", "dolfinx_jit_options.json", usual | {"cache_dir": str(usual["cache_dir"])}),
+        ("dolfinx", "dolfinx_jit_options.json", usual),
         ("ffcx", "ffcx_options.json", of_forms),
     ):
         for path in (settings / library / name, Path.cwd() / name):
@@ -109,7 +110,7 @@ def _check_options() -> None:
 
 
 def _check_file(path: Path, usual: Mapping[str, Any]) -> None:
-    """Insist on values of the kinds that the usual ones have, None for any kind."""
+    """Insist on known keys, and on values of the kinds that the usual ones have."""
     try:
         found = json.loads(path.read_text())
     except FileNotFoundError:
@@ -119,11 +120,14 @@ def _check_file(path: Path, usual: Mapping[str, Any]) -> None:
     if not isinstance(found, dict):
         raise InputError("a JSON object is needed, a value for each option")
     for key, value in found.items():
-        wanted = usual.get(key)
-        number = isinstance(wanted, float) and isinstance(value, int)
-        if not (wanted is None or number or isinstance(value, type(wanted))):
-            kind = type(wanted).__name__
-            raise InputError(f"{key} is {value!r}; something of the type {kind} is needed")
+        if key not in usual:
+            raise InputError(f"there is no option {key!r}; {meant(key, usual)}")
+        kind: tuple[type, ...] = (type(usual[key]),)
+        kind += (int,) if kind == (float,) else ()
+        words = isinstance(value, list) and not all(isinstance(each, str) for each in value)
+        if not isinstance(value, kind) or words:
+            needed = "a list of words" if kind == (list,) else f"a value like {usual[key]!r}"
+            raise InputError(f"{key} is {value!r}; {needed} is needed")
 
 
 def _waited_in_vain(words: str) -> bool:
@@ -171,7 +175,7 @@ def _moved(comm: MPI.Comm) -> bool:
 
 def _tell_of_compiler(comm: MPI.Comm, error: BaseException | None) -> None:
     """Raise InputError if it is the compiler that has failed on rank 0; collective."""
-    words = None
+    words, origin = None, error
     while comm.rank == 0 and words is None and error is not None:
         if found := _FAILED.search(str(error)):
             words = _ARGUMENTS.sub(r"\1", found[1].rstrip("."))
@@ -180,7 +184,7 @@ def _tell_of_compiler(comm: MPI.Comm, error: BaseException | None) -> None:
         raise InputError(
             f"forms cannot be compiled: {words}; a C compiler that works is needed, and CC may"
             " name it; numbers in forms must be finite"
-        )
+        ) from origin
 
 
 _FAILED = re.compile(r"(?:Compile|Link|Platform)Error: (.*)")

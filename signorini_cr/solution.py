@@ -16,6 +16,7 @@ from . import force, means
 from .estimate.certificate import Certificate
 from .estimate.force import Interval
 from .fem import fields
+from .fem.cells import on_cells
 from .fem.conditions import Data
 from .fem.problem import Problem
 from .mesh.domain import Domain
@@ -188,7 +189,7 @@ class Solution:
         found = {"u": self.u_dg()}
         if certificate.indicators is not None:
             shares = np.sqrt(certificate.indicators)
-            found["indicator"] = fields.on_cells(mesh, shares, "indicator")
+            found["indicator"] = on_cells(mesh, shares, "indicator")
         if certificate.companion is not None:
             found["companion"] = certificate.companion
             found["companion"].name = "companion"

@@ -236,13 +236,13 @@ def _left(out: Path, new: bool) -> tuple[int, list[str]]:
         faults.append(f"left over: {strange}")
     if any(path.name.startswith(STAGE) for path in out.parent.iterdir()):
         faults.append("left over beside the folder")
-    if new and not there:
-        return 0, faults
     former = {name for name in there & set(FILES) if (out / name).read_bytes() == b"former"}
     if former == set(FILES):
         return -1, faults
     if former and "report.json" in there:
         faults.append(f"of a former run: {sorted(former)}")
+    if new and "report.json" not in there:
+        return 0, faults
     if "report.json" not in there:
         return 0, [*faults, "no report"]
     report = json.loads((out / "report.json").read_text())

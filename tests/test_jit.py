@@ -83,7 +83,12 @@ def test_who_is_still_at_work_is_waited_for(cache: Path, monkeypatch) -> None:
         (
             "dolfinx_jit_options.json",
             '{"cffi_extra_compile_args": 5}',
-            "cffi_extra_compile_args is 5; something of the type list is needed",
+            "cffi_extra_compile_args is 5; a list of words is needed",
+        ),
+        (
+            "dolfinx_jit_options.json",
+            '{"timeuot": 5}',
+            "no option 'timeuot'; did you mean",
         ),
     ],
 )

@@ -257,7 +257,7 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
-    from ..errors import naming
+    from ..errors import naming, on_root
     from ..output import plots
     from ..output.files import check_writable, write_files
     from ..output.report import CHECKED, REPORT
@@ -265,9 +265,10 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from .statement import folded, statement
 
     folder = _folder(args)
-    # mesh.png beside a report is that of its run
-    picture = comm.bcast(CHECKED if (folder / REPORT).exists() else "mesh.png")
     with naming("--out"):
+        check_writable(folder, comm=comm)
+        # mesh.png beside a report is that of its run
+        picture = CHECKED if on_root(comm, os.path.exists, folder / REPORT) else "mesh.png"
         check_writable(folder, [picture], comm)
     case, domain = read_case(args, screen, comm)
     screen.line(f"{args.file}: in order")

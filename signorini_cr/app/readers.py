@@ -41,7 +41,7 @@ def read_text(path: Path) -> str:
         raise InputError(f"this is not a text file in UTF-8 (byte {error.start})") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"the file cannot be read: {reason}") from None
+        raise InputError(f"the file cannot be read: {reason}") from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -6,12 +6,14 @@ import argparse
 import hashlib
 import json
 import math
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from .. import __version__
@@ -177,7 +179,8 @@ def what_is_kept(kept: list[output.Record], folder: Path) -> str:
         return "no level was finished, nothing was written"
     kind = _kind(kept[0])
     first, last = kept[0][kind], kept[-1][kind]
-    if not (folder / output.REPORT).exists():
+    # another rank's machine may not have it
+    if MPI.COMM_WORLD.rank == 0 and not os.path.exists(folder):
         return f"{folder} has been taken away, and what was kept in it"
     if first == last:
         return f"{kind} {first} is finished and kept in {folder}"

@@ -34,7 +34,7 @@ from ..mesh.domain import Domain
 from .pointwise import EPS, evaluate
 
 if TYPE_CHECKING:
-    from .moments import Tensor, Trace
+    from .quadrature import Tensor, Trace
 
 Complaint = tuple[tuple[float, ...], str]
 """Where, and what is wrong there."""

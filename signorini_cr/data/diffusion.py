@@ -24,7 +24,7 @@ from ..fem.space import facet_corners, facet_entities, function_space, vertex_va
 from ..mesh.domain import Domain
 from .admissible import check_symmetry
 from .loads import NeumannMoments, VolumeMoments, bounds_on_facets, chi
-from .moments import Compiled, OnFacets, Tensor, Trace, Volume
+from .quadrature import Compiled, OnFacets, Tensor, Trace, Volume
 from .ranges import range_of
 
 FINE = (12, 16)

@@ -25,9 +25,9 @@ from ..fem.cells import (
 from ..fem.space import facet_quadrature
 from .cutting import Cut, cut, refine
 from .jets import Boxes, Enclosure
-from .moments import LOAD_DEGREE, OnFacets, Volume
 from .pieces import Pieces
 from .pointwise import Unknown
+from .quadrature import LOAD_DEGREE, OnFacets, Volume
 from .ranges import errors_on, range_on
 from .triangles import Triangles, trace_constant
 

@@ -22,7 +22,7 @@ from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import DiffusionOnMesh, diffusion
 from ..data.loads import NOTHING, Certain, Segments, VolumeMoments, mean_to_norm, reacts
-from ..data.moments import Coefficient, OnParts
+from ..data.quadrature import Coefficient, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from ..rounding import at_most, interval

@@ -20,7 +20,7 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.admissible import differs
-from ..data.moments import OnFacets, OnParts
+from ..data.quadrature import OnFacets, OnParts
 from ..fem.cells import THIN, BoundaryFacets, Cells, measures
 from ..fem.conditions import as_number
 from .best import solved

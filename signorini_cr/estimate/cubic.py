@@ -16,7 +16,7 @@ from dolfinx import fem
 
 from .. import compat
 from ..arrays import FloatArray
-from ..data.moments import OnFacets
+from ..data.quadrature import OnFacets
 from ..fem.cells import Cells, blocks, dot_rows, pick
 from .companion import Companion
 from .flux import Flux

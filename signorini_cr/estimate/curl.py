@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..data.loads import NOTHING, Segments, VolumeMoments
-from ..data.moments import Coefficient
+from ..data.quadrature import Coefficient
 from ..fem.cells import THIN, Cells, blocks, measures, pick
 from .beyond import Beyond
 from .companion import Companion

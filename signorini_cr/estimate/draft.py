@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from ..data.moments import OnFacets, OnParts
+from ..data.quadrature import OnFacets, OnParts
 from ..fem.cells import BoundaryFacets, Cells
 from .functional import Masses
 

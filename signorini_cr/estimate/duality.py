@@ -18,7 +18,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.loads import NOTHING, Segments, VolumeMoments, reacts, trace_of
-from ..data.moments import Coefficient
+from ..data.quadrature import Coefficient
 from ..fem.cells import Cells, at_points, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bend_squares, on_facet
 from .flux import Flux, field_squares

@@ -19,9 +19,9 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
 from ..data.cutting import refine
 from ..data.jets import Enclosure, Jet, choices_first
-from ..data.moments import OnParts, Trace
 from ..data.pieces import Pieces
 from ..data.pointwise import Unknown
+from ..data.quadrature import OnParts, Trace
 from ..data.triangles import Triangles
 from ..fem.cells import BoundaryFacets, Cells
 

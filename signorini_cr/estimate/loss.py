@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..arrays import FloatArray
 from ..data.diffusion import DiffusionOnMesh
 from ..data.loads import Known, Segments
-from ..data.moments import Coefficient
+from ..data.quadrature import Coefficient
 from .duality import EPS
 
 UNKNOWN = "{}: its coefficient is not known to be bounded, and 0 or more, on each facet"

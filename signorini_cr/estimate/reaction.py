@@ -10,7 +10,7 @@ from mpi4py import MPI
 from ..arrays import FloatArray
 from ..data.diffusion import DiffusionOnMesh
 from ..data.loads import Certain, VolumeMoments, reacts
-from ..data.moments import Coefficient
+from ..data.quadrature import Coefficient
 
 UNKNOWN = "the reaction is not known to be bounded, and 0 or more, on each cell"
 

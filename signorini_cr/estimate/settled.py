@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import FloatArray, Int32Array
 from ..data.diffusion import diffusion
-from ..data.moments import OnParts
+from ..data.quadrature import OnParts
 from ..fem.cells import Cells
 from ..fem.conditions import Condition
 from .certificate import Certificate, Made

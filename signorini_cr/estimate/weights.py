@@ -17,8 +17,8 @@ from ..arrays import FloatArray, Int32Array
 from ..data.admissible import place, shown
 from ..data.diffusion import diffusion
 from ..data.jets import Enclosure
-from ..data.moments import OnFacets, OnParts, Trace
 from ..data.pieces import Pieces
+from ..data.quadrature import OnFacets, OnParts, Trace
 from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
 from ..fem.conditions import Condition, Data, as_number, facets_of

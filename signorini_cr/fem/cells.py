@@ -553,14 +553,15 @@ class Cells:
         return -2.0 * sum_rows(self.stiffness[:, block])
 
 
-def on_cells(mesh: Mesh, values: FloatArray) -> fem.Function:
+def on_cells(mesh: Mesh, values: FloatArray, name: str | None = None) -> fem.Function:
     """Make a function that is constant on each cell; collective.
 
     Args:
         mesh: The mesh.
         values: Numbers or tensors on the cells of this rank, shape (cells, …).
+        name: What writers are to call it.
     """
-    function = fem.Function(fem.functionspace(mesh, ("DG", 0, values.shape[1:])))
+    function = fem.Function(fem.functionspace(mesh, ("DG", 0, values.shape[1:])), name=name)
     function.x.array[: values.size] = values.ravel()
     function.x.scatter_forward()
     return function

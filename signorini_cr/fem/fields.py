@@ -13,8 +13,9 @@ import numpy.typing as npt
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import Int32Array
 from ..compat import submesh
+from .cells import on_cells
 from .space import vertex_values
 
 
@@ -28,20 +29,6 @@ def discontinuous(u: fem.Function, name: str = "u") -> fem.Function:
     V = fem.functionspace(u.function_space.mesh, ("DG", 1))
     function = fem.Function(V, name=name)
     function.x.array[V.dofmap.list] = vertex_values(u)
-    return function
-
-
-def on_cells(mesh: Mesh, values: FloatArray, name: str) -> fem.Function:
-    """Make a function that is constant on each cell; collective.
-
-    Args:
-        mesh: The mesh.
-        values: One a cell that this rank owns, shape (cells,).
-        name: What writers are to call it.
-    """
-    function = fem.Function(fem.functionspace(mesh, ("DG", 0)), name=name)
-    function.x.array[: len(values)] = values
-    function.x.scatter_forward()
     return function
 
 

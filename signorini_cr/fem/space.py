@@ -77,7 +77,7 @@ def closure_dofs(V: fem.FunctionSpace, facets: Int32Array) -> Int32Array:
     """Find the dofs that fix a function on boundary facets.
 
     One per facet, its midpoint's, for CR; the d of its vertices for P1, in the order in which
-    `moments.Trace` gives values at vertices.
+    `quadrature.Trace` gives values at vertices.
 
     Args:
         V: CR or P1.

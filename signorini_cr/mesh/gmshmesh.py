@@ -163,9 +163,9 @@ def triangulate(
 
 def _is_bounded_by(triangles: Int64Array, facets: Int64Array) -> bool:
     """Tell whether the sides that one triangle has are these facets, and others have two."""
-    most = int(triangles.max(initial=0)) + 1
+    most = 1 + int(max(triangles.max(initial=0), facets.max(initial=0)))
     sides, cells = np.unique(_key(triangles[:, [[1, 2], [0, 2], [0, 1]]], most), return_counts=True)
-    return bool(cells.max() <= 2) and np.array_equal(
+    return bool(cells.max(initial=0) <= 2) and np.array_equal(
         sides[cells == 1], np.unique(_key(facets, most))
     )
 

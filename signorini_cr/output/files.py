@@ -132,8 +132,8 @@ def _there(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        for place in missing:
-            with suppress(OSError):
+        with suppress(OSError):  # what is in one that does not go may be written with `..`
+            for place in missing:
                 place.rmdir()
 
 

@@ -700,6 +700,7 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "."], ["folder; a problem file (TOML) is needed"]),
         (["solve", "FILE", "--out", "FILE/out"], ["--out: cannot write", "not a folder"]),
         (["solve", "FILE", "--out", "/proc/none"], ["--out: cannot write", "not writable"]),
+        (["check", "FILE", "--out", 300 * "x"], ["--out: cannot write", "name too long"]),
     ],
     ids=lambda argv: " ".join(argv)[:30],
 )

@@ -9,9 +9,9 @@ from helpers import SQUARE
 from mpi4py import MPI
 
 from signorini_cr import compat
-from signorini_cr.data import moments
-from signorini_cr.data.moments import Rule, Trace, Volume
+from signorini_cr.data import quadrature
 from signorini_cr.data.pointwise import Samples
+from signorini_cr.data.quadrature import Rule, Trace, Volume
 from signorini_cr.fem.cells import Cells
 from signorini_cr.fem.space import facet_entities, function_space
 
@@ -70,7 +70,7 @@ def test_in_cells_they_have_them_too(name, monkeypatch):
     domain = SQUARE.mesh(0.2)
     cells = Cells(domain, function_space(domain.mesh, "CR"), [])
     volume = Volume(written(name, domain.mesh), domain.mesh, Rule(domain.mesh, 4))
-    monkeypatch.setattr(moments, "FEW", 0)
+    monkeypatch.setattr(quadrature, "FEW", 0)
     known = volume.at(cells)
     monkeypatch.undo()
     monkeypatch.setattr(compat, "bound", None)

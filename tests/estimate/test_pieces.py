@@ -14,7 +14,7 @@ from mpi4py import MPI
 from signorini_cr import Polygon, Problem, solve, solve_levels
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
-from signorini_cr.data.moments import OnParts
+from signorini_cr.data.quadrature import OnParts
 from signorini_cr.data.triangles import Triangles
 from signorini_cr.estimate import (
     certificate,

@@ -15,8 +15,8 @@ from mpi4py import MPI
 from signorini_cr import Domain, InputError, Polygon, Problem, solve
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Certain, Known, Segments, VolumeMoments
-from signorini_cr.data.moments import OnParts
 from signorini_cr.data.pieces import Pieces
+from signorini_cr.data.quadrature import OnParts
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, duality, flux, force, pairing, weights
 from signorini_cr.estimate.beyond import Beyond

@@ -31,7 +31,7 @@ from signorini_cr import (
     solve,
     solve_levels,
 )
-from signorini_cr.data.moments import Trace
+from signorini_cr.data.quadrature import Trace
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.conditions import Condition
 from signorini_cr.fem.problem import Forms
