@@ -700,7 +700,6 @@ def test_bad_input(name: str, write) -> None:
         (["solve", "."], ["folder; a problem file (TOML) is needed"]),
         (["solve", "FILE", "--out", "FILE/out"], ["--out: cannot write", "not a folder"]),
         (["solve", "FILE", "--out", "/proc/none"], ["--out: cannot write", "not writable"]),
-        (["check", "FILE", "--out", 300 * "x"], ["--out: cannot write", "name too long"]),
     ],
     ids=lambda argv: " ".join(argv)[:30],
 )
@@ -924,6 +923,13 @@ def test_check(write) -> None:
         assert told["dirichlet"].endswith("; 8 facets, length 4")
         assert "neumann" not in told
         assert [file.name for file in out.iterdir()] == ["mesh.png"] or "not drawn" in text
+
+
+@pytest.mark.parametrize("word", ["check", "solve"])
+def test_a_folder_whose_name_is_too_long(word: str, write) -> None:
+    status, _, err = run(word, write(CASE), "--out", 300 * "x")
+    told = "--out: cannot write to" in err and err.endswith("File name too long\n")
+    assert status == 2 and (told if COMM.rank == 0 else not err)
 
 
 def test_a_check_leaves_the_results_of_a_run_alone(write) -> None:
