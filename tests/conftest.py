@@ -25,14 +25,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--first"):
         return
-    begun, left_out = set(), []
+    begun: set[str] = set()
+    kept: list[pytest.Item] = []
+    left_out: list[pytest.Item] = []
     for item in items:
         test = item.nodeid.partition("[")[0]
-        if item.get_closest_marker("slow") and test in begun:
-            left_out.append(item)
+        again = test in begun and item.get_closest_marker("slow")
+        (left_out if again else kept).append(item)
         begun.add(test)
     config.hook.pytest_deselected(items=left_out)
-    items[:] = [item for item in items if item not in set(left_out)]
+    items[:] = kept
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -7,7 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +230,20 @@ def smallest_angle(mesh: Mesh) -> float:
 def integral(form: ufl.Form, comm: MPI.Comm = MPI.COMM_WORLD) -> float:
     """What the form is, over all ranks."""
     return comm.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+def on_the_square(problem: Problem, levels: int = 4, size: float = 0.25) -> list[Solution]:
+    """On meshes of the unit square, each twice as fine as the one before."""
+    return list(solve_levels(problem, SQUARE.mesh(size, MPI.COMM_WORLD), levels))
+
+
+def widths_of(intervals: Iterable[tuple[float, float]], inside: float | None = None) -> np.ndarray:
+    """How wide intervals are, each of which must hold a number if there is one."""
+    found = []
+    for lower, upper in intervals:
+        assert lower <= upper and (inside is None or lower <= inside <= upper)
+        found.append(upper - lower)
+    return np.array(found)
 
 
 def orders(found: np.ndarray) -> np.ndarray:

@@ -241,10 +241,8 @@ def _left(out: Path, new: bool) -> tuple[int, list[str]]:
         return -1, faults
     if former and "report.json" in there:
         faults.append(f"of a former run: {sorted(former)}")
-    if new and "report.json" not in there:
-        return 0, faults
     if "report.json" not in there:
-        return 0, [*faults, "no report"]
+        return 0, faults if new else [*faults, "no report"]
     report = json.loads((out / "report.json").read_text())
     what, table = ("times", "times.csv") if "times" in report else ("levels", "levels.csv")
     number = len(report[what])

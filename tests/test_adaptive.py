@@ -32,7 +32,7 @@ def run(example, size=4, **limits):
     return list(solve_adaptive(example.problem, example.structured(size), **limits))
 
 
-MOST = {"S1": 4000, "B": 4000, "D": 10_000, "I": 400}
+MOST = {"S1": 4000, "B": 4000, "D": 10_000, "I": 1500}
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import SQUARE, orders
+from helpers import SQUARE, on_the_square, orders, widths_of
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -16,7 +16,6 @@ from signorini_cr import (
     Polygon,
     Problem,
     Robin,
-    Solution,
     force,
     solve_levels,
 )
@@ -37,20 +36,11 @@ WEIGHTS = {
 """With their means on the floor and on top."""
 
 
-def solved(problem, levels=4, size=0.25) -> list[Solution]:
-    """On meshes of the unit square; what is asked of a problem is asked of the same solutions."""
-    return list(solve_levels(problem, SQUARE.mesh(size, MPI.COMM_WORLD), levels))
-
-
 def widths(solutions, *parts, weight=None, inside=None):
     """Of the intervals of what flows through parts."""
-    found = []
-    for solution in solutions:
-        value, lower, upper = force.flux(solution, *parts, weight=weight)
-        assert abs(value - lower) < 1.0
-        assert lower <= upper and (inside is None or lower <= inside <= upper)
-        found.append(upper - lower)
-    return np.array(found)
+    found = [force.flux(solution, *parts, weight=weight) for solution in solutions]
+    assert all(abs(value - lower) < 1.0 for value, lower, _ in found)
+    return widths_of([each[1:] for each in found], inside)
 
 
 @pytest.mark.parametrize("part", ["floor", "top"])
@@ -58,7 +48,7 @@ def test_fluxes_of_a_linear_problem(part):
     """No part is in contact: h²."""
     around = {"left": Neumann(), "right": Neumann()}
     ends = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0)}
-    found = widths(solved(Problem(f=5.0, reaction=4.0, conditions=ends | around)), part)
+    found = widths(on_the_square(Problem(f=5.0, reaction=4.0, conditions=ends | around)), part)
     assert (abs(orders(found) - 2.0) < 0.2).all() and found[-1] < 2e-2
 
 
@@ -66,7 +56,7 @@ def test_fluxes_beside_a_loss_of_heat():
     """Both solutions are like r² log r where parts meet: almost h²."""
     around = {"left": Neumann(), "right": Robin(1.0, coefficient=3.0, external=0.5)}
     ends = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0)}
-    found = widths(solved(Problem(f=5.0, reaction=2.0, conditions=ends | around)), "top")
+    found = widths(on_the_square(Problem(f=5.0, reaction=2.0, conditions=ends | around)), "top")
     assert (orders(found) > 1.5).all() and (np.diff(orders(found)) > 0.0).all()
 
 
@@ -89,7 +79,7 @@ def test_a_linear_flux_is_known_to_rounding():
     """u is affine."""
     conditions = {"floor": Dirichlet(0.0), "top": Dirichlet(1.0), "left": Neumann()}
     problem = Problem(conditions=conditions | {"right": Neumann()})
-    found = widths(solved(problem), "top", inside=1.0)
+    found = widths(on_the_square(problem), "top", inside=1.0)
     assert (found < 1e-6).all()
 
 
@@ -112,7 +102,7 @@ def layers(floor, levels, size):
         sides = {"floor": below, "top": Dirichlet(-sign)} | BESIDE
         problem = Problem(f=-10.0 * sign, conditions=sides)
         flows = {"floor": 6.0 * sign, "top": 4.0 * sign}
-    return solved(problem, levels, size), flows
+    return on_the_square(problem, levels, size), flows
 
 
 @pytest.mark.parametrize("part", ["floor", "top"])
@@ -167,7 +157,7 @@ def test_where_all_data_vary_within_cells(touching):
     floor = Contact(lambda x: u(x) - room, g=known, coefficient=b, external=0.5)
     sides = {"floor": floor, "top": Dirichlet(u), "right": Neumann(along)}
     sides["left"] = Neumann(lambda x: -along(x))
-    solutions = solved(Problem(f=load, coefficient=kappa, reaction=c, conditions=sides))
+    solutions = on_the_square(Problem(f=load, coefficient=kappa, reaction=c, conditions=sides))
     t, weights = np.polynomial.legendre.leggauss(20)
     x = 0.5 + 0.5 * t
     top = 0.5 * weights @ ((2.0 + np.sin(3.0 * x - 1.0)) * np.cos(2.0 * x + 1.0))
@@ -185,7 +175,7 @@ def test_contact_that_begins_somewhere():
     """h: nothing is corrected."""
     conditions = {"floor": Contact(0.0), "top": Dirichlet(0.0), "left": Neumann()}
     load = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), -8.0, 8.0)  # noqa: E731
-    solutions = solved(Problem(f=load, conditions=conditions | {"right": Neumann()}), 3)
+    solutions = on_the_square(Problem(f=load, conditions=conditions | {"right": Neumann()}), 3)
     found = widths(solutions, "floor")
     assert (orders(found) < 1.7).all()
     for weight, _ in WEIGHTS.values():
@@ -196,7 +186,7 @@ def test_contact_that_begins_somewhere():
 def test_a_part_without_contact_beside_one_where_contact_begins():
     """What is known of one part does not hang on the other: h², and h there."""
     sides = {"floor": Contact(-9.0), "top": Contact(0.0)} | {"left": Neumann(), "right": Neumann()}
-    solutions = solved(Problem(f=lambda x: 2.0 - 4.0 * x[0], reaction=2.0, conditions=sides))
+    solutions = on_the_square(Problem(f=lambda x: 2.0 - 4.0 * x[0], reaction=2.0, conditions=sides))
     found = widths(solutions, "floor", inside=0.0)
     assert (orders(found) > 1.5).all()
     first = widths(solutions[:3], "top")
@@ -221,7 +211,7 @@ def test_a_weight_on_a_part_in_contact_and_one_without():
     def weight(x):
         return (1.0 - x[1]) * (1.0 + x[0])
 
-    solutions = solved(problem, 3, 0.125)
+    solutions = on_the_square(problem, 3, 0.125)
     found = widths(solutions, "floor", "right", inside=9.0, weight=weight)
     assert (orders(found) > 1.7).all()
     found = widths(solutions, "right", inside=0.0, weight=lambda x: x[1] * (1.0 - x[1]))

@@ -5,43 +5,32 @@ from functools import cache
 import numpy as np
 import pytest
 import ufl
-from helpers import SQUARE, orders
-from mpi4py import MPI
+from helpers import on_the_square, orders, widths_of
 
-from signorini_cr import Contact, Dirichlet, Neumann, Problem, Solution, means, solve_levels
+from signorini_cr import Contact, Dirichlet, Neumann, Problem, means
 
 pytestmark = pytest.mark.slow
 
 BESIDE = {"left": Neumann(), "right": Neumann()}
 
 
-def solved(problem, levels=4) -> list[Solution]:
-    """On meshes of the unit square."""
-    return list(solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), levels))
-
-
 @cache
 def out_of_reach():
     """−u'' + 9 u = 1, u'(0) = 0, u(1) = 1; solved once for all that is asked of it."""
     conditions = {"floor": Contact(-3.0), "top": Dirichlet(1.0)} | BESIDE
-    return solved(Problem(f=1.0, reaction=9.0, conditions=conditions))
+    return on_the_square(Problem(f=1.0, reaction=9.0, conditions=conditions))
 
 
 @cache
 def pressed(loss):
     """u = 5 y² − 6 y and λ = 6 with f = −10; likewise."""
     conditions = {"floor": Contact(0.0, coefficient=loss), "top": Dirichlet(-1.0)} | BESIDE
-    return solved(Problem(f=-10.0, conditions=conditions))
+    return on_the_square(Problem(f=-10.0, conditions=conditions))
 
 
 def widths(solutions, where=None, weight=None, inside=None):
     """Of the integrals' intervals."""
-    found = []
-    for solution in solutions:
-        _, lower, upper = means.integral(solution, where, weight)
-        assert lower <= upper and (inside is None or lower <= inside <= upper)
-        found.append(upper - lower)
-    return np.array(found)
+    return widths_of([means.integral(each, where, weight)[1:] for each in solutions], inside)
 
 
 def bent(x):
@@ -96,7 +85,7 @@ def test_one_part_held_and_one_free():
         "top": Dirichlet(-1.0),
         "left": Neumann(),
     }
-    found = widths(solved(Problem(f=-10.0, conditions=conditions)), inside=-4 / 3)
+    found = widths(on_the_square(Problem(f=-10.0, conditions=conditions)), inside=-4 / 3)
     assert (abs(orders(found) - 2.0) < 0.1).all()
 
 
@@ -110,5 +99,5 @@ def test_contact_that_begins_somewhere():
     """Where nothing more is known the width is of the first order."""
     load = lambda x: ufl.conditional(ufl.lt(x[0], 0.5), -8.0, 8.0)  # noqa: E731
     conditions = {"floor": Contact(0.0), "top": Dirichlet(0.0)} | BESIDE
-    found = widths(solved(Problem(f=load, conditions=conditions)))
+    found = widths(on_the_square(Problem(f=load, conditions=conditions)))
     assert (orders(found) > 0.8).all() and (orders(found) < 1.7).all()

@@ -266,10 +266,9 @@ def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
 
     folder = _folder(args)
     with naming("--out"):
-        check_writable(folder, comm=comm)
-        # mesh.png beside a report is that of its run
-        picture = CHECKED if on_root(comm, os.path.exists, folder / REPORT) else "mesh.png"
-        check_writable(folder, [picture], comm)
+        check_writable(folder, ["mesh.png", CHECKED], comm)
+    # mesh.png beside a report is that of its run
+    picture = CHECKED if on_root(comm, os.path.exists, folder / REPORT) else "mesh.png"
     case, domain = read_case(args, screen, comm)
     screen.line(f"{args.file}: in order")
     screen.line(folded(statement(case, domain)))

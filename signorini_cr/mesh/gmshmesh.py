@@ -164,7 +164,7 @@ def triangulate(
 def _is_bounded_by(triangles: Int64Array, facets: Int64Array) -> bool:
     """Tell whether the sides that one triangle has are these facets, and others have two."""
     most = 1 + int(max(triangles.max(initial=0), facets.max(initial=0)))
-    sides, cells = np.unique(_key(triangles[:, [[1, 2], [0, 2], [0, 1]]], most), return_counts=True)
+    sides, cells = np.unique(_sides(triangles, most), return_counts=True)
     return bool(cells.max(initial=0) <= 2) and np.array_equal(
         sides[cells == 1], np.unique(_key(facets, most))
     )
@@ -427,8 +427,7 @@ def _check_names(
     if not curves:
         return
     tags = int(triangles.max()) + 1
-    sides = _key(triangles[:, [[1, 2], [0, 2], [0, 1]]], tags)
-    keys, cells = np.unique(sides, return_counts=True)
+    keys, cells = np.unique(_sides(triangles, tags), return_counts=True)
     loose = np.setdiff1d(keys[cells == 1], _key(labelled, tags))
     for name, ends in curves.items():
         number = np.count_nonzero(np.isin(_key(ends, tags), loose))
@@ -488,7 +487,7 @@ def _check_facets(raw: Triangulation, names: Mapping[int, str]) -> None:
     """Insist on labels of exterior facets, one each, and on triangles side by side."""
     if (found := too_thin(raw.points[raw.triangles])) is not None:
         raise InputError(found)
-    of_cells = _key(raw.triangles[:, [[1, 2], [0, 2], [0, 1]]], len(raw.points))
+    of_cells = _sides(raw.triangles, len(raw.points))
     keys, sides, count = np.unique(of_cells, return_inverse=True, return_counts=True)
     sides = sides.reshape(of_cells.shape)
     _check_labels(raw, keys, count, names)
@@ -502,6 +501,11 @@ def _check_facets(raw: Triangulation, names: Mapping[int, str]) -> None:
 def _key(ends: Int64Array, points: int) -> Int64Array:
     """Make one number of two, in either order, that are below the number of points."""
     return ends.min(axis=-1) * points + ends.max(axis=-1)
+
+
+def _sides(triangles: Int64Array, points: int) -> Int64Array:
+    """Make such numbers of triangles' sides, each opposite a corner, shape (triangles, 3)."""
+    return _key(triangles[:, [[1, 2], [0, 2], [0, 1]]], points)
 
 
 def _check_labels(

@@ -15,7 +15,7 @@ from ..rounding import at_most, counted, interval, known
 from . import checkpoint
 from .files import Where, Writer, write_files, write_text
 from .meanings import OF_STEPS
-from .report import FIELDS, bounded, energy_bounds, of_former_runs, plain, report_json
+from .report import FIELDS, REPORT, bounded, energy_bounds, of_former_runs, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
 from .tables import (
     Column,
@@ -251,7 +251,7 @@ def write_search(
     facts = {"said": said, "levels": report["search"]}
     removed = of_former_runs(folder, comm) if len(report["search"]) == 1 else set()
     writers: dict[str, Writer] = {
-        "report.json": lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
+        REPORT: lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
     }
     write_files(folder, writers, removed=removed, comm=comm)
@@ -288,7 +288,7 @@ def write_steps(
         return lambda path: on_root(comm, write_text, path, make)
 
     writers: dict[str, Writer] = {
-        "report.json": text(lambda: report_json(report)),
+        REPORT: text(lambda: report_json(report)),
         TABLE: text(lambda: levels_csv(records)),
         SERIES: text(lambda: _series(records)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
