@@ -3,6 +3,7 @@
 import faulthandler
 import gc
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,6 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # Here fd 2 is the real one; while a test runs it is the capture file
     global _stderr
     _stderr = os.dup(2)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored, by all that tests start
     # What runs that were killed have left would keep forms of the tests' own waiting
     if MPI.COMM_WORLD.rank == 0:
         jit.remove_unfinished(until=time.time() - jit.ABANDONED)

@@ -787,6 +787,48 @@ def waves(rng: np.random.Generator) -> Exact:
     )
 
 
+# ---- κ varies slowly: p = n_x, n_y, b, room. Heat flows along n, by 1 per length
+
+
+def _slow_kappa(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return m.exp(p[2] * (p[0] * x + p[1] * y))
+
+
+def _slow_u(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return (1.0 - 1.0 / _slow_kappa(m, x, y, p)) / p[2]
+
+
+def _slow_gradient(m: Any, x: Any, y: Any, p: Sequence[Any]) -> tuple[Any, Any]:
+    flow = 1.0 / _slow_kappa(m, x, y, p)
+    return p[0] * flow, p[1] * flow
+
+
+def _slow_g(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return p[1] + 0.0 * x  # on top
+
+
+def _slow_obstacle(m: Any, x: Any, y: Any, p: Sequence[Any]) -> Any:
+    return _slow_u(m, x, y, p) - p[3]
+
+
+def coefficient_slow(rng: np.random.Generator) -> Exact:
+    """Κ varies by a ten-thousandth to a tenth of itself in a cell, and no load hides it."""
+    pressed = bool(rng.random() < 0.6)
+    angle = float(rng.uniform(-0.9, -0.1)) * np.pi if pressed else 0.0
+    b = float(10.0 ** rng.uniform(-3.0, 0.0) * rng.choice([-1, 1]))
+    return Exact(
+        "κ varies slowly, no load",
+        (float(np.cos(angle)), float(np.sin(angle)), b, 0.0 if pressed else 1.0),
+        HELD if rng.random() < 0.5 else GATE,
+        _slow_u,
+        _slow_gradient,
+        _slow_obstacle,
+        _slow_u,
+        g=_slow_g,
+        coefficient=_slow_kappa,
+    )
+
+
 CLASSES: dict[Callable[[np.random.Generator], Exact], int] = {
     load_jumps: 150,
     coefficient_jumps: 100,
@@ -801,5 +843,6 @@ CLASSES: dict[Callable[[np.random.Generator], Exact], int] = {
     load_disc: 80,
     smooth: 90,
     waves: 60,
+    coefficient_slow: 90,
 }
 """What makes a problem of each class, and how many are made."""

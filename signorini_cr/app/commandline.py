@@ -313,7 +313,7 @@ def start_petsc(options: list[str]) -> None:
         os.environ["HOME"] = tempfile.gettempdir() if found == "~" else found
     if "petsc4py.PETSc" not in sys.modules:
         # PETSc would take a closed pipe, or being told to stop, for a crash
-        petsc4py.init([sys.argv[0] or "signorini-cr", "-no_signal_handler", *options])
+        petsc4py.init(["signorini-cr", "-no_signal_handler", *options])
     elif options:
         from petsc4py import PETSc
 
