@@ -6,8 +6,8 @@ limit = timeout --kill-after=20 2400
 
 readers = env TOOLS=readers.txt container/tool pytest -p meshio -p vtk -p pyvista -p nbclient
 
-.PHONY: demo studies verify fuzz endurance docs quick quick-alone test test-alone test-first test-pair \
-    quick-pair coverage mutants ranks ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
+.PHONY: demo studies verify fuzz endurance docs quick quick-half quick-others test test-alone test-first \
+    test-pair quick-pair coverage mutants ranks ranks-3 ranks-4 readers browser test-package test-wheels lint types clean purge
 
 demo:
 	$(run) $(limit) mpirun -n 2 python3 demos/demo_s1.py
@@ -39,12 +39,18 @@ endurance:
 docs:
 	$(run) container/tool sphinx -W --keep-going -q -b html docs docs/_build
 
-# While one works: lint and types, beside them the tests that take next to no time
+# While one works: lint and types, beside them the tests that take next to no time, half of them in
+# some streets
+half := tests/estimate tests/verification tests/vi
 quick:
-	@$(MAKE) --no-print-directory --keep-going --jobs 2 lint types quick-alone
+	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target \
+	    lint types quick-half quick-others
 
-quick-alone:
-	$(run) $(limit) python3 -m pytest -q -m 'not slow'
+quick-half:
+	$(run) $(limit) python3 -m pytest -q -m 'not slow' $(half)
+
+quick-others:
+	$(run) $(limit) python3 -m pytest -q -m 'not slow' $(half:%=--ignore=%)
 
 test: test-alone test-pair
 
