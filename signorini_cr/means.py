@@ -19,8 +19,9 @@ from .estimate.weights import scalar
 from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Problem
-from .fem.space import function_space, shared_sum
+from .fem.space import function_space
 from .mesh.domain import Domain, named
+from .mesh.shared import shared_sum
 
 DOMAIN = "domain"
 """The place that all of Ω is, unless u has a mean on something else that is called so."""

@@ -24,10 +24,11 @@ from signorini_cr import InputError, Polygon, compat
 from signorini_cr.adaptive import adaptively
 from signorini_cr.fem.physics import Imposed
 from signorini_cr.fem.snapshot import Snapshot
-from signorini_cr.fem.space import facet_corners, facet_entities, facet_measures, shared_sum
+from signorini_cr.fem.space import facet_corners, facet_entities, facet_measures
 from signorini_cr.levels import solve_physics
 from signorini_cr.limits import Limits
 from signorini_cr.mesh.refinement import refine
+from signorini_cr.mesh.shared import shared_sum
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.restart import Restart
 

@@ -16,9 +16,10 @@ from ..data.loads import reacts, trace_of
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
 from ..fem.conditions import Condition, Data, facets_of
-from ..fem.space import function_space, ghosted_vector, shared_sum
+from ..fem.space import function_space, ghosted_vector
 from ..garbage import release
 from ..jit import compiled
+from ..mesh.shared import shared_sum
 from ..options import DUAL, ESTIMATE_PREFIX, solve_once
 from ..vi.solved import Solved
 from .certificate import LOST, Certificate, Made

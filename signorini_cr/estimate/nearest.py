@@ -17,9 +17,10 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..fem.cells import Cells, on_cells, sum_rows
-from ..fem.space import ghosted_vector, shared_maximum, shared_sum
+from ..fem.space import ghosted_vector
 from ..garbage import release
 from ..jit import compiled
+from ..mesh.shared import shared_maximum, shared_sum
 from ..options import COMPANION, ESTIMATE_PREFIX, solve_once
 from .functional import Masses, Slopes
 

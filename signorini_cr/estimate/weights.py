@@ -23,8 +23,9 @@ from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
 from ..fem.conditions import Condition, Data, as_number, facets_of
 from ..fem.problem import Forms, as_expression, carry
-from ..fem.space import function_space, shared_sum
+from ..fem.space import function_space
 from ..mesh.domain import Domain
+from ..mesh.shared import shared_sum
 from .certificate import Made
 from .lifting import JUMP, Cubic, Lift, lift
 

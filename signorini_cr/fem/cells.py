@@ -14,14 +14,15 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from dolfinx import fem, la
+from dolfinx import fem
 from dolfinx.mesh import Mesh
 from scipy.sparse import csc_array
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import DIRICHLET, Domain, Refinement
-from .space import facet_entities, shared_maximum, shared_sum
+from ..mesh.shared import shared_maximum, shared_sum
+from .space import facet_entities
 from .space import measures as simplex_measures
 
 BLOCK = 1 << 15
@@ -330,11 +331,10 @@ class Cells:
     @cached_property
     def exterior(self) -> BoolArray:
         """Whether each facet dof lies on the boundary, ghosts included."""
-        mark = la.vector(self.V.dofmap.index_map, dtype=np.float64)
+        mark = self._facet_zeros()
         for side in self.sides.values():
-            mark.array[side.dofs] = 1.0
-        self.share(mark.array)
-        return mark.array > 0
+            mark[side.dofs] = 1.0
+        return self.share(mark) > 0
 
     @cached_property
     def layers(self) -> Layers:
@@ -467,14 +467,18 @@ class Cells:
     @cached_property
     def between(self) -> IndexArray:
         """Facet dofs that other ranks see as well, shape (n,)."""
-        index_map = self.V.dofmap.index_map
-        mark = np.zeros(index_map.size_local + index_map.num_ghosts)
-        mark[index_map.size_local :] = 1.0
+        mark = self._facet_zeros()
+        mark[self.owned_facets() :] = 1.0
         return np.flatnonzero(self.share(mark) > 0)
 
     @cached_property
-    def _mailbox(self) -> la.Vector:
-        return la.vector(self.V.dofmap.index_map, dtype=np.float64)
+    def _mailbox(self) -> FloatArray:
+        """One for all messages, 0 between them: a new one would take longer than all the rest."""
+        return self._facet_zeros()
+
+    def _facet_zeros(self) -> FloatArray:
+        index_map = self.V.dofmap.index_map
+        return np.zeros(index_map.size_local + index_map.num_ghosts)
 
     def from_others(self, where: IndexArray, values: FloatArray) -> FloatArray:
         """Sum what the other ranks have, in the order of ``between``; collective.
@@ -484,13 +488,11 @@ class Cells:
             values: What it has, shape (n,).
         """
         box = self._mailbox
-        box.array[where] = values
-        mine = box.array[self.between]
-        box.scatter_reverse(la.InsertMode.add)
-        box.scatter_forward()
-        theirs = box.array[self.between] - mine
-        box.array[where] = 0.0
-        box.array[self.between] = 0.0
+        box[where] = values
+        mine = box[self.between]
+        theirs = self.share(box)[self.between] - mine
+        box[where] = 0.0
+        box[self.between] = 0.0
         return theirs
 
     def owned_facets(self) -> int:

@@ -20,6 +20,7 @@ from .. import compat
 from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError
 from .domain import Domain, Refinement
+from .shared import shared_sum
 
 SIMILAR: FloatArray = np.array(
     [
@@ -319,10 +320,10 @@ def _ghosts_in(index_map: Any, entities: Int32Array) -> Int32Array:
 def _shared(mesh: Mesh) -> Int32Array:
     """Find the facets of this rank that another one sees, too; collective."""
     facet_map = mesh.topology.index_map(1)
-    seen = la.vector(facet_map, dtype=np.int32)
-    seen.array[facet_map.size_local :] = 1
-    seen.scatter_reverse(la.InsertMode.add)
-    return np.flatnonzero(seen.array[: facet_map.size_local]).astype(np.int32)
+    seen = np.zeros(facet_map.size_local + facet_map.num_ghosts)
+    seen[facet_map.size_local :] = 1.0
+    shared_sum(mesh, facet_map, seen)
+    return np.flatnonzero(seen[: facet_map.size_local]).astype(np.int32)
 
 
 def _between_ranks(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from dolfinx import la
 from dolfinx.mesh import Mesh, compute_midpoints
 
 from ..arrays import FloatArray
 from ..compat import cell_nodes
+from .shared import shared_sum
 
 THINNEST = 1e6
 """Lengths by heights that are possible.
@@ -86,16 +86,16 @@ def folded(mesh: Mesh) -> str | None:
         topology.connectivity(d, k).array.reshape(-1, d + 1)[:owned] for k in (d - 1, 0)
     )
     numbers = topology.index_map(0).local_to_global(vertices.ravel()).reshape(vertices.shape)
-    sides = la.vector(of_facets)
+    sides = np.zeros(of_facets.size_local + of_facets.num_ghosts)
     for i in range(d + 1):
         # the way around a facet that a cell gives it, against that of its vertices' numbers
         ends = np.delete(numbers, i, axis=1)
         way = np.prod(
             [np.sign(ends[:, k] - ends[:, j]) for j in range(d) for k in range(j)], axis=0
         )
-        np.add.at(sides.array, facets[:, i], (-1) ** i * way * turns)
-    sides.scatter_reverse(la.InsertMode.add)
-    bad = np.flatnonzero(np.abs(sides.array[: of_facets.size_local]) > 1.5).astype(np.int32)
+        np.add.at(sides, facets[:, i], (-1) ** i * way * turns)
+    shared_sum(mesh, of_facets, sides)
+    bad = np.flatnonzero(np.abs(sides[: of_facets.size_local]) > 1.5).astype(np.int32)
     if not len(bad):
         return None
     place = _place(compute_midpoints(mesh, d - 1, bad[:1])[0, :d])

@@ -22,8 +22,9 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.physics import Imposed
-from ..fem.space import facet_corners, facet_entities, function_space, shared_maximum, shared_sum
+from ..fem.space import facet_corners, facet_entities, function_space
 from ..mesh.exchange import Exchange
+from ..mesh.shared import shared_maximum, shared_sum
 
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
 """No edge or median of a cell is at right angles to it, unless on purpose."""

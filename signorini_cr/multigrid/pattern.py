@@ -14,7 +14,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..arrays import FloatArray, IndexArray
-from ..fem.space import shared_sum
+from ..mesh.shared import shared_sum
 from .parents import Layout
 
 

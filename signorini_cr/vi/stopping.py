@@ -39,10 +39,10 @@ from ..multigrid.cycle import Grid
 DECADES = 2.0
 """Dofs whose diagonal entries are within so many powers of ten make a class."""
 
-LEVELS = 4
+BANDS = 4
 """So many classes of dofs on Γ1 that are made of much or of little; the last has all the rest."""
 
-LEVEL = 5.0
+BAND = 5.0
 """So many powers of ten make one. Where u touches without pressing, what rows are made of is what
 the mesh does not resolve, 10⁻³ to 10⁻⁵ of what it is elsewhere: that is not worth more steps."""
 
@@ -51,9 +51,9 @@ WINDOWS = 8
 square and the ones around it: the end of a contact zone, or a corner, where forces fall to 0 is no
 part of its own, on whichever side of a square's edge it lies."""
 
-BOTTOM = 10.0 ** -(LEVEL * (LEVELS - 1))
+BOTTOM = 10.0 ** -(BAND * (BANDS - 1))
 """What forces and residuals are measured against at least, in parts of the most that rows are made
-of: where the last of the levels begins. Where u falls off by many orders of magnitude, or flows are
+of: where the last of the bands begins. Where u falls off by many orders of magnitude, or flows are
 what rounding makes of none, there is no end below."""
 
 PART = 1e-2
@@ -128,8 +128,8 @@ class Stiffness:
         self._smallest, self.stiffest, self.contrast = low, high, max(high / low, 1.0)
         self._kinds = 1 + int(self._classes(np.array([high]))[0]) if high > 0.0 else 1
         self._kind = self._classes(grid.operator.diagonal)
-        self.number = self._kinds * LEVELS
-        self.bounded = LEVELS * self._kind
+        self.number = self._kinds * BANDS
+        self.bounded = BANDS * self._kind
         self.made_of: FloatArray = np.zeros(self.number)
         self.least: FloatArray = np.zeros(self.number)
         self._window = np.zeros(len(grid.operator.dofs), np.intp) if window is None else window
@@ -168,11 +168,11 @@ class Stiffness:
         top = float(around.max())
         around = _spread(around)[self._window]
         decades = np.log10(max(top, 1e-300) / np.maximum(around, 1e-300))
-        level = np.clip(decades / LEVEL, 0, LEVELS - 1).astype(np.intp)
-        self.bounded = LEVELS * self._kind + level
+        band = np.clip(decades / BAND, 0, BANDS - 1).astype(np.intp)
+        self.bounded = BANDS * self._kind + band
         self.made_of = self.totals(made_of)
         self.least = PART * self.made_of
-        self.least[::LEVELS] = 0.0
+        self.least[::BANDS] = 0.0
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Sum values of the bounded dofs over this rank's part of each class, shape (classes,)."""

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 from signorini_cr.multigrid.constrained import ConstrainedMatrix
 from signorini_cr.vi.active import ActiveSet
-from signorini_cr.vi.stopping import LEVELS, Stiffness
+from signorini_cr.vi.stopping import BANDS, Stiffness
 
 pytestmark = pytest.mark.serial
 FIXED, BOUNDED = np.array([3, 7], np.int32), np.array([1, 4, 12, 20, 27], np.int32)
@@ -55,14 +55,14 @@ def test_classes(contrast, number):
     low, high = entries[free].min(), entries[free].max()
     assert stiffness.contrast == pytest.approx(high / low)
     classes = np.floor(np.log(entries / low + 1e-300) / np.log(100.0)).clip(0)
-    kinds = stiffness.number // LEVELS
+    kinds = stiffness.number // BANDS
     assert kinds == 1 + classes[free].max() and abs(kinds - number) <= 1
-    assert np.array_equal(stiffness.bounded, LEVELS * classes[BOUNDED])
+    assert np.array_equal(stiffness.bounded, BANDS * classes[BOUNDED])
     values = np.arange(1.0, 1 + len(BOUNDED))
     sums = stiffness.sums(values)
     assert len(sums) == stiffness.number
     for i, found in enumerate(sums):
-        assert found == values[LEVELS * classes[BOUNDED] == i].sum()
+        assert found == values[BANDS * classes[BOUNDED] == i].sum()
     x = np.random.default_rng(2).normal(size=len(A))
     sizes = (np.abs(A) @ np.abs(x))[BOUNDED]
     which = np.array([True, False, True, True, False])
@@ -97,7 +97,7 @@ def test_imbalance():
 
     def expected(r):
         found = 0.0
-        for i in range(stiffness.number // LEVELS):
+        for i in range(stiffness.number // BANDS):
             own = counted[classes[counted] == i]
             noise = 4 * 2.0**-53 * np.linalg.norm(np.diag(A)[own] * x[own])
             if np.linalg.norm(r[own]) > noise:
