@@ -22,13 +22,15 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from dolfinx.mesh import exterior_facet_indices
 from mpi4py import MPI
 
 from ..arrays import Int32Array
-from ..fem.problem import Data, as_expression
-from ..fem.space import facet_quadrature, facet_to_dof, function_space
+from ..fem.conditions import as_number, facets_of
+from ..fem.problem import Data, Forms, Problem
+from ..fem.space import facet_entities, facet_quadrature, facet_to_dof, function_space
 from ..jit import compiled
-from ..mesh.domain import CONTACT, DIRICHLET, Domain
+from ..mesh.domain import Domain
 from ..solution import Solution
 from .exact import Example
 from .norms import facet_values
@@ -47,24 +49,35 @@ def facet_sets(domain: Domain, example: Example) -> npt.NDArray[np.int8]:
     first: where it is positive, u = α whatever rounding makes of u − α.
 
     Returns:
-        BOUND, MIXED or FREE for every facet of `Domain.facets(CONTACT)`, shape (n,).
+        BOUND, MIXED or FREE for each contact facet that this rank owns, by their local indices,
+        ascending; shape (n,).
 
     Raises:
-        ValueError: The example's u or λ is not known.
+        ValueError: The example's u or λ is not known, or a part has an upper bound.
     """
-    exact, pressure = example.problem.exact, example.pressure
-    if exact is None or pressure is None:
+    forms, pressure = _forms(domain, example.problem), example.pressure
+    if forms.exact is None or pressure is None:
         raise ValueError(f"the solution of {example.name} is not known")
-    facets = domain.facets(CONTACT)
     points = ((np.arange(SAMPLES) + 0.5) / SAMPLES)[:, None]
+    facet_map = domain.mesh.topology.index_map(domain.mesh.topology.dim - 1)
+    sets = np.empty(facet_map.size_local, dtype=np.int8)
+    for condition in forms.bounded:
+        ((_, obstacle),) = condition.bounds
+        facets = domain.facets(condition.number)
+        pressed = facet_values(domain.mesh, pressure, facets, points) > 0.0
+        gap = facet_values(domain.mesh, forms.exact - obstacle, facets, points)
+        share = (pressed | (gap <= 0.0)).mean(axis=1)
+        sets[facets] = np.where(share == 1.0, BOUND, np.where(share == 0.0, FREE, MIXED))
+    return sets[facets_of(domain, forms.bounded)]
 
-    def gap(x: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
-        return as_expression(exact, x) - as_expression(example.problem.obstacle, x)
 
-    pressed = facet_values(domain.mesh, pressure, facets, points) > 0.0
-    bound = pressed | (facet_values(domain.mesh, gap, facets, points) <= 0.0)
-    share = bound.mean(axis=1)
-    return np.where(share == 1.0, BOUND, np.where(share == 0.0, FREE, MIXED)).astype(np.int8)
+def _forms(domain: Domain, problem: Problem) -> Forms:
+    """Take a problem to a mesh, and insist that Γ1 has α alone."""
+    forms = Forms(problem, domain.mesh, "CR", domain.parts, domain.materials)
+    for condition in forms.bounded:
+        if [sign for sign, _ in condition.bounds] != [1]:
+            raise ValueError(f"{condition.part} has an upper bound, of which the theory is not")
+    return forms
 
 
 @dataclass(frozen=True)
@@ -94,8 +107,13 @@ class Judgement:
 
 
 def judge(solution: Solution, example: Example) -> Judgement:
-    """Compare the discrete active set with the sets (2.2); collective."""
-    sets, active = facet_sets(solution.domain, example), solution.contact.active
+    """Compare the discrete active set with the sets (2.2); collective.
+
+    Raises:
+        ValueError: As for `facet_sets`.
+    """
+    sets, contact = facet_sets(solution.domain, example), solution.contact
+    active = contact.active[np.argsort(contact.facets)]
     comm = solution.domain.mesh.comm
     counts = np.array(
         [
@@ -176,26 +194,35 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
         degree: Degree of the quadratures.
 
     Raises:
-        ValueError: The solution is that of another element, u or λ is not known, or the mesh has
-            ghost cells.
+        ValueError: The solution is that of another element, u or λ is not known, the problem is not
+            the paper's, as with another κ, or the mesh has ghost cells.
     """
     domain, problem = solution.domain, solution.problem
     if solution.element != "CR" or problem.exact is None:
         raise ValueError("the estimate is that of the CR element, and needs the exact solution")
+    forms = _forms(domain, problem)
+    if not _is_the_papers(forms):
+        raise ValueError(
+            "the estimate is that of the paper's problem: κ = 1, no reaction, no loss of heat, no"
+            " flux beside an obstacle's"
+        )
     mesh = domain.mesh
     if mesh.comm.allreduce(mesh.topology.index_map(mesh.topology.dim).num_ghosts):
         raise ValueError("the terms are summed over cells: make the mesh with GhostMode.none")
     interpolant = interpolate(domain, problem.exact, degree)
     w = fem.Function(interpolant.function_space)
     w.x.array[:] = interpolant.x.array - solution.u.x.array
-    x, n = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
-    u = as_expression(problem.exact, x)
-    f = -ufl.div(ufl.grad(u)) if problem.f is None else as_expression(problem.f, x)
-    g = ufl.dot(ufl.grad(u), n) if problem.g is None else as_expression(problem.g, x)
-    kinds = _sides(domain, facet_sets(domain, example))
+    n, u = ufl.FacetNormal(mesh), forms.exact
+    kinds = _sides(domain, forms, facet_sets(domain, example))
+    sources = {
+        _SOURCES + i: facet_entities(mesh, domain.facets(condition.number)).ravel()
+        for i, condition in enumerate(forms.natural)
+    }
     metadata = {"quadrature_degree": degree}
     dx = ufl.Measure("dx", mesh, metadata=metadata)
-    ds = ufl.Measure("ds", mesh, metadata=metadata, subdomain_data=list(kinds.items()))
+    ds = ufl.Measure(
+        "ds", mesh, metadata=metadata, subdomain_data=[*kinds.items(), *sources.items()]
+    )
 
     def square(v: fem.Function) -> ufl.Form:
         return ufl.inner(ufl.grad(u - v), ufl.grad(u - v)) * dx
@@ -203,16 +230,19 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
     def side(kind: int) -> ufl.Form:
         return ufl.dot(ufl.grad(u), n) * w * ds(kind)
 
-    forms = [
+    load = forms.f * w * dx
+    for number, condition in zip(sources, forms.natural, strict=True):
+        load += condition.flux * w * ds(number)
+    terms = [
         square(solution.u),
         square(interpolant),
         side(_INTERIOR),
         side(_DIRICHLET),
         side(BOUND),
         side(MIXED),
-        ufl.inner(ufl.grad(u), ufl.grad(w)) * dx - f * w * dx - g * w * ds(_NEUMANN),
+        ufl.inner(ufl.grad(u), ufl.grad(w)) * dx - load,
     ]
-    integrals = [fem.assemble_scalar(compiled(mesh.comm, fem.form, form)) for form in forms]
+    integrals = [fem.assemble_scalar(compiled(mesh.comm, fem.form, term)) for term in terms]
     owned = w.function_space.dofmap.index_map.size_local
     integrals.append(float(solution.residual.x.array[:owned] @ w.x.array[:owned]))
     total = np.array(integrals)
@@ -224,11 +254,21 @@ def abstract_estimate(solution: Solution, example: Example, degree: int = 12) ->
     )
 
 
-_DIRICHLET, _NEUMANN, _INTERIOR = 3, 4, 5
+def _is_the_papers(forms: Forms) -> bool:
+    """Tell whether it is −Δu = f, with nothing but α on Γ1 and ∂ₙu = g on Γg."""
+    return (
+        forms.problem.form is None
+        and (as_number(forms.kappa), as_number(forms.reaction)) == (1.0, 0.0)
+        and all(condition.loss is None for condition in forms.conditions)
+        and all(condition.flux is None for condition in forms.bounded)
+    )
 
 
-def _sides(domain: Domain, sets: npt.NDArray[np.int8]) -> dict[int, Int32Array]:
-    """Sort the sides of the owned cells by kind: BOUND, MIXED, FREE, Γ0, Γg, or both sides inside.
+_DIRICHLET, _NATURAL, _INTERIOR, _SOURCES = 3, 4, 5, 6
+
+
+def _sides(domain: Domain, forms: Forms, sets: npt.NDArray[np.int8]) -> dict[int, Int32Array]:
+    """Find the sides of the owned cells in BOUND, in MIXED, on Γ0, and inside, where both count.
 
     DOLFINx takes any list of sides for a one-sided integral, interior facets' as well; thus no
     integral over jumps is needed, and no ghost cells.
@@ -238,15 +278,16 @@ def _sides(domain: Domain, sets: npt.NDArray[np.int8]) -> dict[int, Int32Array]:
     """
     mesh = domain.mesh
     tdim = mesh.topology.dim
-    mesh.topology.create_connectivity(tdim, tdim - 1)
+    for pair in ((tdim, tdim - 1), (tdim - 1, tdim)):
+        mesh.topology.create_connectivity(*pair)
     facets = mesh.topology.index_map(tdim - 1)
     kind = np.full(facets.size_local + facets.num_ghosts, _INTERIOR, dtype=np.int8)
-    kind[domain.tags.indices] = _NEUMANN
-    kind[domain.tags.find(DIRICHLET)] = _DIRICHLET
-    kind[domain.facets(CONTACT)] = sets
+    kind[exterior_facet_indices(mesh.topology)] = _NATURAL
+    kind[facets_of(domain, forms.fixed)] = _DIRICHLET
+    kind[facets_of(domain, forms.bounded)] = sets
     cells = mesh.topology.index_map(tdim).size_local
     sides = kind[mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)[:cells]]
     return {
         number: np.argwhere(sides == number).astype(np.int32).ravel()
-        for number in (BOUND, MIXED, FREE, _DIRICHLET, _NEUMANN, _INTERIOR)
+        for number in (BOUND, MIXED, _DIRICHLET, _INTERIOR)
     }

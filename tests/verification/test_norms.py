@@ -1,12 +1,25 @@
 """Norms and the paper's estimate, against what can be known of them without solving anything."""
 
+from dataclasses import astuple, replace
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from signorini_cr import Problem, exact, norms, solve, solve_levels, theory
+from signorini_cr import (
+    Contact,
+    Dirichlet,
+    Neumann,
+    Polygon,
+    Problem,
+    exact,
+    norms,
+    solve,
+    solve_levels,
+    theory,
+)
 from signorini_cr.fem.space import facet_measures, function_space
 from signorini_cr.mesh.domain import CONTACT
 
@@ -108,6 +121,46 @@ def test_the_estimate_is_for_cr_with_a_known_solution():
         theory.abstract_estimate(solve(exact.E.problem, exact.E.structured(4)), exact.E)
     with pytest.raises(ValueError, match="CR element"):
         theory.abstract_estimate(solve(exact.S1.problem, exact.S1.structured(4), "P1"), exact.S1)
+
+
+def named(example, **conditions):
+    """The same with names of its own for the parts of the boundary, given what holds on them."""
+    names = {"contact": "floor", "dirichlet": "wall", "neumann": "side"}
+    boundary = [names[part] for part in example.polygon.boundary]
+    polygon = Polygon(example.polygon.vertices, boundary, names=tuple(dict.fromkeys(boundary)))
+    held = {"floor": Contact(0.0), "wall": Dirichlet(), "side": Neumann()} | conditions
+    conditions = {part: held[part] for part in dict.fromkeys(polygon.boundary)}
+    problem = replace(example.problem, conditions=conditions)
+    return replace(example, polygon=polygon, problem=problem)
+
+
+@pytest.mark.parametrize("name", ["S1", "S1 Neumann"])
+def test_the_theory_goes_by_what_holds_on_parts_and_not_by_their_names(name):
+    usual, other = exact.ALL[name], named(exact.ALL[name])
+    terms, judgements = [], []
+    for example in (usual, other):
+        solution = solve(example.problem, example.structured(8))
+        terms.append(astuple(theory.abstract_estimate(solution, example)))
+        judgements.append(theory.judge(solution, example))
+    assert np.allclose(*terms, rtol=1e-9, atol=1e-13)
+    assert judgements[0] == judgements[1] and judgements[0].bound > 0
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        (Contact(0.0, upper=9.0), "floor has an upper bound"),
+        (Contact(0.0, g=1.0), "no flux beside an obstacle's"),
+        (Contact(0.0, coefficient=1.0), "no loss of heat"),
+    ],
+)
+def test_the_theory_is_of_the_papers_problem_alone(condition, words):
+    example = named(exact.S1, floor=condition)
+    with pytest.raises(ValueError, match=words):
+        theory.abstract_estimate(solve(example.problem, example.structured(4)), example)
+    stiff = replace(exact.S1, problem=replace(exact.S1.problem, coefficient=2.0))
+    with pytest.raises(ValueError, match="κ = 1"):
+        theory.abstract_estimate(solve(stiff.problem, stiff.structured(4)), stiff)
 
 
 def gathered_sets(domain, example):
