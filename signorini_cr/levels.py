@@ -164,10 +164,11 @@ def solve_physics(
         return hierarchy.multigrid(system.operator, system.owned_dirichlet)
 
     if restart is not None:
+        held = level.floating is None  # so it is on finer meshes, of which none needs a system
         for refined in restart.meshes(domain):
             level.tidy()
             hierarchy.add(*refined)
-            level = Level(hierarchy.meshes, has_dirichlet=level.floating is None)
+            level = Level(hierarchy.meshes, has_dirichlet=held)
         start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:

@@ -65,10 +65,9 @@ class Moments:
         """The mesh as arrays, for the Crouzeix-Raviart element."""
         if self.earlier is not None:
             return self.earlier.cells
-        forms, kappa = self.compiled.forms, self.compiled.kappa
-        fixed = [condition.number for condition in forms.fixed]
+        kappa = self.compiled.kappa
         stretch = kappa.stretch(self.domain) if isinstance(kappa, Tensor) else None
-        cells = Cells(self.domain, self.V, fixed, stretch=stretch)
+        cells = Cells(self.domain, self.V, self.compiled.forms.gamma_0, stretch=stretch)
         cells.drain(self._sinks(cells))
         return cells
 

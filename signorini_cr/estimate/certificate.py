@@ -219,7 +219,8 @@ class Made:
 
     def cells(self) -> Cells:
         """Return the mesh's geometry."""
-        return Cells(self.level.domain, self.level.V, stretch=self.stretch)
+        gamma_0 = diffusion(self.level.data).forms.gamma_0
+        return Cells(self.level.domain, self.level.V, gamma_0, stretch=self.stretch)
 
     def through(self, cells: Cells) -> FloatArray:
         """Compute the fluxes of y out of the cells, shape (d + 1, cells)."""

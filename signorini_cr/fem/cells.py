@@ -20,7 +20,7 @@ from scipy.sparse import csc_array
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
-from ..mesh.domain import DIRICHLET, Domain, Refinement
+from ..mesh.domain import Domain, Refinement
 from ..mesh.shared import shared_maximum, shared_sum
 from .space import facet_entities
 from .space import measures as simplex_measures
@@ -186,7 +186,7 @@ class Cells:
         self,
         domain: Domain,
         V: fem.FunctionSpace,
-        fixed: Sequence[int] = (DIRICHLET,),
+        fixed: Sequence[int],
         sinks: Mapping[int, FloatArray] = MappingProxyType({}),
         stretch: FloatArray | None = None,
     ):

@@ -493,6 +493,11 @@ class Forms:
         return tuple(c for c in self.conditions if c.fixed is not None)
 
     @property
+    def gamma_0(self) -> tuple[int, ...]:
+        """Their parts' values in the facet tags."""
+        return tuple(c.number for c in self.fixed)
+
+    @property
     def bounded(self) -> tuple[Condition, ...]:
         """The conditions that bound u: their parts make Γ1."""
         return tuple(c for c in self.conditions if c.bounds)

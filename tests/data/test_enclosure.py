@@ -18,6 +18,7 @@ from signorini_cr.data.jets import Boxes, Enclosure, lowered, values
 from signorini_cr.data.pieces import Pieces
 from signorini_cr.data.ranges import Deviation, means
 from signorini_cr.fem.cells import Cells
+from signorini_cr.mesh.domain import DIRICHLET
 from signorini_cr.mesh.families import structured
 
 pytestmark = pytest.mark.slow
@@ -159,7 +160,7 @@ def test_slanted_cells_are_enclosed_in_their_own_coordinates():
     domain = structured(HELD_ALL_ROUND, 8, WORLD)
     mesh = domain.mesh
     mesh.geometry.x[:, 0] += 50 * mesh.geometry.x[:, 1]
-    cells = Cells(domain, fem.functionspace(mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(mesh, ("CR", 1)), (DIRICHLET,))
     x = ufl.SpatialCoordinate(mesh)
     deviation = Deviation(ufl.sin(2 * (x[0] - 50 * x[1]) + 0.3) * ufl.cos(2 * x[1]))
     pieces = Pieces.of_cells(cells)

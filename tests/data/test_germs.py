@@ -13,7 +13,7 @@ from signorini_cr.data.pieces import Pieces
 from signorini_cr.data.ranges import Deviation, errors_on
 from signorini_cr.fem.cells import Cells
 from signorini_cr.fem.space import function_space
-from signorini_cr.mesh.domain import Polygon
+from signorini_cr.mesh.domain import DIRICHLET, Polygon
 
 pytestmark = pytest.mark.serial
 
@@ -107,7 +107,7 @@ def test_points_inside_are_found():
 def test_slivers_at_a_singular_point_are_not_cut_into_slabs():
     """A vertex that is near a singular point leaves a sliver, which has a bound as a triangle."""
     domain = exact.S1.structured(1, MPI.COMM_SELF)
-    cells = Cells(domain, function_space(domain.mesh, "CR"))
+    cells = Cells(domain, function_space(domain.mesh, "CR"), (DIRICHLET,))
     x = ufl.SpatialCoordinate(domain.mesh)
     deviation = Deviation(x[0] ** 4 * (x[0] ** 2 + x[1] ** 2) ** -0.25)
     corners = np.array([[1.6e-3, 3.4e-3], [0.0, 0.0], [-2.75e-12, 0.0]])[:, :, None]

@@ -41,6 +41,7 @@ from signorini_cr.estimate.flux import unbalanced
 from signorini_cr.fem.cells import Cells
 from signorini_cr.force import flux, force_bounds
 from signorini_cr.means import mean
+from signorini_cr.mesh.domain import DIRICHLET
 from signorini_cr.mesh.families import structured
 from signorini_cr.multigrid.hierarchy import NestedMesh
 from signorini_cr.vi.level import Level
@@ -447,7 +448,7 @@ def test_residual_functional_is_bounded():
     example = exact.S1_NEUMANN
     *_, solution = solve_levels(example.problem, example.structured(4), 3)
     level, mesh = solution.level, solution.domain.mesh
-    cells = Cells(level.domain, level.V)
+    cells = Cells(level.domain, level.V, (DIRICHLET,))
     V = fem.functionspace(mesh, ("Lagrange", 1))
     fixed = fem.locate_dofs_topological(V, 1, level.domain.tags.find(2))
     rng = np.random.default_rng(3)
@@ -471,7 +472,7 @@ def test_what_is_carried_away_does_not_depend_on_the_ranks():
     for comm in (WORLD, MPI.COMM_SELF):
         domain = exact.S1_NEUMANN.structured(6, comm)
         level = solve(exact.S1_NEUMANN.problem, domain).level
-        cells, mesh = Cells(level.domain, level.V), domain.mesh
+        cells, mesh = Cells(level.domain, level.V, (DIRICHLET,)), domain.mesh
         x = mesh.geometry.x[cell_nodes(mesh)[: cells.number]].mean(axis=1)
         left = cells.volume * np.exp(-3 * x[:, 0])
         bounds.append([unbalanced(level, cells, left, np.array(1.0), s) for s in (0.0, np.inf)])
@@ -807,7 +808,7 @@ def test_refusals():
 )
 def test_ranges_hold_everywhere(expression):
     domain = exact.S1.structured(6)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     x = ufl.SpatialCoordinate(domain.mesh)
     low, high = range_of(expression(x), cells)
     points = np.random.default_rng(0).dirichlet([0.3, 0.3, 0.3], 60)[:, 1:]

@@ -15,7 +15,7 @@ from signorini_cr.estimate import best, companion, nearest
 from signorini_cr.estimate.certificate import certify
 from signorini_cr.estimate.functional import Slopes
 from signorini_cr.fem.cells import Cells
-from signorini_cr.mesh.domain import CONTACT, Domain
+from signorini_cr.mesh.domain import CONTACT, DIRICHLET, Domain
 from signorini_cr.mesh.families import structured
 
 pytestmark = pytest.mark.ranks
@@ -34,10 +34,12 @@ PUSHED = Problem(
 def cells_of(n, stretched=False, comm=WORLD):
     domain = structured(HELD_ALL_ROUND, n, comm, jitter=0.2)
     V = fem.functionspace(domain.mesh, ("CR", 1))
-    cells = Cells(domain, V)
+    cells = Cells(domain, V, (DIRICHLET,))
     if stretched:
         turned = np.array([[0.8, 0.3], [0.3, (1 + 0.09) / 0.8]])
-        cells = Cells(domain, V, stretch=np.broadcast_to(turned, (cells.number, 2, 2)).copy())
+        cells = Cells(
+            domain, V, (DIRICHLET,), stretch=np.broadcast_to(turned, (cells.number, 2, 2)).copy()
+        )
     return cells
 
 
@@ -114,7 +116,7 @@ def test_multigrid_of_petsc_on_thin_cells(monkeypatch):
     mesh.topology.create_connectivity(1, 2)
     rim = exterior_facet_indices(mesh.topology)
     domain = Domain(mesh, meshtags(mesh, 1, rim, np.full_like(rim, CONTACT)))
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(WORLD.rank)
     excess = rng.normal(size=(3, cells.number))
     slopes = Slopes.of(of_gradients(cells, np.array(1.0)), excess, np.zeros(len(cells.exterior)))

@@ -300,7 +300,7 @@ def test_bounds_by_taylors_formula(signed, monkeypatch):
 def cusps(where, domain=None):
     """Around one vertex, with heights that fit something."""
     domain = domain or square(2, comm=MPI.COMM_SELF)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     x = domain.mesh.geometry.x[:, :2]
     vertex = np.argmin(np.abs(x - where).sum(axis=1))
     nodes = domain.mesh.geometry.dofmap[: cells.number].T
@@ -459,7 +459,7 @@ def test_cusps_are_continuous_and_the_best(where):
 def test_vertices_with_cusps():
     """Those that hold a tenth, no two neighbours, and none where κ varies."""
     domain = square(4, comm=MPI.COMM_SELF, jitter=0.0)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     nodes, x = domain.mesh.geometry.dofmap[: cells.number].T, domain.mesh.geometry.x[:, :2]
 
     def around(*where):
@@ -475,7 +475,7 @@ def test_vertices_with_cusps():
     found = Cusps.of(cells, kappa, steady & ~far, energies)
     assert set(found.at) == set(np.flatnonzero(one))
     domain = square(8, comm=MPI.COMM_SELF)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     assert Cusps.of(cells, kappa, np.array(True), np.ones(cells.number)) is None
 
 
@@ -485,7 +485,7 @@ def test_vertices_with_cusps():
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
 def test_fluxes_of_a_given_divergence(jitter):
     domain = square(4, ("contact", "neumann", "dirichlet", "neumann"), jitter=jitter)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     left = np.random.default_rng(WORLD.rank).normal(size=cells.number)
     fluxes, all_reached = _carry(cells, left)
     assert all_reached
@@ -507,7 +507,7 @@ def test_what_children_lack_is_spread_over_their_parents():
     problem = Problem(f=1.0, coefficient=2.0)
     *_, solution = solve_levels(problem, square(3), 3)
     level = solution.level
-    cells = Cells(level.domain, level.V)
+    cells = Cells(level.domain, level.V, (DIRICHLET,))
     left = np.random.default_rng(WORLD.rank).normal(size=cells.number)
     kappa = np.random.default_rng(WORLD.rank + 9).uniform(1, 2, cells.number)
     found = unbalanced(level, cells, left, kappa, np.inf)
@@ -515,7 +515,9 @@ def test_what_children_lack_is_spread_over_their_parents():
     for mesh, coarser in zip(level.meshes[:0:-1], level.meshes[-2::-1], strict=True):
         parent = mesh.parents.cell[: len(left)]
         number = coarser.domain.mesh.topology.index_map(2).size_local
-        coarse = Cells(coarser.domain, fem.functionspace(coarser.domain.mesh, ("CR", 1)))
+        coarse = Cells(
+            coarser.domain, fem.functionspace(coarser.domain.mesh, ("CR", 1)), (DIRICHLET,)
+        )
         sums, sizes, squares, low = np.zeros((4, number))
         low += np.inf
         for i, at in enumerate(parent):
@@ -537,7 +539,7 @@ def test_what_children_lack_is_spread_over_their_parents():
 def some_cells(seed):
     """A mesh, and random data on its cells."""
     domain = square(2, comm=MPI.COMM_SELF)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(seed)
     kappa = SimpleNamespace(
         low=rng.uniform(0.5, 1, cells.number), high=rng.uniform(1, 3, cells.number)
@@ -744,7 +746,7 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     """Conjugate gradients to the end: orthogonal to all that have no divergence."""
     monkeypatch.setattr(flux, "STEPS", 200)
     domain = square(3, ("contact", "neumann", "dirichlet", "neumann"))
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(WORLD.rank)
     left, kappa = rng.normal(size=cells.number), rng.uniform(1, 3, cells.number)
 
@@ -776,7 +778,7 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
 def test_what_is_worth_carrying(size):
     """Not what is small against the bound; else y gets a field that balances it."""
     domain = square(3, ("contact", "neumann", "dirichlet", "neumann"))
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     left = np.random.default_rng(WORLD.rank).normal(size=cells.number)
     y = SimpleNamespace(excess=np.ones((3, cells.number)), left=left.copy(), unbalanced=left.copy())
     kappa = np.array(2.0)
@@ -832,7 +834,7 @@ def test_conjugate_gradients_for_heights(monkeypatch):
 def test_nearest_function_of_degree_two(kappa):
     """E no longer falls in any value that is free, and what is not free has stayed."""
     domain = square(3)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(WORLD.rank)
     kappa = np.array(kappa) if kappa == 1.0 else rng.uniform(1, 3, cells.number)
     excess, bumps = rng.normal(size=(3, cells.number)), np.zeros(len(cells.exterior))
@@ -913,7 +915,7 @@ def test_energy_of_a_function_of_degree_two():
 def test_cubic_functions_fit_best():
     """No height of an inner facet or of a cell can be changed for the better."""
     domain = square(3, comm=MPI.COMM_SELF)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(6)
     kappa = rng.uniform(1, 3, cells.number)
     v = companion.Companion(
@@ -1248,7 +1250,7 @@ def test_the_best_function_of_degree_two(height, monkeypatch):
     """
     monkeypatch.setattr(Cusps, "of", lambda *_: None)
     domain = square(4, comm=MPI.COMM_SELF)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(14)
     kappa, w = rng.uniform(1, 3, cells.number), rng.normal(size=(3, cells.number))
     rim, contact = np.zeros(cells.vertices.max() + 1), cells.sides[1]
@@ -1366,7 +1368,7 @@ def test_size_of_the_field_that_carries_a_quadratic_flux(shear):
     domain = square(2, comm=MPI.COMM_SELF)
     domain.mesh.geometry.x[:, :2] += rng.uniform(-0.15, 0.15, (len(domain.mesh.geometry.x), 2))
     domain.mesh.geometry.x[:, 0] += shear * domain.mesh.geometry.x[:, 1]
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     smaller = []
     for side in cells.sides.values():
         n = len(side.cells)
@@ -1413,10 +1415,10 @@ def test_triangles_where_lengths_are_stretched():
     """As those of the stretched corners."""
     domain, rng = square(2, comm=MPI.COMM_SELF), np.random.default_rng(22)
     V = fem.functionspace(domain.mesh, ("CR", 1))
-    a = rng.normal(size=(Cells(domain, V).number, 2, 2))
+    a = rng.normal(size=(Cells(domain, V, (DIRICHLET,)).number, 2, 2))
     stretch = a @ a.swapaxes(1, 2) + np.eye(2)
     stretch /= np.sqrt(np.linalg.det(stretch))[:, None, None]
-    cells = Cells(domain, V, stretch=stretch)
+    cells = Cells(domain, V, (DIRICHLET,), stretch=stretch)
     for side in cells.sides.values():
         found = Triangles.of(cells, side, stretched=True)
         apex, base = corner_points(cells, side)

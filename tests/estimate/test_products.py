@@ -131,7 +131,7 @@ def made_up(cells, seed):
 def test_a_weight_in_cells():
     """ψ times u_h and v where both are polynomials, and Cauchy and Schwarz where one is not."""
     domain = square()
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     at, there = Points(cells), np.arange(cells.number) < 3
     rng, made = made_up(cells, 1)
     load = moments(at, psi(at.x))
@@ -195,7 +195,7 @@ def test_a_weight_in_cells():
 def test_what_v_has_beyond_its_mean_meets_what_is_rough(kind):
     """At least |v − v_T|, times |T|^{1/2} ‖ψ − q‖, and at most twice as much."""
     domain = square()
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     at, facet = Points(cells, 20), cells.facets[1, 3]
     rng, made = made_up(cells, 2)
     vertices, made.vertices, made.bumps = made.vertices, 0 * made.vertices, 0 * made.bumps
@@ -231,7 +231,7 @@ def test_what_v_has_beyond_its_mean_meets_what_is_rough(kind):
 def test_rounding_of_weights():
     """In parts of ∫ |ψ| and of ∫ |ψ v|: exactly these where ψ and v are numbers."""
     domain = square()
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     _, made = made_up(cells, 3)
     made.vertices[:], made.bumps[:], there = -2.0, 0.0, np.ones(cells.number)
     load = VolumeMoments(np.full(cells.number, -3.0), None, None)
@@ -607,7 +607,7 @@ def random_kappa(rng, number):
 def test_the_gap_with_a_reaction(bent):
     """c takes up what f has beyond its mean where that is cheaper, and what y lacks."""
     domain = square(3)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     at, rng = Points(cells), np.random.default_rng(20)
     number, kappa = cells.number, random_kappa(rng, cells.number)
     c = np.exp(rng.uniform(0, 9, number))
@@ -664,9 +664,9 @@ def test_the_gap_where_a_tensor_varies(more):
     """‖K^{-1/2}(y − K∇z)‖ by what K has beyond κ_T, where lengths are stretched."""
     domain = square()
     rng, V = np.random.default_rng(21), fem.functionspace(domain.mesh, ("CR", 1))
-    number = Cells(domain, V).number
+    number = Cells(domain, V, (DIRICHLET,)).number
     a = rng.normal(size=(number, 2, 2))
-    cells = Cells(domain, V, stretch=a @ a.swapaxes(1, 2) + np.eye(2))
+    cells = Cells(domain, V, (DIRICHLET,), stretch=a @ a.swapaxes(1, 2) + np.eye(2))
     at, mean = Points(cells), rng.uniform(1, 2, number)
     assert np.allclose(at.area, cells.volume)
     off = 0.2 * rng.normal(size=(len(at.weights), number, 2, 2))
@@ -733,7 +733,7 @@ def test_quadrature_on_pieces(more):
     A polynomial's largest square is Σ φ_i² at a vertex times its mean, φ_i orthonormal.
     """
     domain = square()
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     at, rng, number = Points(cells), np.random.default_rng(26), cells.number
     P, w, excess = rng.normal(size=(3, 3, number))
     bumps, heights = rng.normal(size=(2, len(cells.exterior)))
@@ -815,7 +815,7 @@ def test_a_coefficient_against_affine_functions(kind):
 
     made = solve(Problem(f=-9.0, coefficient=kappa), square(3)).certificate._made
     cells = made.cells()
-    plain = Cells(made.level.domain, made.level.V)
+    plain = Cells(made.level.domain, made.level.V, (DIRICHLET,))
     at = Points(plain)
     slope = sums_of(at.affine(made.vertices[plain.vertices]), at.of_facets(made.bumps))[1]
     tensor = waves(at.x)[..., None, None] * np.eye(2)
@@ -863,7 +863,7 @@ def test_a_coefficient_against_affine_functions(kind):
 def test_what_pulls_at_bumps_of_the_curl(more):
     """−∫ κ⁻¹ (y − κ∇(u_h + v)/2)·curl b_i on each cell."""
     domain = square()
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     at, rng, number = Points(cells), np.random.default_rng(31), cells.number
     kappa, (P, excess, rise) = rng.uniform(1, 3, number), rng.normal(size=(3, 3, number))
     bumps, heights = rng.normal(size=(2, len(cells.exterior)))
@@ -1060,7 +1060,7 @@ def test_rounding_of_the_bracket():
 def test_values_at_vertices_to_begin_with(kind):
     """Least squares: what it costs to leave u_h on cells, by κ and c, and t/b on facets."""
     domain = square(3)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng, none = np.random.default_rng(24), BoundaryFacets.joined([], 2)
     w, side, some = rng.normal(size=(3, cells.number)), cells.sides[3], kind == "masses"
     side = side if some else none
@@ -1222,7 +1222,7 @@ def test_what_cells_with_a_reaction_carry():
 def test_a_reaction_that_is_strong(kappa):
     """y need not balance the load from c h² = 3 κ on."""
     domain = square(3)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     side, number = cells.sides[1], cells.number
     none, nothing = BoundaryFacets.joined([], 2), np.zeros(0)
     edge = Known(none, np.zeros((2, 0)), nothing, nothing > 0)
@@ -1243,7 +1243,7 @@ def test_forces_take_up_what_a_flux_is_bettered_by(sign, some):
     Where a force would change its sign there is none, and b takes up what it does elsewhere.
     """
     domain = square(3)
-    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)))
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     at, rng, side = Points(cells), np.random.default_rng(30), cells.sides[1]
     number, kappa = cells.number, rng.uniform(1, 2, cells.number)
     c = np.full(number, 300.0)
