@@ -327,6 +327,8 @@ def test_going_on(domain):
     assert again.iterations.newton <= 1  # it starts from what was found
     for solution in (again, last):
         check(solution)
+    with pytest.raises(InputError, match="are those of diffusion"):
+        last.force_bounds()
 
 
 def test_each_component_is_held_elsewhere():

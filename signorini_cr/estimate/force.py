@@ -63,7 +63,8 @@ class Interval(NamedTuple):
 
 
 def made_of(solution: Certified) -> Made:
-    """Return what the certificate is made of; an error where there is none."""
+    """Return what the certificate is made of; an error where there is none, or another physics."""
+    diffusion(solution.level.data)
     certificate = solution.certificate
     if certificate._made is None or certificate.bound_h1 is None:
         raise InputError(f"{NO_BOUNDS}: {certificate.reason}")

@@ -14,7 +14,10 @@ import pytest
 from mpi4py import MPI
 
 from signorini_cr import (
+    Contact,
+    Dirichlet,
     Domain,
+    Neumann,
     Polygon,
     Problem,
     limits,
@@ -25,8 +28,10 @@ from signorini_cr import (
 )
 from signorini_cr.app import cli, run
 from signorini_cr.errors import InputError, NotConverged
+from signorini_cr.fem.physics import OnMesh
 from signorini_cr.output import checkpoint
 from signorini_cr.restart import Restart
+from signorini_cr.vi.system import System
 
 pytestmark = pytest.mark.slow
 
@@ -45,9 +50,12 @@ levels = 4
 MODES = ("uniform", "adaptive")
 
 
+CORNERS = np.array([[-1, 0], [1, 0], [1, 1], [-1, 1]])
+
+
 def rectangle(size: float) -> Domain:
     parts = ("contact", "dirichlet", "dirichlet", "dirichlet")
-    return Polygon(np.array([[-1, 0], [1, 0], [1, 1], [-1, 1]]), parts).mesh(size)
+    return Polygon(CORNERS, parts).mesh(size)
 
 
 @pytest.fixture
@@ -287,6 +295,29 @@ def test_from_python_the_steps_are_those_of_a_run_in_one_piece() -> None:
         assert one.contact.number_active == other.contact.number_active
     for one, other in zip(rest[1:], whole[4:], strict=True):
         assert one.iterations.newton == other.iterations.newton
+
+
+@pytest.mark.parametrize("wall", [Dirichlet(0.0), Neumann()])
+def test_meshes_that_are_solved_already_are_not_assembled(wall, monkeypatch) -> None:
+    """But the first, which tells whether something holds all of the domain."""
+    problem = Problem(f=-1.0, conditions={"floor": Contact(0.0), "wall": wall})
+    sides = ("floor", "wall", "wall", "wall")
+    domain = Polygon(CORNERS, sides, names=("floor", "wall")).mesh(0.5)
+    first, second, third, fourth = solve_levels(problem, domain, 4)
+    restart = Restart.of(second, Restart.of(first, None, False), False)
+    restart = COMM.bcast(Restart.of(third, restart, False))
+    assembled = []
+    data = System.__init__
+
+    def counted(system: System, on_mesh: OnMesh, *more: object) -> None:
+        assembled.append(on_mesh.domain.mesh)
+        data(system, on_mesh, *more)
+
+    monkeypatch.setattr(System, "__init__", counted)
+    again, last = solve_levels(problem, domain, 4, restart=restart)
+    assert [again.cells, last.cells] == [third.cells, fourth.cells]
+    assert len(assembled) == 3 and assembled[0] is domain.mesh
+    assert last.energy == pytest.approx(fourth.energy, rel=1e-10)
 
 
 @pytest.mark.parametrize("mode", MODES)
