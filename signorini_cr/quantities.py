@@ -1,19 +1,53 @@
-"""What is wanted of a solution in an interval."""
+"""What is wanted of a solution in an interval, and what kinds of that there are."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+from .errors import InputError, meant
 from .estimate.force import Interval
 from .fem.conditions import Data
 from .solution import Solution
+
+
+class Kind(NamedTuple):
+    """A kind of quantities.
+
+    Attributes:
+        bound: Puts one between two numbers, given a solution, the place and a weight; collective.
+        parts: The types of the parts of the boundary that it may be of.
+        of_u: Whether it may be of materials, and of all of the domain, as well.
+        unit: What it is measured in: "u", "force", or "" where that isn't told.
+        weighted_unit: The same where it has a weight.
+    """
+
+    bound: Callable[[Solution, str | None, Data | None], Interval]
+    parts: tuple[str, ...]
+    of_u: bool
+    unit: str
+    weighted_unit: str
+
+
+def _flux(solution: Solution, place: str | None, weight: Data | None) -> Interval:
+    return solution.flux(str(place), weight=weight)
+
+
+KINDS = {
+    "force": Kind(_flux, ("contact",), False, "force", ""),
+    "flux": Kind(_flux, ("dirichlet",), False, "force", ""),
+    "mean": Kind(Solution.mean, ("contact", "neumann", "robin"), True, "u", "u"),
+    "integral": Kind(Solution.integral, ("contact", "neumann", "robin"), True, "", ""),
+}
+"""All there are, by the key that asks for one."""
 
 
 class Quantity(NamedTuple):
     """A number that u has.
 
     Attributes:
-        kind: "force" or "flux" for what flows through a part, "mean" or "integral" for that of u.
+        kind: One of `KINDS`: "force" or "flux" for what flows through a part, "mean" or "integral"
+            for that of u.
         place: A part of the boundary or a material; None or "domain" for all of the domain.
         weight: What is integrated with it, and in means divided by; None for 1.
     """
@@ -26,9 +60,9 @@ class Quantity(NamedTuple):
         """Bound it; collective.
 
         Raises:
-            InputError: There is no bound; the message says why.
+            InputError: There is no such kind, or no bound; the message says why.
         """
-        if self.kind in ("force", "flux"):
-            return solution.flux(str(self.place), weight=self.weight)
-        ask = solution.mean if self.kind == "mean" else solution.integral
-        return ask(self.place, self.weight)
+        if self.kind not in KINDS:
+            told = meant(self.kind, KINDS)
+            raise InputError(f"no kind of quantity is called {self.kind!r}; {told}")
+        return KINDS[self.kind].bound(solution, self.place, self.weight)

@@ -131,6 +131,8 @@ def test_all_of_the_domain_has_a_name_unless_something_else_has_it():
     for kind, expected in {"mean": 0.5, "integral": 1.0}.items():
         found = Quantity(kind, "domain").of(solution)
         assert found == Quantity(kind).of(solution)
+    with pytest.raises(InputError, match="no kind of quantity is called 'men'; did you mean mean"):
+        Quantity("men").of(solution)
         assert found.value == pytest.approx(expected)
     there = r"no material; did you mean domain\? There are .*floor, right, left, domain$"
     with pytest.raises(InputError, match=there):

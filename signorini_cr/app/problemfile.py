@@ -34,6 +34,7 @@ from ..mesh.balance import Refined
 from ..mesh.domain import PARTS, Domain, Polygon, read_gmsh
 from ..mesh.polygon import check_loops, coordinates, cut
 from ..output.units import Units
+from ..quantities import KINDS as QUANTITIES
 from ..quantities import Quantity
 from ..rounding import counted
 from ..solution import Solution
@@ -64,7 +65,6 @@ from .reference import (
     KINDS,
     MATERIAL,
     PART,
-    QUANTITIES,
     QUANTITY,
     SECTIONS,
     TENSOR,
@@ -392,13 +392,16 @@ def _quantities(
                 f"{key}: one of {', '.join(QUANTITIES)} is to be given, found {' and '.join(kinds)}"
             )
         if not kinds:
-            raise InputError(
-                f'{key}: {{ force = "PART" }}, {{ flux = "PART" }}, {{ mean = "PLACE" }} or'
-                f' {{ integral = "PLACE" }}, perhaps with a weight, is needed, found {shown(value)}'
+            *first, last = (
+                f'{{ {kind} = "{"PLACE" if each.of_u else "PART"}" }}'
+                for kind, each in QUANTITIES.items()
             )
-        (kind,) = kinds
-        own = [each for each, what in types.items() if what in QUANTITIES[kind]]
-        of_u = kind in ("mean", "integral")
+            raise InputError(
+                f"{key}: {', '.join(first)} or {last}, perhaps with a weight, is needed, found"
+                f" {shown(value)}"
+            )
+        kind, of_u = kinds[0], QUANTITIES[kinds[0]].of_u
+        own = [each for each, what in types.items() if what in QUANTITIES[kind].parts]
         if of_u:
             own += [*materials, DOMAIN]
         place = one_of(own)(f"{key}.{kind}", value[kind])

@@ -73,14 +73,6 @@ KINDS: dict[str, type[Condition]] = {
 TYPES = {name: kind.names() for name, kind in KINDS.items()}
 """The keys that go with each type of a part."""
 
-QUANTITIES = {
-    "force": ("contact",),
-    "flux": ("dirichlet",),
-    "mean": ("contact", "neumann", "robin"),
-    "integral": ("contact", "neumann", "robin"),
-}
-"""Kinds of quantities, and the types of the parts that each is of; the last two are of materials,
-too."""
 QUANTITIES_EXAMPLE = [
     'push = { force = "floor" }',
     'moment = { force = "floor", weight = "x" }',

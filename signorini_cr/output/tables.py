@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from ..quantities import KINDS
 from ..rounding import at_most, counted, interval, known, rounded_up
 from .meanings import PRINTED
 from .units import GLUE, PLAIN, Units
@@ -133,10 +134,9 @@ def is_plain_force(found: Mapping[str, Any]) -> bool:
 
 def unit_of(found: Mapping[str, Any], units: Units) -> str:
     """Return the unit of a quantity, "" where it depends on a weight's or is not told."""
-    if found.get("kind") == "mean":
-        return units.after("u")
-    told = found.get("kind") != "integral" and not found.get("weighted")
-    return units.after("force") if told else ""
+    kind = KINDS[found.get("kind", "force")]
+    unit = kind.weighted_unit if found.get("weighted") else kind.unit
+    return units.after(unit) if unit else ""
 
 
 def _interval(lower: float, upper: float, measured: str = "") -> str:
