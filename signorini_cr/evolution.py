@@ -368,6 +368,8 @@ def solve_in_time(
         raise InputError(f"done is {done}; it must be the number of a step, or 0")
     if steps > MOST_STEPS or not np.isfinite(steps / end):
         raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
+    if not np.isfinite(float(end) * steps):
+        raise InputError(f"end is {end}; {steps} times that is too much for a number")
     if not isinstance(scheme, str) or scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
     if time is not None and not _is_clock(time):

@@ -7,7 +7,7 @@ import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import ufl
 from dolfinx import cpp, fem
 from dolfinx.mesh import (
     Mesh,
+    MeshTags,
     compute_midpoints,
     create_rectangle,
     create_unit_cube,
@@ -199,11 +200,19 @@ def stay(comm: MPI.Comm, parts: int, kinds: Any, corners: Any) -> Any:
 def rectangle(n: int, comm: MPI.Comm = MPI.COMM_WORLD, neumann: bool = False) -> Domain:
     """(−1, 1) × (0, 1) with Γ1 below and Γ0 elsewhere, or a Neumann part on the right."""
     mesh = create_rectangle(comm, [[-1.0, 0.0], [1.0, 1.0]], [2 * n, n])
+
+    def parts(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.where(y < 1e-12, 1, np.where(neumann & (x > 1 - 1e-12), 3, 2))
+
+    return Domain.from_tags(mesh, tagged(mesh, parts))
+
+
+def tagged(mesh: Mesh, values: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> MeshTags:
+    """Tag the exterior facets by where their midpoints are."""
     mesh.topology.create_connectivity(1, 2)
     facets = exterior_facet_indices(mesh.topology)
-    x = compute_midpoints(mesh, 1, facets)
-    values = np.where(x[:, 1] < 1e-12, 1, np.where(neumann & (x[:, 0] > 1 - 1e-12), 3, 2))
-    return Domain.from_tags(mesh, meshtags(mesh, 1, facets, values.astype(np.int32)))
+    x, y, _ = compute_midpoints(mesh, 1, facets).T
+    return meshtags(mesh, 1, facets, np.asarray(values(x, y), dtype=np.int32))
 
 
 def corners(mesh: Mesh) -> np.ndarray:

@@ -13,10 +13,9 @@ from dolfinx import fem
 from dolfinx.mesh import (
     compute_midpoints,
     create_unit_square,
-    exterior_facet_indices,
     meshtags,
 )
-from helpers import DEMOS, command, is_picture, script, start
+from helpers import DEMOS, command, is_picture, script, start, tagged
 from mpi4py import MPI
 
 import signorini_cr
@@ -166,16 +165,16 @@ def test_robin_materials_and_two_contact_parts_take_ten_lines():
     listing = in_the_how_to("python", '"shelf": scr.Contact')
     assert len(listing.strip().splitlines()) <= 12  # ten of them code, but for brackets
     mesh = create_unit_square(COMM, 8, 8)
-    mesh.topology.create_connectivity(1, 2)
-    facets = exterior_facet_indices(mesh.topology)
-    x = compute_midpoints(mesh, 1, facets)
-    sides = np.select([x[:, 1] < 1e-9, x[:, 0] < 1e-9, x[:, 0] > 1 - 1e-9], [1, 2, 3], 4)
+
+    def sides(x, y):
+        return np.select([y < 1e-9, x < 1e-9, x > 1 - 1e-9], [1, 2, 3], 4)
+
     cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
     kinds = np.where(compute_midpoints(mesh, 2, cells)[:, 1] > 0.5, 7, 0)
     names = {
         "scr": signorini_cr,
         "mesh": mesh,
-        "facet_tags": meshtags(mesh, 1, facets, sides.astype(np.int32)),
+        "facet_tags": tagged(mesh, sides),
         "cell_tags": meshtags(mesh, 2, cells, kinds.astype(np.int32)),
     }
     exec(listing, names)

@@ -223,11 +223,10 @@ def _end_all(comm: Any, status: int) -> int:
 
 def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
     from ..errors import InputError, NotConverged, naming
-    from ..memory import most_memory
     from ..output import report as output
     from ..output.files import check_writable
     from ..restart import AnotherMesh
-    from .run import stopped, what_is_kept
+    from .run import out_of_memory, what_is_kept
     from .runs import solve_case
 
     folder = _folder(args)
@@ -246,14 +245,12 @@ def _solve(args: argparse.Namespace, screen: Screen, comm: Any) -> int:
         if not ran_out_of_memory(error):
             error.add_note(what_is_kept(records, folder) if records else "")
             raise
-    failure = NotConverged(
-        f"out of memory, of which this process has had {most_memory() / 1e9:.2g} GB", len(records)
-    )
+    told = out_of_memory(records, folder)
     if comm.size > 1:  # the other ranks know nothing of it
         screen.root = True
-        screen.complain(f"{args.file}: {stopped(failure, records, folder)}")
+        screen.complain(f"{args.file}: {told}")
         _end_all(comm, NOT_CONVERGED)
-    raise NotConverged(stopped(failure, records, folder))
+    raise NotConverged(told)
 
 
 def _check(args: argparse.Namespace, screen: Screen, comm: Any) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx.mesh import compute_midpoints, entities_to_geometry
 
 from ..arrays import BoolArray, FloatArray, Int32Array
+from ..data.admissible import shown
 from ..errors import InputError
 from ..mesh.domain import Domain
 from .expressions import Expression
@@ -118,7 +119,7 @@ def check_values(
     when = ""
     if time is not None and expressions[datum].depends_on_time:
         when = f", at the time {time:g}"
-    message = f"{datum}: the value at {_point(bad[1:3])} is {bad[3]:g}"
+    message = f"{datum}: the value at {shown(bad[1:3])} is {bad[3]:g}"
     if math.isfinite(bad[3]):
         there = "there" if datum.section == "material" else "everywhere"
         raise InputError(f"{message}; the {datum.key} must be {datum.told.least} {there}{when}")
@@ -144,7 +145,3 @@ def _points(domain: Domain, dim: int, which: BoolArray | Int32Array, digits: int
     nodes = np.unique(entities_to_geometry(mesh, dim, entities))
     points = np.vstack([mesh.geometry.x[nodes], compute_midpoints(mesh, dim, entities)])
     return np.round(points, digits) + 0.0
-
-
-def _point(x: Collection[float]) -> str:
-    return "(" + ", ".join(f"{value:.10g}" for value in x) + ")"

@@ -670,6 +670,8 @@ def _time(
     steps = _steps(get(table, "time", "steps", whole, needed="a whole number, of steps,"))
     if not math.isfinite(steps / end):
         raise InputError(f"time.end: {end:g} is too little for numbers to tell steps apart")
+    if not math.isfinite(end * steps):
+        raise InputError(f"time.end: {end:g} is too much for numbers to tell the time of a step")
     return Time(
         end=end,
         steps=steps,

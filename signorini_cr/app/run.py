@@ -18,6 +18,7 @@ from petsc4py import PETSc
 
 from .. import __version__
 from ..errors import InputError, NotConverged, naming, on_root
+from ..memory import most_memory
 from ..mesh.domain import Domain
 from ..options import PREFIX
 from ..output import report as output
@@ -171,6 +172,13 @@ def stopped(failure: NotConverged, kept: list[output.Record], folder: Path) -> s
     """Say that a run stops on a level, and why."""
     level = len(kept) if failure.level is None else failure.level
     return f"stopped on level {level}: {failure.reason}\n{what_is_kept(kept, folder)}"
+
+
+def out_of_memory(kept: list[output.Record], folder: Path) -> str:
+    """Say that memory has ended, for the next level or for what is made of all."""
+    where = f"after {_kind(kept[-1])} {kept[-1][_kind(kept[-1])]}" if kept else "on level 0"
+    told = f"out of memory, of which this process has had {most_memory() / 1e9:.2g} GB"
+    return f"stopped {where}: {told}\n{what_is_kept(kept, folder)}"
 
 
 def what_is_kept(kept: list[output.Record], folder: Path) -> str:

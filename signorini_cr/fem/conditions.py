@@ -220,6 +220,11 @@ class Condition:
         return f"{cls.__name__}: " + ", ".join(f"{name} = {text}" for name, text in given.items())
 
     @property
+    def kind(self) -> str:
+        """Its kind, as legends of pictures call it."""
+        return type(self).__name__
+
+    @property
     def main(self) -> Any:
         """Its main datum."""
         return getattr(self, self.names()[0])
@@ -378,6 +383,11 @@ class Contact(Condition):
             f"{said['obstacle']} ≤ u ≤ {said['upper']}, {left} ≥ 0 on the lower bound, ≤ 0 on the"
             " upper, 0 between them"
         )
+
+    @property
+    def kind(self) -> str:
+        """One word for all of them."""
+        return "contact"
 
     @property
     def optional(self) -> bool:

@@ -22,7 +22,6 @@ from mpi4py import MPI
 from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root
-from ..fem.conditions import Contact
 from ..fem.space import closure_dofs, facet_measures
 from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain, named
 from ..multigrid.parents import Layout
@@ -92,8 +91,7 @@ def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]
     """Choose how the parts of the boundary are drawn, and say what holds there if it is known."""
     kinds = {}
     for key, condition in getattr(problem, "conditions", {}).items():
-        touched = isinstance(condition, Contact)
-        kinds[named(domain.parts, key)] = "contact" if touched else type(condition).__name__
+        kinds[named(domain.parts, key)] = condition.kind
     own = [(name, part) for name, part in domain.parts.items() if part not in STYLES]
     colors = itertools.cycle(OTHERS)
     styles = dict(STYLES)

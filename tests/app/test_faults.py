@@ -85,9 +85,9 @@ def test_where_memory_ends_the_levels_before_are_kept(limited, tmp_path: Path) -
     done = helpers.altered(tmp_path, kills.CASE, program, ranks=limited[-1] + 1)
     assert done.returncode == cli.NOT_CONVERGED, done.stderr
     words = " ".join(done.stderr.split())
-    level = int(words.split("stopped on level ")[1].split(":")[0])
+    level = int(words.split("stopped after level ")[1].split(":")[0]) + 1
     assert level >= 6
-    assert f"stopped on level {level}: out of memory, of which this process has had 0." in words
+    assert f"level {level - 1}: out of memory, of which this process has had 0." in words
     assert f"levels 0 to {level - 1} are finished and kept in" in words
     assert "Traceback" not in done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())

@@ -199,6 +199,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
         ("end = 1.5", "end = 0", "time.end: a number above 0 is needed"),
         ("end = 1.5\n", "", "time.end: this key is missing"),
         ("end = 1.5", "end = 1e-320", "time.end: 9.99989e-321 is too little for numbers"),
+        ("end = 1.5", "end = 8e307", "time.end: 8e+307 is too much for numbers to tell"),
         ("steps = 6", "steps = 2.5", "time.steps: a whole number is needed"),
         ("steps = 6", 'steps = 6\nscheme = "trapez"', "time.scheme"),
         ('capacity = "1 + 1"', 'capacity = "x"', "time.capacity: a number above 0 is needed"),

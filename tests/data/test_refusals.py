@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from helpers import HELD_ABOVE
+from helpers import HELD_ABOVE, tagged
 from mpi4py import MPI
 
 from signorini_cr import exact
@@ -196,12 +196,12 @@ def test_solving_refuses_a_jump_in_two_and_three_dimensions():
     assert "at (0.2, 1) the dirichlet value jumps" in refused(lambda: solve(jump, domain))
     assert "jumps" in refused(lambda: list(solve_levels(jump, domain, 2)))
     mesh = dolfinx.mesh.create_unit_cube(COMM, 3, 3, 3)
-    cube = tagged(mesh, lambda x: np.where(np.isclose(x[:, 2], 0), 1, 2))
+    cube = marked(mesh, lambda x: np.where(np.isclose(x[:, 2], 0), 1, 2))
     assert "jumps from" in refused(lambda: solve(jump, cube))
     checked(Problem(dirichlet=lambda x: ufl.tanh(50 * x[0])), cube)
 
 
-def tagged(mesh, label: Callable) -> Domain:
+def marked(mesh, label: Callable) -> Domain:
     tdim = mesh.topology.dim
     mesh.topology.create_connectivity(tdim - 1, tdim)
     facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
@@ -220,7 +220,7 @@ def tagged(mesh, label: Callable) -> Domain:
 )
 def test_functions_may_not_jump_either(element, function, fits: bool):
     mesh = dolfinx.mesh.create_rectangle(COMM, RECTANGLE[[0, 2]], [8, 4])
-    domain = tagged(mesh, lambda x: np.where(np.isclose(x[:, 1], 0), 1, 2))
+    domain = marked(mesh, lambda x: np.where(np.isclose(x[:, 1], 0), 1, 2))
     u_D = fem.Function(fem.functionspace(mesh, element))
     u_D.interpolate(function)
     problem = Problem(dirichlet=u_D, obstacle=-9.0)
@@ -339,12 +339,11 @@ def test_the_datum_that_is_wrong_is_named(data: dict, words: str):
 
 def test_every_value_must_be_on_the_boundary():
     mesh = dolfinx.mesh.create_unit_square(COMM, 4, 4)
-    mesh.topology.create_connectivity(1, 2)
-    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-    x = dolfinx.mesh.compute_midpoints(mesh, 1, facets)
-    values = np.select([np.isclose(x[:, 1], 0), np.isclose(x[:, 1], 1)], [1, 2], 0)
-    values[np.isclose(x[:, 0], 1)] = 4
-    tags = dolfinx.mesh.meshtags(mesh, 1, facets, values.astype(np.int32))
+
+    def values(x, y):
+        return np.select([np.isclose(x, 1), np.isclose(y, 0), np.isclose(y, 1)], [4, 1, 2], 0)
+
+    tags = tagged(mesh, values)
     for parts, words in (
         ({"contact": 7}, "tagged contact (value 7): the values there are 0, 1, 2, 4"),
         ({"contact": [1, 7]}, "tagged contact (value 7)"),

@@ -12,11 +12,9 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import (
-    compute_midpoints,
     create_rectangle,
-    exterior_facet_indices,
-    meshtags,
 )
+from helpers import tagged
 from mpi4py import MPI
 from scipy.optimize import brentq
 
@@ -34,10 +32,7 @@ CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
 def rectangle(low, high, columns, rows, parts, move=None, comm=WORLD, **names):
     """Squares cut in two; parts tells what a facet's midpoint belongs to, before it is moved."""
     mesh = create_rectangle(comm, [low, high], [columns, rows])
-    mesh.topology.create_connectivity(1, 2)
-    facets = exterior_facet_indices(mesh.topology)
-    x, y, _ = compute_midpoints(mesh, 1, facets).T
-    tags = meshtags(mesh, 1, facets, parts(x, y).astype(np.int32))
+    tags = tagged(mesh, parts)
     if move is not None:
         points = mesh.geometry.x
         points[:, 0], points[:, 1] = move(points[:, 0].copy(), points[:, 1].copy())

@@ -17,12 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dolfinx.mesh import (
-    compute_midpoints,
     create_rectangle,
-    exterior_facet_indices,
     locate_entities,
     meshtags,
 )
+from helpers import tagged
 from mpi4py import MPI
 
 sys.path[:0] = [str(Path(__file__).parent.parent), str(Path(__file__).parents[2] / "verification")]
@@ -54,11 +53,11 @@ SLACK = 1e-9
 def grid(columns, rows, layered):
     """The unit square, from rectangles cut in two; from x = ½ on it may be of another material."""
     mesh = create_rectangle(WORLD, [(0.0, 0.0), (1.0, 1.0)], [columns, rows])
-    mesh.topology.create_connectivity(1, 2)
-    facets = exterior_facet_indices(mesh.topology)
-    x, y, _ = compute_midpoints(mesh, 1, facets).T
-    sides = np.select([y < 1e-9, x > 1 - 1e-9, y > 1 - 1e-9], [1, 2, 3], 4)
-    tags = meshtags(mesh, 1, facets, sides.astype(np.int32))
+
+    def sides(x, y):
+        return np.select([y < 1e-9, x > 1 - 1e-9, y > 1 - 1e-9], [1, 2, 3], 4)
+
+    tags = tagged(mesh, sides)
     more = {name: i + 1 for i, name in enumerate(SIDES)}
     if layered:
         east = locate_entities(mesh, 2, lambda x: x[0] > 0.5 - 1e-9)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from dolfinx.mesh import compute_midpoints, create_rectangle, exterior_facet_indices, meshtags
+from dolfinx.mesh import compute_midpoints, create_rectangle, meshtags
+from helpers import tagged
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -37,11 +38,11 @@ def root(matrix):
 def square(n=8, image=None):
     """The unit square with contact below, two materials left and right; or its image."""
     mesh = create_rectangle(MPI.COMM_WORLD, [[0.0, 0.0], [1.0, 1.0]], [n, n])
-    mesh.topology.create_connectivity(1, 2)
-    facets = exterior_facet_indices(mesh.topology)
-    x, y, _ = compute_midpoints(mesh, 1, facets).T
-    sides = [y < 1e-9, x > 1 - 1e-9, y > 1 - 1e-9]
-    parts = np.select(sides, [BOTTOM, RIGHT, TOP], LEFT).astype(np.int32)
+
+    def sides(x, y):
+        return np.select([y < 1e-9, x > 1 - 1e-9, y > 1 - 1e-9], [BOTTOM, RIGHT, TOP], LEFT)
+
+    parts = tagged(mesh, sides)
     cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
     east = compute_midpoints(mesh, 2, cells)[:, 0] > 0.5
     tags = meshtags(mesh, 2, cells, np.where(east, EAST, WEST).astype(np.int32))
@@ -49,7 +50,7 @@ def square(n=8, image=None):
         mesh.geometry.x[:, :2] = mesh.geometry.x[:, :2] @ image.T
     return Domain.from_tags(
         mesh,
-        meshtags(mesh, 1, facets, parts),
+        parts,
         contact=BOTTOM,
         dirichlet=TOP,
         right=RIGHT,

@@ -9,7 +9,7 @@ import dolfinx.mesh
 import numpy as np
 import pytest
 import ufl
-from helpers import MESHES, integral, smallest_angle, stay
+from helpers import MESHES, integral, smallest_angle, stay, tagged
 from mpi4py import MPI
 
 from signorini_cr import Problem, Solver, solve, solve_adaptive, solve_in_time, solve_levels
@@ -581,12 +581,12 @@ def test_a_labelled_facet_of_no_triangle(shared_tmp_path: Path, stray: int):
 def tagged_rectangle(mode, n: int = 4, values=(7, 5, 9)) -> tuple:
     """(-1, 1) × (0, 1), tagged on y = 0, at the sides and above."""
     mesh = dolfinx.mesh.create_rectangle(COMM, [[-1, 0], [1, 1]], [2 * n, n], ghost_mode=mode)
-    mesh.topology.create_connectivity(1, 2)
-    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-    x = dolfinx.mesh.compute_midpoints(mesh, 1, facets)
-    below, above = np.isclose(x[:, 1], 0), np.isclose(x[:, 1], 1)
-    labels = np.where(below, values[0], np.where(above, values[2], values[1])).astype(np.int32)
-    return mesh, dolfinx.mesh.meshtags(mesh, 1, facets, labels)
+
+    def labels(x, y):
+        below, above = np.isclose(y, 0), np.isclose(y, 1)
+        return np.where(below, values[0], np.where(above, values[2], values[1]))
+
+    return mesh, tagged(mesh, labels)
 
 
 @pytest.mark.parametrize("mode", list(dolfinx.mesh.GhostMode))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem, la
-from helpers import corners, integral, smallest_angle, stay
+from helpers import corners, integral, smallest_angle, stay, tagged
 from mpi4py import MPI
 
 from signorini_cr.compat import cell_nodes
@@ -34,13 +34,11 @@ SHAPES = {
 def own(mode: dolfinx.mesh.GhostMode, n: int) -> Domain:
     """(-1, 1) × (0, 1) as a user would make it: contact below, Dirichlet at the sides."""
     mesh = dolfinx.mesh.create_rectangle(COMM, [[-1, 0], [1, 1]], [2 * n, n], ghost_mode=mode)
-    mesh.topology.create_connectivity(1, 2)
-    facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
-    x = dolfinx.mesh.compute_midpoints(mesh, 1, facets)
-    values = np.where(
-        np.isclose(x[:, 1], 0), CONTACT, np.where(np.isclose(x[:, 1], 1), NEUMANN, DIRICHLET)
-    )
-    return Domain.from_tags(mesh, dolfinx.mesh.meshtags(mesh, 1, facets, values.astype(np.int32)))
+
+    def values(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.select([np.isclose(y, 0), np.isclose(y, 1)], [CONTACT, NEUMANN], DIRICHLET)
+
+    return Domain.from_tags(mesh, tagged(mesh, values))
 
 
 @pytest.fixture(
