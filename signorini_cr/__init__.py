@@ -35,7 +35,7 @@ try:
 except ModuleNotFoundError:
     pass
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # Loaded when first used: `signorini-cr --help` must not wait for DOLFINx
 _ROOMS = {
