@@ -22,8 +22,7 @@ from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
 from ..mesh.domain import Domain, Refinement
 from ..mesh.shared import shared_maximum, shared_sum
-from .space import facet_entities
-from .space import measures as simplex_measures
+from .space import facet_entities, simplex_measures
 
 BLOCK = 1 << 15
 """Cells that are worked on at a time: as many as the processor's cache holds."""

@@ -115,7 +115,7 @@ def facet_measures(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, FloatArr
         of shape (n,).
     """
     x = facet_vertices(mesh, facet_entities(mesh, facets))
-    return x, measures(x)
+    return x, simplex_measures(x)
 
 
 def facet_normals(mesh: Mesh, entities: Int32Array) -> FloatArray:
@@ -137,7 +137,7 @@ def facet_normals(mesh: Mesh, entities: Int32Array) -> FloatArray:
     return np.asarray(normal / np.linalg.norm(normal, axis=1)[:, None])
 
 
-def measures(x: FloatArray) -> FloatArray:
+def simplex_measures(x: FloatArray) -> FloatArray:
     """Compute the measures of simplices with vertices x, shape (n, vertices, gdim)."""
     edges = x[:, 1:] - x[:, :1]
     gram = np.einsum("nid,njd->nij", edges, edges)

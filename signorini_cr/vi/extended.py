@@ -148,13 +148,14 @@ class Extended:
 
         That is an active set of its own solution, but for dofs whose forces are nothing.
         """
+        wanted = self.active
         for _ in range(SETS):
+            self.active = wanted
             left = self._refine(share)
             wanted = self.active.exchanged(self._pushes(), self._gap())
             wrong = self._misclassified(wanted)
             if wrong.sum() <= share * self._bottom:
                 return left + wrong
-            self.active = wanted
         if wrong.sum() <= TOUCHING * self._flow():
             return left + wrong
         raise NotConverged(f"no active set is that of its own solution, of {SETS} tried")

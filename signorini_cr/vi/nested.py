@@ -27,7 +27,7 @@ from ..fem.space import (
     facet_entities,
     facet_measures,
     ghosted_vector,
-    measures,
+    simplex_measures,
 )
 from ..garbage import release
 from ..multigrid.parents import Layout, barycentric_coordinates
@@ -212,7 +212,7 @@ class _Inherited:
         points = x.mean(axis=1, keepdims=True)
         local = np.argmin(np.abs(barycentric_coordinates(simplices, points)[:, 0]), axis=1)
         each, corners = np.arange(len(facets)), facet_corners(mesh)[local]
-        parent_measure = measures(simplices[each[:, None], corners])
+        parent_measure = simplex_measures(simplices[each[:, None], corners])
         block = V.dofmap.index_map_bs
         marks = np.zeros(len(coarse.u.x.array))
         marks[coarse.contact.active_set.dofs] = 1.0
