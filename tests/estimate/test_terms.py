@@ -574,7 +574,7 @@ def test_tetrahedra():
     certificate = certify(solution)
     agrees(certificate, again(solution, certificate, 2.0, *data.values(), low))
     with pytest.raises(InputError, match="for d = 2 only"):
-        force_bounds(SimpleNamespace(certificate=certificate))
+        force_bounds(SimpleNamespace(level=level, certificate=certificate))
     for curved in ({"dirichlet": lambda x: x[0] ** 2}, {"obstacle": lambda x: x[0] ** 2 - 9}):
         level = Level((NestedMesh(Diffusion(Problem(**data, **curved), mesh), domain),))
         solution.level, solution.u = level, fem.Function(level.V)
