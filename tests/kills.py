@@ -271,6 +271,8 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2], help="numbers of ranks")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     arguments = parser.parse_args()
+    # or each run would begin by compiling the program's source, and be seconds late
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     counts: Counter[tuple[str, int]] = Counter()
     wrong = kept = 0
     with tempfile.TemporaryDirectory() as folder:
