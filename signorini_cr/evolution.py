@@ -8,6 +8,7 @@ function of Crouzeix-Raviart, so that all its integrals are exact, the certifica
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
@@ -360,7 +361,7 @@ def solve_in_time(
             not fit into the memory there is.
     """
     insist_on_kind("end", end, Real, "a number")
-    if not (end > 0.0 and np.isfinite(end)):
+    if not 0.0 < end < np.inf:
         raise InputError(f"end is {end}; it must be a time after 0")
     insist_on_count("steps", steps)
     insist_on_kind("done", done, Integral, "a whole number")
@@ -368,7 +369,7 @@ def solve_in_time(
         raise InputError(f"done is {done}; it must be the number of a step, or 0")
     if steps > MOST_STEPS or not np.isfinite(steps / end):
         raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
-    if not np.isfinite(float(end) * steps):
+    if end > sys.float_info.max / steps:
         raise InputError(f"end is {end}; {steps} times that is too much for a number")
     if not isinstance(scheme, str) or scheme not in SCHEMES:
         raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
