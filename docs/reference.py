@@ -148,8 +148,8 @@ NAMES = {
         mesh.families""",
     "Solving": "solve solve_levels solve_adaptive solve_in_time adapt_to_run Solver",
     "Results": """\
-        Solution vi.contact.Contact vi.contact.Kkt vi.solver.Iterations Certificate adaptive.Tried
-        force.force_bounds force.flux means.mean means.integral force.Interval""",
+        Solution vi.contact.ContactFacts vi.contact.Kkt vi.solver.Iterations Certificate
+        adaptive.Tried force.force_bounds force.flux means.mean means.integral force.Interval""",
     "Errors": "InputError NotConverged",
     "Known solutions and rates": "verification.exact verification.norms verification.theory",
     "Pictures and files": """\

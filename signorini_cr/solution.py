@@ -22,7 +22,7 @@ from .fem.problem import Problem
 from .mesh.domain import Domain
 from .rounding import at_most, counted, known
 from .shown import HTML
-from .vi.contact import Contact
+from .vi.contact import ContactFacts
 from .vi.level import Level
 from .vi.solver import Iterations
 
@@ -45,7 +45,7 @@ class Solution:
     level: Level
     u: fem.Function
     residual: fem.Function
-    contact: Contact
+    contact: ContactFacts
     energy: float
     iterations: Iterations
     seconds: dict[str, float] = field(default_factory=dict)

@@ -35,7 +35,7 @@ def contact_page(
     """Draw all of Γ1, each connected part in a column of its own.
 
     Args:
-        table: From `Contact.table`.
+        table: From `ContactFacts.table`.
         transitions: Points where contact begins or ends, shape (m, 2 or 3).
         size: The largest |u_h| anywhere: far smaller values are drawn as the zeros they are.
         ax: Axes in a grid, whose place the panels take.

@@ -233,7 +233,7 @@ def contact_csv(table: Mapping[str, npt.NDArray]) -> str:
     """Write one line a contact facet, in order along the boundary; `active` is 0 or 1.
 
     Args:
-        table: From `Contact.table`.
+        table: From `ContactFacts.table`.
     """
     columns = [column.astype(int) if column.dtype == bool else column for column in table.values()]
     return _csv(table, zip(*(column.tolist() for column in columns), strict=True))

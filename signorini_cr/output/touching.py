@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import FloatArray
-from ..vi.contact import Contact
+from ..vi.contact import ContactFacts
 
 
-def contact_lines(contact: Contact) -> tuple[FloatArray, FloatArray]:
+def contact_lines(contact: ContactFacts) -> tuple[FloatArray, FloatArray]:
     """Find the parts of a plane Γ1 in contact, and those that are not; collective.
 
     Where contact ends inside a facet, so does the line.
@@ -36,7 +36,7 @@ def contact_lines(contact: Contact) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(touching), free
 
 
-def in_words(contact: Contact) -> str:
+def in_words(contact: ContactFacts) -> str:
     """Say how much of Γ1 is in contact, for a title; collective."""
     whole = contact.comm.allreduce(float(contact.measure.sum()))
     if contact.number_active in (0, contact.number):

@@ -53,7 +53,7 @@ class Kkt:
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
+class ContactFacts:
     """Contact facets of this rank, and figures over all ranks.
 
     Attributes:
@@ -105,7 +105,7 @@ class Contact:
         """Describe the contact in a line."""
         length = known(self.length, self.length / max(self.number_active, 1))  # to within a facet
         return (
-            f"<Contact: {self.number_active} of {counted(self.number, 'facet')}, "
+            f"<ContactFacts: {self.number_active} of {counted(self.number, 'facet')}, "
             f"length {length}, force {known(self.force, None, 4)}>"
         )
 
@@ -135,7 +135,7 @@ class Contact:
 
 def contact_facts(
     data: OnMesh, system: System, u: fem.Function, residual: fem.Function, iterations: Iterations
-) -> Contact:
+) -> ContactFacts:
     """Read the state of Γ1 off a solution; collective.
 
     Args:
@@ -166,7 +166,7 @@ def contact_facts(
     comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
     min_gap, min_pressure = least
     of_load = float(np.sqrt(squares)) / (system.residual_scale or 1.0)
-    return Contact(
+    return ContactFacts(
         comm=comm,
         facets=system.bounded_facets,
         vertices=there.vertices,
@@ -192,7 +192,7 @@ def contact_facts(
 def _at_facets(
     data: OnMesh, system: System, u: fem.Function, at_dofs: _AtDofs, pressure: FloatArray
 ) -> dict[str, npt.NDArray]:
-    """Compute what `Contact` has of each facet, by name; collective.
+    """Compute what `ContactFacts` has of each facet, by name; collective.
 
     Args:
         data: The physics on the mesh.

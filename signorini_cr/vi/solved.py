@@ -8,7 +8,7 @@ from dolfinx import fem
 
 from ..fem.problem import Problem
 from ..mesh.domain import Domain
-from .contact import Contact
+from .contact import ContactFacts
 from .level import Level
 
 
@@ -31,7 +31,7 @@ class Solved(Found, Protocol):
     """u_h on one mesh; the attributes are those of :class:`~signorini_cr.solution.Solution`."""
 
     residual: fem.Function
-    contact: Contact
+    contact: ContactFacts
     energy: float
     seconds: dict[str, float]
 

@@ -392,7 +392,7 @@ def test_what_python_shows_is_a_line() -> None:
     solution = solve(example.problem, domain)
     shown = [repr(each) for each in (solution, solution.contact, domain, example.problem)]
     assert shown[0].startswith("<Solution: CR, 408 dofs, 8 of 16 facets in contact, force ")
-    assert shown[1].startswith("<Contact: 8 of 16 facets, length 1, force ")
+    assert shown[1].startswith("<ContactFacts: 8 of 16 facets, length 1, force ")
     assert shown[2].startswith("<Domain: 256 cells; facets")
     assert shown[3] == "Problem(f=_s1_load, dirichlet=0.0, exact=<lambda>)"
     assert repr(example) == f"<Example: S1, {shown[3]}>"
