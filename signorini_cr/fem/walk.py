@@ -69,7 +69,7 @@ class Walk:
         """Sort what is found on the facets, and find the transition points; collective.
 
         Args:
-            fields: What `Contact` has of them: names, obstacle, upper, u, pressure, active and
+            fields: What `ContactFacts` has of them: names, obstacle, upper, u, pressure, active and
                 gap_at_vertices.
 
         Returns:
