@@ -246,7 +246,8 @@ def solve_level(
     u, residual = system.start(), fem.Function(level.V)
     if level.floating is not None:
         level.floating.check(system, level.data.inflow())
-    if not system.is_trivial:  # or u is the solution already
+    # or u is the solution already; or near it, and another u has too many digits of the offset
+    if not (system.is_trivial or system.drifts):
         if start.known is not None:
             known_start(start.known, level, u)
         elif start.coarser is not None:

@@ -57,7 +57,7 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     """Say what happens on Γ1, in a sentence, with the digits that are known.
 
     A place on Γ1 is known to within a facet, the force as well as it is certain. Where PETSc's
-    options have let the solver end before it would have, that is said as well.
+    options have let the solver end before it would have, or rounding has, that is said as well.
 
     Args:
         record: The last level's.
@@ -82,8 +82,8 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     if left is None or left > LEFT or wrong is None or wrong > WRONG:
         known_to = f"forces are known to {short(wrong)} of their sum"
         line += (
-            "; not converged as usual, as an option ends the solver early: the residual is"
-            f" {short(left)} of the load, and"
+            "; not converged as usual, as an option or rounding ends the solver early: the residual"
+            f" is {short(left)} of the load, and"
             f" {'how well forces are known is not known' if wrong is None else known_to}"
         )
     return line

@@ -43,6 +43,10 @@ BESIDE = 1e-16
 FAR = 16.0
 """Values so many times as far from 0 as from one another are told from their middle."""
 
+DRIFT = 100.0
+"""So many times as far from 0 as loads may bend u is where c and b alone hold it, if they are weak.
+"""
+
 APART = 1e-15
 """Distance of two bounds that are the same, in parts of the largest."""
 
@@ -103,10 +107,12 @@ class System:
 
     Where all values of u_D, or of α where there is no Γ0, lie far from 0 and close together, the
     unknown is u less their middle, the offset, and b, bounds and u_D are those of this unknown: a_h
-    sees differences, which would have lost the digits that u spends on the offset.
+    sees differences, which would have lost the digits that u spends on the offset. So it is where
+    nothing but weak c and b hold u: the offset is the constant that the loads are in balance with.
 
     Attributes:
         offset: What is to be added to the solution to have u; 0 in most cases.
+        drifts: Whether that is the constant that c and b hold against the loads.
         operator: A as the solver uses it.
         A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
         b: χ less the Dirichlet values' share by dof, the values themselves in their rows, ghosts up
@@ -139,8 +145,14 @@ class System:
         """
         self._data, self._like, V = data, like, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
-        if like is not None and data.fixed is like._data.fixed and data.bounds is like._data.bounds:
-            self._take_boundary(like)
+        self.drifts = False
+        known = None if like is None or like.drifts else like
+        if (
+            known is not None
+            and data.fixed is known._data.fixed
+            and data.bounds is known._data.bounds
+        ):
+            self._take_boundary(known)
         else:
             self._read_boundary(layout.size[0])
         if like is None:
@@ -150,7 +162,8 @@ class System:
         else:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi())
-        same = like if like is not None and self.u_D is like.u_D else None
+        self._take_balance()
+        same = like if not self.drifts and like is not None and self.u_D is like.u_D else None
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b)
@@ -210,6 +223,34 @@ class System:
             self.u_D.x.array[self.dirichlet] -= self.offset
             for bound in (self.lower, self.upper):
                 bound[np.abs(bound) < PETSc.INFINITY] -= self.offset
+
+    def _take_balance(self) -> None:
+        """Make the constant u with a_h(u, 1) = χ(1) the offset where u is near it; collective.
+
+        With c ≪ κ, u is f/c but for a part of f/κ. Rounding of A u would hide the loads.
+        """
+        comm = self._data.V.mesh.comm
+        held = comm.allreduce(len(self.dirichlet) > 0, op=MPI.LOR)
+        if held or (of_constants := self._data.of_constants()) is None:
+            return
+        owned, layout = self.A.getLocalSize()[0], Layout.of_space(self._data.V)
+        of_one, chi = layout.shared_sum(of_constants)[:owned], self.chi[:owned]
+        lost, net, loads = summed(comm, np.array([of_one.sum(), chi.sum(), np.abs(chi).sum()]))
+        diagonal = self.operator.whole_diagonal
+        softest = comm.allreduce(float(diagonal.min(initial=np.inf)), op=MPI.MIN)
+        with np.errstate(all="ignore"):
+            constant, bend = net / lost, loads / softest
+        if not DRIFT * bend < abs(constant) < np.inf:
+            return
+        lowest, highest = self.lower + self.offset, self.upper + self.offset
+        inside = bool((lowest <= constant).all() and (constant <= highest).all())
+        if not comm.allreduce(inside, op=MPI.LAND):
+            return  # a bound holds u
+        self.drifts, before, self.offset = True, self.offset, constant
+        self.lower, self.upper = self.lower.copy(), self.upper.copy()  # they may be another's
+        for bounds in (self.lower, self.upper):
+            bounds[np.abs(bounds) < PETSc.INFINITY] -= constant - before
+        self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
 
     def _take_boundary(self, like: System) -> None:
         """Take values and bounds from a system of the same data."""
@@ -305,6 +346,8 @@ class System:
             squares = np.array([each @ each for each in residuals])
         norms = np.sqrt(summed(comm, squares))
         scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
+        if self.drifts:  # loads are what is left where u is 0
+            scale = norms[-1]
         if not np.isfinite(norms).all():
             raise InputError("data: so large that their squares overflow; choose other units")
         largest = max(

@@ -19,7 +19,7 @@ import scipy.sparse.linalg
 import ufl
 from dolfinx import fem
 from dolfinx.mesh import compute_midpoints, create_mesh, exterior_facet_indices, meshtags
-from helpers import SQUARE
+from helpers import SQUARE, integral
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -683,3 +683,34 @@ def test_forces_that_fall_off_without_end(name, c):
         assert solution.contact.force == pytest.approx(forces.sum(), rel=1e-6, abs=1e-20 * most)
         assert solution.contact.number_active >= np.count_nonzero(forces > 1e-12 * most)
         assert solution.contact.kkt.force_error < 1e-6
+
+
+@pytest.mark.parametrize("held_by", ["reaction", "spring", "air"])
+@pytest.mark.parametrize("weak", [1e-3, 1e-6, 1e-10])
+def test_what_little_holds_u_against_the_loads_is_in_balance_with_them(held_by, weak):
+    """With v = 1: weak ∫ u_h = ∫ f = 2.5, over Ω or a side. And −u'' = 3x − 1.5 but for O(weak)."""
+    sides = {name: Neumann() for name in SQUARE.names}
+    sides["floor"] = Contact(-0.3, coefficient=weak if held_by == "spring" else 0.0)
+    if held_by == "air":
+        sides["right"] = Robin(coefficient=weak, external=20.0)
+    reaction = weak if held_by == "reaction" else 0.0
+    problem = Problem(f=lambda x: 1.0 + 3.0 * x[0], reaction=reaction, conditions=sides)
+    errors = []
+    for solution in solve_levels(problem, SQUARE.mesh(0.25, MPI.COMM_WORLD), 4):
+        domain, kkt = solution.domain, solution.contact.kkt
+        mesh, over = domain.mesh, ufl.dx
+        if held_by != "reaction":
+            side = domain.parts["floor" if held_by == "spring" else "right"]
+            over = ufl.Measure("ds", mesh, subdomain_data=domain.tags)(side)
+        lost = weak * integral((solution.u - (20.0 if held_by == "air" else 0.0)) * over)
+        assert lost == pytest.approx(2.5, rel=1e-9)
+        assert kkt.residual <= 1e-8 and solution.contact.number_active == 0
+        if held_by == "reaction":
+            x = ufl.SpatialCoordinate(mesh)[0]
+            flow = ufl.as_vector([1.5 * (x - x**2), 0.0])
+            square = integral(ufl.inner(*[ufl.grad(solution.u) - flow] * 2) * ufl.dx)
+            errors.append(np.sqrt(square))
+            bound = 1.001 * solution.certificate.bound_h1
+            assert errors[-1] <= bound
+            assert weak < 1e-9 or bound <= 4.0 * errors[-1]  # u itself has few digits of its slope
+    assert len(errors) == 0 or errors[-2] / errors[-1] == pytest.approx(2.0, abs=0.1)
