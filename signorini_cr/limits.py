@@ -112,7 +112,7 @@ class Limits:
         seconds, self._passed = passed - (self._passed or passed), passed
         left = self._left(comm)
         if left is not None and left <= 0.0:
-            raise NotConverged("the time of --max-time is over")
+            raise NotConverged("the time limit, max_time, is over")
         if left is not None and seconds > left:
             raise NotConverged(f"it would take about {_words(seconds, left)}")
 
@@ -125,7 +125,7 @@ class Limits:
 
 def _words(seconds: float, left: float) -> str:
     """Say what is asked for, and what there is."""
-    return f"{seconds:.2g} s, and of --max-time there are {max(left, 0.0):.2g} s left"
+    return f"{seconds:.2g} s, and of the time limit there are {max(left, 0.0):.2g} s left"
 
 
 def _refuse(number: int, dofs: int, words: str | None) -> None:

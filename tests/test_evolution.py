@@ -626,7 +626,7 @@ def test_what_was_found_before_time_ran_out_is_there(monkeypatch):
         Clock.now += 1.0
 
     found = []
-    with pytest.raises(NotConverged, match="would take about 3 s, and of --max-time there"):
+    with pytest.raises(NotConverged, match="would take about 3 s, and of the time limit there"):
         for tried in adapt_to_run(run, max_time=4.5):
             found.append(len(tried.meshes))
     assert found == [0, 1]

@@ -1,6 +1,7 @@
 """The order of the package: imports lead from the upper streets to the lower ones, never back."""
 
 import ast
+import re
 import runpy
 import shutil
 from functools import cache
@@ -136,8 +137,13 @@ def test_an_import_by_the_name_of_the_package_is_refused(tmp_path: Path) -> None
 
 @pytest.mark.serial
 def test_only_the_front_door_imports_by_strings() -> None:
-    files = {path for path in PACKAGE.rglob("*.py") if "import_module" in path.read_text()}
+    ways = re.compile(r"import_module|__import__|import_from|runpy")
+    files = {path for path in PACKAGE.rglob("*.py") if ways.search(path.read_text())}
     assert files == {PACKAGE / "__init__.py"}
+    # what is loaded already: the ground floor looks for the class of an error, and for no more
+    ways = re.compile(r"sys\.modules\S*(__package__|signorini_cr)")
+    files = {path for path in PACKAGE.rglob("*.py") if ways.search(path.read_text())}
+    assert files == {PACKAGE / "memory.py"}
 
 
 @pytest.mark.serial

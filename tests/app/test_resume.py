@@ -347,7 +347,7 @@ def test_a_level_that_would_end_too_late_is_not_begun(mode: str, case, monkeypat
     if COMM.rank == 0:
         error = " ".join(capfd.readouterr().err.split())
         assert "case.toml: stopped on level 3: its" in error
-        assert "of --max-time there are" in error
+        assert "of the time limit there are" in error
         assert "levels 0 to 2 are finished and kept in out" in error
     assert report()["complete"] is False
     now = 0.0
@@ -418,7 +418,7 @@ def test_little_time_is_enough_for_the_first_level(seconds: str, ranks: int, tmp
     done = helpers.altered(tmp_path, kills.CASE, program, *words, ranks=ranks, seconds=60)
     assert done.returncode == cli.NOT_CONVERGED, done.stderr
     words = " ".join(done.stderr.split())
-    assert words.count("of --max-time there are") == 1 and "finished and kept" in words
+    assert words.count("of the time limit there are") == 1 and "finished and kept" in words
 
 
 def test_a_level_that_memory_does_not_hold_is_refused(case, monkeypatch, capfd) -> None:

@@ -420,7 +420,9 @@ def test_a_step_that_would_end_too_late_is_not_begun(
     assert solved(case(), out, "--max-time", 3.5) == 3
     if COMM.rank == 0:
         error = " ".join(capfd.readouterr().err.split())
-        assert "time step 4: it would take about 1 s, and of --max-time there are 0.5 s" in error
+        assert (
+            "time step 4: it would take about 1 s, and of the time limit there are 0.5 s" in error
+        )
         assert "steps 1 to 3 are finished and kept in" in error
     assert len(report_in(out)["times"]) == 3
     assert solved(case(), out, "--resume") == 0
