@@ -118,10 +118,11 @@ def figures() -> str:
 ABOUT_PYTHON = """\
 # Python names
 
-Everything here is in `import signorini_cr as scr`, as `scr.solve` or `scr.plots.plot_mesh`, but for
-what has a path of its own, as in `from signorini_cr.output.vtu import write_solution`; the version
-is `scr.__version__`. All functions are collective, every rank calls them, unless they say
-otherwise. Lengths are in the units of the mesh, u in those of the data.
+Everything here is in `import signorini_cr as scr`, as `scr.solve` or `scr.plots.plot_mesh`, which
+`from signorini_cr.plots import plot_mesh` finds as well, but for what has a path of its own, as in
+`from signorini_cr.output.vtu import write_solution`; the version is `scr.__version__`. All
+functions are collective, every rank calls them, unless they say otherwise. Lengths are in the units
+of the mesh, u in those of the data.
 
 There is a line for each name. `help(signorini_cr.solve_adaptive)` says the same, with what it
 takes, returns and raises, and so for the others; numbers such as (1.6) are those of formulas in

@@ -12,7 +12,11 @@ On a mesh with facet tags, a contact boundary takes five lines::
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from .shown import HTML
@@ -102,6 +106,31 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return import_module(f".{_MODULES[name]}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+class _ByShortName(Loader):
+    """Finds the modules that scripts use by name for `import` and `from`, too.
+
+    It is asked after Python's own finders, and hands on the module itself, not a second one.
+    """
+
+    @classmethod
+    def find_spec(cls, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        package, _, short = name.rpartition(".")
+        return ModuleSpec(name, cls()) if package == __name__ and short in _MODULES else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module: ModuleType = __getattr__(spec.name.rpartition(".")[2])
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Has run already; what importing wrote into it is put back."""
+        assert module.__spec__
+        module.__spec__ = module.__spec__.loader_state
+
+
+sys.meta_path.append(_ByShortName)
 
 
 def _as_html(solution: Solution) -> str:

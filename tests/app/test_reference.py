@@ -1,6 +1,7 @@
 """The reference's pages against what the program reads, takes, prints, writes and offers."""
 
 import csv
+import importlib.util
 import json
 import re
 import runpy
@@ -152,6 +153,25 @@ def test_every_public_name_is_in_the_reference() -> None:
     ]
     assert modules == []
     assert {*signorini_cr.__all__, *signorini_cr._MODULES} <= set(dir(signorini_cr))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("short", sorted(signorini_cr._MODULES))
+def test_modules_are_imported_by_their_short_names(short: str) -> None:
+    """One module by either name, which `importlib.reload` finds as well."""
+    module = importlib.import_module(f"signorini_cr.{short}")
+    place = f"signorini_cr.{signorini_cr._MODULES[short]}"
+    assert module is getattr(signorini_cr, short) is importlib.import_module(place)
+    assert module.__name__ == module.__spec__.name == place
+    assert importlib.util.find_spec(place).origin == module.__file__
+
+
+@pytest.mark.serial
+def test_only_the_short_names_are_imported() -> None:
+    with pytest.raises(ModuleNotFoundError, match=r"No module named 'signorini_cr\.exactly'"):
+        importlib.import_module("signorini_cr.exactly")
+    with pytest.raises(ModuleNotFoundError, match="No module named 'exact'"):
+        importlib.import_module("exact")
 
 
 @pytest.mark.serial
