@@ -184,4 +184,8 @@ def test_streets_are_drawn_from_the_top_to_the_bottom():
     order = names["floors"](arrows := names["read"](PACKAGE))
     assert order[-1] == names["GROUND"] and order[-2] == "mesh"
     assert all(order.index(here) < order.index(there) for here, there in arrows)
-    assert len((ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_the_architecture_is_read_in_some_minutes():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80 and len(text.split()) <= 1200

@@ -80,6 +80,18 @@ def test_links_lead_somewhere(file):
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("file", ["ARCHITECTURE.md", "CONTRIBUTING.md"])
+def test_a_change_goes_to_files_that_there_are(file):
+    """In tables: `fem/space.py` of the package, `/tests/helpers.py` of the repository, or `mesh/`."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    rows = "\n".join(line for line in text.splitlines() if line.startswith("| "))
+    places = re.findall(r"`(/?[\w/]+(?:\.py|\.md|/))`", rows)
+    assert len(places) > 20
+    for place in places:
+        assert (ROOT / place[1:] if place[0] == "/" else PACKAGE / place).exists(), place
+
+
+@pytest.mark.serial
 def test_the_long_description_does_without_the_folder():
     without = runpy.run_path(str(ROOT / "setup.py"))["without_its_folder"]
     text = without((ROOT / "README.md").read_text(encoding="utf-8"))
