@@ -82,7 +82,7 @@ def test_links_lead_somewhere(file):
 @pytest.mark.serial
 @pytest.mark.parametrize("file", ["ARCHITECTURE.md", "CONTRIBUTING.md"])
 def test_a_change_goes_to_files_that_there_are(file):
-    """In tables: `fem/space.py` of the package, `/tests/helpers.py` of the repository, or `mesh/`."""
+    """In tables: `fem/space.py` of the package, `/tests/helpers.py` beside it, or `mesh/`."""
     text = (ROOT / file).read_text(encoding="utf-8")
     rows = "\n".join(line for line in text.splitlines() if line.startswith("| "))
     places = re.findall(r"`(/?[\w/]+(?:\.py|\.md|/))`", rows)

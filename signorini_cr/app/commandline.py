@@ -296,6 +296,8 @@ def _cannot_be_value(word: str) -> bool:
 def _unknown(word: str, command: _Parser) -> NoReturn:
     if not word.startswith("-"):
         command.error(f"{word!r} is one argument too many; one FILE.toml is allowed")
+    if word.split("=")[0] in command._option_string_actions:
+        command.error(f"{word} is behind --, where there are no options; put it before that")
     options = [name for name in command._option_string_actions if name.startswith("--")]
     near = difflib.get_close_matches(word.split("=")[0], options, n=1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(options)}"

@@ -107,7 +107,10 @@ class Run:
             if found is None:
                 return None, {}
             restart, facts = found
-            for key in sorted({*said, *facts["said"]}):
+            # steps in time change the defaults of other keys, and are told before these
+            keys = sorted({*said, *facts["said"]})
+            keys.sort(key=lambda key: not key.startswith("time."))
+            for key in keys:
                 was, now = (each.get(key) for each in (facts["said"], said))
                 if was != now:
                     was, now = (

@@ -674,6 +674,7 @@ def test_bad_input(name: str, write) -> None:
         (["solv"], ["no command 'solv'", "did you mean solve?"]),
         (["solve"], ["FILE.toml"]),
         (["solve", "FILE", "two"], ["'two' is one argument too many"]),
+        (["solve", "--", "FILE", "--out"], ["--out is behind --, where there are no options"]),
         (["solve", "FILE", "--outt", "DIR"], ["no option --outt", "did you mean --out?"]),
         (["solve", "FILE", "--level", "3"], ["no option --level", "did you mean --levels?"]),
         (["solve", "FILE", "--levels", "0"], ["--levels", "1 or more", "found 0"]),

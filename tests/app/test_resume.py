@@ -154,6 +154,7 @@ def test_where_there_is_nothing_a_resumed_run_begins(case) -> None:
         ("uniform", "adaptive", [], 'refine.mode was "uniform" and is "adaptive"'),
         ("", "", ["--element", "p1"], '--element was "cr" and is "p1"'),
         ("[refine]", "g = 1\n[refine]", [], "data.g was not given and is 1"),
+        ("[refine]", "[time]\nend = 1\nsteps = 2\n[refine]", [], "time.end was not given and is 1"),
         (
             "[refine]",
             '[quantities]\nall = { mean = "domain" }\n[refine]',
