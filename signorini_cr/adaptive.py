@@ -36,7 +36,7 @@ ALIKE = 1e-6
 and where a problem is symmetric, cells are twins but for that."""
 
 RUNS = 3.0
-"""What a run in time, the one on the mesh that is found, and what that writes take, in runs."""
+"""Time that a run in time, the one on the mesh that is found, and its output take, in runs."""
 
 RESOLUTION = 1e-11
 """Least diameter of a cell to be refined, in parts of the largest coordinate."""
@@ -91,7 +91,7 @@ def solve_adaptive(
 
 
 class Shares(NamedTuple):
-    """Where the error is.
+    """Bound of the error, and the cells' shares of it.
 
     Attributes:
         bound: Of the broken error (1.6).

@@ -23,7 +23,7 @@ class Diffusion(Forms):
 
     @property
     def galerkin(self) -> bool:
-        """Whether quadrature sees the same on all meshes: κ jumps between cells, if at all."""
+        """True if quadrature sees the same on all meshes: κ jumps between cells, if at all."""
         return self.steady and self.of_one is None
 
     @property

@@ -62,7 +62,7 @@ SCHEMES = {"euler": Scheme(1.0, (1.0,)), "bdf2": Scheme(1.5, (4.0 / 3.0, -1.0 / 
 
 
 class Clock(Protocol):
-    """What has a time that can be set, as dolfinx's Constant."""
+    """An object with a time that can be set, as dolfinx's Constant."""
 
     value: Any
 

@@ -1,4 +1,4 @@
-"""What is to be freed on several ranks, or in time.
+"""Release of objects that must be freed on several ranks, or in time.
 
 What Python drops at a moment of its own choosing PETSc can't free on several ranks, and keeps until
 all of them call `PETSc.garbage_cleanup` for the object's communicator. Each mesh has its own, which

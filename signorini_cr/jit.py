@@ -38,12 +38,12 @@ from .errors import InputError, meant, naming, on_root
 
 T = TypeVar("T")
 Loaded: TypeAlias = tuple[list[Any], ModuleType]
-"""What FFCx asks of a form: its objects, and the module that holds them."""
+"""A loaded form, as FFCx asks for it: its objects, and the module that holds them."""
 
 ABANDONED = 60.0
 """Seconds without a change from which on a source file without mark belongs to nobody."""
 OWN = "signorini-cr-forms-"
-"""What the names of temporary folders begin with; the number of their process follows."""
+"""Prefix of temporary folders' names; the number of their process follows."""
 
 tell: Callable[[str], Any] = warnings.warn
 """Called on all ranks with what a user should know."""
@@ -91,7 +91,7 @@ def compiled(comm: MPI.Comm, build: Callable[..., T], *args: object) -> T:
 
 
 _UNUSABLE = TypeError, ValueError, AttributeError
-"""What DOLFINx and FFCx raise over a file with options that they can't use, among others."""
+"""Errors of DOLFINx and FFCx over a file with options that they can't use, among others."""
 
 
 def _check_options() -> None:
@@ -188,7 +188,7 @@ def _tell_of_compiler(comm: MPI.Comm, error: BaseException | None) -> None:
 
 
 _FAILED = re.compile(r"(?:Compile|Link|Platform)Error: (.*)")
-"""What cffi says where a command has failed."""
+"""Words of cffi where a command has failed."""
 _ARGUMENTS = re.compile(r"'\['([^']+)'.*\]'")
 """A command with its arguments, as some versions of setuptools tell them."""
 

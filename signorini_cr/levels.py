@@ -211,7 +211,7 @@ def check_pieces(physics: Diffusion, domain: Domain) -> None:
 
 
 class Start(NamedTuple):
-    """What a solve starts from: zero, unless there is something here.
+    """The start of a solve: zero, unless there is something here.
 
     Attributes:
         coarser: The solution on the mesh below.

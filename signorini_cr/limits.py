@@ -1,4 +1,4 @@
-"""Whether another level or step fits into the time and the memory there are, by those before."""
+"""Limits of time and memory: another level or step fits or not, by those before."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TELLING = 20_000
 
 
 class _Taken(NamedTuple):
-    """What a level took: its dofs, seconds, and the most bytes this rank has held until its end."""
+    """Cost of a level: its dofs, seconds, and the most bytes this rank has held until its end."""
 
     dofs: int
     seconds: float
@@ -28,7 +28,7 @@ class _Taken(NamedTuple):
 
 
 class Limits:
-    """What the levels of a sequence may take.
+    """Limits of time and memory for the levels of a sequence.
 
     Args:
         max_time: Wall time in seconds from now on, None for any.

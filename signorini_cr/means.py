@@ -32,7 +32,7 @@ AFLOAT = (
     "nothing but contact is known to hold a part of the domain, and no energy tells how high it is"
 )
 ROUNDING = 1e-14
-"""What rounding may do to an integral, in parts of that of |ψ u|."""
+"""Rounding of an integral, in parts of that of |ψ u|."""
 
 
 def mean(

@@ -36,7 +36,7 @@ ESTIMATE_PREFIX = PREFIX + "estimate_"
 """That of the linear systems of the certificate; what they leave costs sharpness, not validity."""
 
 OF_SOLVERS = re.compile("-(snes|ksp|pc)_[a-z]")
-"""What options of a solver begin with that are lost without the prefix."""
+"""Beginnings of solvers' options that are lost without the prefix."""
 
 OF_PETSC = (
     "-log_view", "-log_view_memory", "-log_trace", "-options_left", "-options_view",

@@ -1,4 +1,4 @@
-"""What is wanted of a solution in an interval, and what kinds of that there are."""
+"""Quantities of a solution that are wanted in an interval, and their kinds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run goes on: u_h on the last meshes or at the last times, and how meshes were made.
+"""State that a run goes on from: u_h on the last meshes or last times, and how meshes were made.
 
 Cells, facets and vertices are told by where they are. Places are the same to the last bit however a
 mesh is shared out: those of vertices are read, or are midpoints of two others, and so are those of
@@ -33,11 +33,11 @@ Places = npt.NDArray[np.complex128]
 
 
 BESIDE = 0.2371
-"""How far that is, in lengths of the facet; a number by which it is no other facet's place."""
+"""Distance of a facet's place beside it, in lengths of the facet; it is no other facet's place."""
 
 
 class AnotherMesh(InputError):
-    """What is to go on was solved on another mesh."""
+    """Error where what is to go on was solved on another mesh."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What shows a result where there is more than a line of text, in a notebook.
+"""Displays of results that are more than a line of text, in a notebook.
 
 It stands above what it shows: the front door, which knows both, has put it here.
 """
@@ -9,4 +9,4 @@ from collections.abc import Callable
 from typing import Any
 
 HTML: dict[str, Callable[[Any], str]] = {}
-"""What makes HTML of an object, by the name of its class."""
+"""Functions that make HTML of an object, by the name of its class."""

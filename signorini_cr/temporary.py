@@ -12,7 +12,7 @@ import tempfile
 ROOM = 2_000_000
 """Bytes that compiling a form takes, at most."""
 VARIABLES = ("TMPDIR", "TEMP", "TMP")
-"""What may name the folder, the first before the others."""
+"""Variables that may name the folder, the first before the others."""
 USUAL = ("/tmp", "/var/tmp")
 
 

@@ -19,7 +19,7 @@ from .reference import ABOVE, EXPRESSIONS, Key
 
 
 class Datum(NamedTuple):
-    """Where an expression stands in a problem file; as a text, its key.
+    """Place of an expression in a problem file; as a text, its key.
 
     Attributes:
         section: "data", "exact", "boundary", "material", "time" or "quantities".
@@ -45,7 +45,7 @@ class Datum(NamedTuple):
 
 
 Weights = Mapping[str, str | None]
-"""Where weights are used: the part or material by the quantity, None for all of the domain."""
+"""Part or material where each quantity's weight is used, None for all of the domain."""
 
 
 def _used_on(datum: Datum, domain: Domain, weights: Weights) -> int | None:

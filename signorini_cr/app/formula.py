@@ -139,7 +139,7 @@ class Expression:
 
     @property
     def is_condition(self) -> bool:
-        """Whether the value is true or false rather than a number."""
+        """True if the value is true or false rather than a number."""
         return self.root.condition
 
     @property
@@ -149,7 +149,7 @@ class Expression:
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether the time is in it."""
+        """True if the time is in it."""
         return any(node.op == "clock" for node in self._order)
 
     @cached_property

@@ -87,7 +87,7 @@ MOST_CELLS = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Time:
-    """What [time] says.
+    """Contents of the section [time].
 
     Attributes:
         end: The last time.
@@ -131,7 +131,7 @@ class Time:
 
 @dataclass(frozen=True, eq=False)
 class ProblemFile:
-    """What a problem file says.
+    """Contents of a problem file.
 
     Attributes:
         title: For reports and pictures; the file's name where there is none.

@@ -46,14 +46,14 @@ class Key(NamedTuple):
 
     @property
     def is_expression(self) -> bool:
-        """Whether expressions belong there."""
+        """True if expressions belong there."""
         return self.value in (EXPRESSION, TENSOR)
 
 
 DEFAULTS = {
     name: each.default for name, each in inspect.signature(solve_adaptive).parameters.items()
 }
-"""What arguments of `solve_adaptive` are when left out."""
+"""Defaults of the arguments of `solve_adaptive`."""
 USUAL = {name: f"{value}".removesuffix(".0") for name, value in DEFAULTS.items()}
 """The same in words."""
 EXPRESSION = "an expression or a number"
@@ -65,11 +65,11 @@ PART = "boundary.NAME"
 MATERIAL = "material.NAME"
 """The sections of the materials."""
 QUANTITY = "quantities.NAME"
-"""What is wanted in an interval; on one line each, usually."""
+"""The sections of quantities that are wanted in an interval; on one line each, usually."""
 KINDS: dict[str, type[Condition]] = {
     kind.__name__.lower(): kind for kind in (Contact, Dirichlet, Neumann, Robin)
 }
-"""What each type of a part makes of the section's other keys."""
+"""The class of condition for each type of a part; it takes the section's other keys."""
 TYPES = {name: kind.names() for name, kind in KINDS.items()}
 """The keys that go with each type of a part."""
 
@@ -80,7 +80,7 @@ QUANTITIES_EXAMPLE = [
     'mean_air = { mean = "air" }',
     'stored = { integral = "domain", weight = "where(y < 0.5, 2, 1)" }',
 ]
-"""What they look like."""
+"""Examples of quantities, as a problem file has them."""
 
 KEYS = (
     Key("", "title", "a text", "the file's name", "Stands in the report and over pictures.",

@@ -1,4 +1,4 @@
-"""What `solve` does: meshes, or steps in time, solved one by one, told, and kept in the folder."""
+"""The run of `solve`: meshes, or steps in time, solved one by one, told, and kept in the folder."""
 
 from __future__ import annotations
 

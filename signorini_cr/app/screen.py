@@ -1,4 +1,4 @@
-"""What the command prints, on rank 0: results to stdout, progress and complaints to stderr."""
+"""Output of the command, on rank 0: results to stdout, progress and complaints to stderr."""
 
 from __future__ import annotations
 

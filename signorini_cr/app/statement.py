@@ -19,7 +19,7 @@ from .screen import WIDTH
 INDENT = 11
 _SIGNS = {"coefficient": "κ", "f": "f", "reaction": "c", "capacity": "capacity"}
 ROWS = ("domain", "equation", "time", "exact.u", "where")
-"""What rows are called that are about no part and no material."""
+"""Names of rows that are about no part and no material."""
 LONGEST = 90
 """Characters of an expression; what is longer is cut."""
 

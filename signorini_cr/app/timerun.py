@@ -1,4 +1,4 @@
-"""What `solve` does in time: a mesh is sought, if one is to be, then step after step is solved."""
+"""The run of `solve` in time: a mesh is sought, if one is to be, then each step is solved."""
 
 from __future__ import annotations
 

@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from .quadrature import Tensor, Trace
 
 Complaint = tuple[tuple[float, ...], str]
-"""Where, and what is wrong there."""
+"""A place, and what is wrong there."""
 
 SAFETY = 4.0
-"""How many times its bound a rounding error may be: the bound is of first order."""
+"""Factor on the bound of a rounding error: the bound is of first order."""
 
 WANTED = "a symmetric positive definite tensor is needed"
 
@@ -48,7 +48,7 @@ MOST_SHOWN = 100
 """Points that are looked at for the one to be told."""
 
 TOLERANCE = 1e-9
-"""What is no difference, in parts of u_D's size: formulas are written with so many digits."""
+"""Gap that is no difference, in parts of u_D's size: formulas are written with so many digits."""
 
 SKEW = 1e-12
 """The same for a tensor's entries, of which both are told: what is no rounding has no bound."""
@@ -60,14 +60,14 @@ SAMPLES, LEAST, MOST = 50_000, 4, 128
 """Intervals in which u_D is looked at: about so many in all, and so many a facet."""
 
 HUGE = 1e3
-"""How many times the largest value looked at first a value must be to belong to a pole."""
+"""Least value at a pole, in multiples of the largest value looked at first."""
 
 AT_A_TIME = 20_000
 """Intervals that are cut at a time; of more, only the rougher part of each."""
 
 MIDDLE = 0.45
-"""Where intervals are cut: in their middles, a jump that lies just there, as sign(x) at 0, has the
-mean of both sides."""
+"""Part of an interval at which it is cut: in its middle, a jump that lies just there, as sign(x) at
+0, has the mean of both sides."""
 
 SHORTEST = 1e3
 """Length of the shortest intervals, in units of the points' rounding."""
@@ -82,8 +82,8 @@ FACTORISED = 100_000
 """Largest matrix of a form of the user's own that is looked at for eigenvalues below 0."""
 
 DEFINITE = 1e-13
-"""What is no eigenvalue of a matrix whose diagonal is 1: a stiff part in one 1e12 times as soft has
-1e-12."""
+"""Eigenvalue that counts as 0 in a matrix whose diagonal is 1: a stiff part in one 1e12 times as
+soft has 1e-12."""
 
 NOT_DEFINITE = (
     "form: a(u, u) is not above 0 for all u that vanish on the dirichlet parts; without that there"

@@ -23,7 +23,7 @@ Values = tuple[FloatArray, FloatArray]
 """Values at points, and what rounding may have done to them."""
 
 ENOUGH = 1e-6
-"""What is no difference, in parts of the largest value: an exact solution may be a fit."""
+"""Gap that is no difference, in parts of the largest value: an exact solution may be a fit."""
 
 JUMP = 2.0
 """A factor by which κ may jump inside of a cell: the bound is not the sharper for another mesh."""

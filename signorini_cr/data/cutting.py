@@ -26,7 +26,7 @@ PIECES = 6_000
 BEHIND = 0.25
 """Part of what may be missed that is left to cells for which a large box is good enough."""
 ROUNDS = 40
-"""How often pieces are cut at most."""
+"""Rounds of cuts at most."""
 BISECTIONS = 6
 """Steps towards the smallest size that there is room for."""
 CELLS = 60_000
@@ -34,15 +34,15 @@ CELLS = 60_000
 LEAST = 1e-11
 """Part of a cell, or of a facet, that is not cut any more: coordinates have so many digits."""
 IN_VAIN = 3
-"""How often in turn they are, with next to no gain."""
+"""Rounds in turn with next to no gain at most."""
 ROOMY, STEEP = 10, 1.2
 """More room for pieces where errors fall faster than with this power of their number."""
 MUCH = 1.5
 """For how large a sum of errors, 1 being the goal, there is more room."""
 ACROSS = 1.15
-"""How much better than by quarters errors must fall for a cut across an axis."""
+"""Factor by which errors must fall better than by quarters for a cut across an axis."""
 DEEP = 60.0
-"""How far above the threshold pieces are cut twice at once."""
+"""Multiple of the threshold from which on pieces are cut twice at once."""
 ENOUGH = 0.5
 """Sum of errors at which it ends."""
 FALL = 4.0
@@ -54,7 +54,7 @@ _FEW = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """What is known of data on cells, some of which are cut into pieces.
+    """Errors of data on cells, some of which are cut into pieces.
 
     Attributes:
         errors: On each cell, of one that is cut the mean by volume, shape (rows, cells).
@@ -225,7 +225,7 @@ class _Room:
 
 @dataclass(frozen=True, eq=False)
 class _Wanted:
-    """What is to become small, see `refine`."""
+    """Errors that are to become small, see `refine`."""
 
     errors: Callable[[Pieces], FloatArray]
     weights: FloatArray

@@ -29,7 +29,7 @@ SECTORS = 16
 NARROW = 1e-12
 """Directions are known up to this angle, and vertices up to it in parts of their distance."""
 CLOSE = 1e-3
-"""How near a vertex singular points matter, in parts of the simplex's size."""
+"""Distance from a vertex at which singular points matter, in parts of the simplex's size."""
 
 
 @dataclass(frozen=True, eq=False)

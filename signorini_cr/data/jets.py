@@ -32,12 +32,12 @@ from .pointwise import Unknown, by_operators, is_affine
 Range = tuple[FloatArray, FloatArray]
 """Lower and upper bounds."""
 Truth = tuple[BoolArray, BoolArray]
-"""Where a condition can hold, and where it can fail."""
+"""Masks of the boxes in which a condition can hold, and of those in which it can fail."""
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Where to enclose: points low ≤ x ≤ high, as they depend on some variables.
+    """Boxes to enclose data in: points low ≤ x ≤ high, as they depend on some variables.
 
     Attributes:
         low: Least coordinates, shape (gdim, n).
@@ -109,10 +109,10 @@ class Boxes:
 
 
 CHOICES = 5
-"""How many conditions an expression may have that is written as choices first: 2⁵ expressions."""
+"""Most conditions in an expression that is written as choices first: 2⁵ expressions."""
 
 STRIP = 1e-13
-"""What counts as rounding of a coordinate, in parts of it."""
+"""Rounding of a coordinate, in parts of it."""
 
 STEPS = 6
 """To where a condition changes, by a fixed slope: on small pieces a step leaves little."""
@@ -988,7 +988,7 @@ _KINDS: dict[type, _Rule] = {
     fem.Constant: Enclosure._of_constant,
     fem.Function: Enclosure._function,
 }
-"""How expressions of each kind are enclosed. Roots and absolute values are more than their series;
+"""Rules that enclose expressions, by kind. Roots and absolute values are more than their series;
 no other kinds are the same or include one another."""
 
 
@@ -1005,7 +1005,7 @@ _KNOWN = (
     classes.MultiIndex,
     classes.SpatialCoordinate,
 )
-"""What needs no lowering."""
+"""Kinds of expressions that need no lowering."""
 _ORDERED = (classes.GT, classes.GE, classes.LT, classes.LE)
 _COMPARISONS = (*_ORDERED, classes.EQ, classes.NE)
 
@@ -1014,7 +1014,7 @@ _COMPARISONS = (*_ORDERED, classes.EQ, classes.NE)
 
 
 _agreeing: WeakKeyDictionary[Any, bool] = WeakKeyDictionary()
-"""What was found of conditionals that are still there: one with x in it has its mesh along."""
+"""Answers on conditionals that are still there: one with x in it has its mesh along."""
 
 
 def _known_to_agree(e: Any) -> bool:

@@ -251,12 +251,12 @@ def reacts(reaction: FloatArray) -> bool:
 
 
 SHARE = 4e-3
-"""What may be missed of f, in parts of the bound, or thereabouts."""
+"""Part of the bound that may be missed of f, or thereabouts."""
 UNBOUNDED = "f is not bounded on the mesh, or not known to be"
 
 
 class NeumannMoments:
-    """What is needed of g on a part of the boundary.
+    """Moments of g, and b, on a part of the boundary.
 
     Attributes:
         side: The facets.
@@ -285,7 +285,7 @@ class NeumannMoments:
 
     @property
     def varies(self) -> bool:
-        """Whether b may vary within facets."""
+        """True if b may vary within facets."""
         return self.most is not self.loss
 
     def between(self, pieces: Pieces, cells: Cells) -> FloatArray:
@@ -322,7 +322,7 @@ def bounds_on_facets(b: Expr, cells: Cells, side: BoundaryFacets) -> tuple[Float
 
 
 ROUNDS = 3
-"""How often facets are halved on which b varies."""
+"""Halvings of facets on which b varies."""
 ROUNDED = 1e-13
 """Part of b on a facet by which it may seem to be below 0."""
 
@@ -339,7 +339,7 @@ def to_cells(cells: Cells, side: BoundaryFacets, shares: FloatArray) -> FloatArr
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of the fluxes through the boundary: g − b u_h on all parts with a g or a b.
+    """Known fluxes through the boundary: g − b u_h on all parts with a g or a b.
 
     Attributes:
         side: The facets.
@@ -632,7 +632,7 @@ class Segments:
 
     @cached_property
     def given(self) -> BoolArray:
-        """Whether b takes up q − g_F more cheaply than a field in the cell, shape (facets,)."""
+        """True where b takes up q − g_F more cheaply than a field in the cell, shape (facets,)."""
         return self.loss * self._constant**2 > pick(self.low, self.facets.cells)
 
     @cached_property
@@ -642,7 +642,7 @@ class Segments:
 
     @cached_property
     def followed(self) -> BoolArray:
-        """Whether y·n on thin cells is to have q's affine part, shape (facets,).
+        """True where y·n on thin cells is to have q's affine part, shape (facets,).
 
         What that is wrong by, b times the error of u_h, costs little where b |F| is below κ, in
         cells of any shape.

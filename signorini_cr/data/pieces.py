@@ -13,12 +13,12 @@ from ..fem.cells import BoundaryFacets, Cells, corner_points, points_of
 from .jets import Boxes
 
 Levels = Callable[["Pieces"], FloatArray]
-"""What changes its sign where data may jump, at triangles' vertices and their edges' middles.
+"""Function that changes sign where data may jump, at triangles' vertices and edges' middles.
 
 The shape is (differences, 6, n).
 """
 SLABS = 4
-"""What triangles are cut into across an axis."""
+"""Slabs that a triangle is cut into across an axis."""
 QUARTERS, UNKNOWN, JUMP = -1, -2, -3
 """Ways to cut pieces, besides across an axis; the last is along a line where data may jump."""
 SLANTED = 4.0
@@ -26,12 +26,12 @@ SLANTED = 4.0
 EDGES = np.array([[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]])
 """The middles of a triangle's edges, each opposite to a vertex."""
 AFFINE = 1e-13
-"""What counts as rounding in values of an affine function, in parts of the largest."""
+"""Rounding in values of an affine function, in parts of the largest."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What belongs to facets.
+    """Cells, directions and normals of facets.
 
     Attributes:
         cells: Their cells, shape (facets,).
@@ -261,7 +261,7 @@ class Pieces:
 
     @property
     def whole(self) -> BoolArray:
-        """Whether each is a simplex and no slab, shape (n,)."""
+        """True for each that is a simplex and no slab, shape (n,)."""
         return np.asarray((self.span[0] == 0.0) & (self.span[1] == 1.0))
 
     def _ends(self, array: FloatArray) -> FloatArray:

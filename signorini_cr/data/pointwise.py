@@ -353,7 +353,7 @@ OPERATORS: dict[type, Callable[..., Any]] = {
     **_EXTREMES,
     **_TRUTHS,
 }
-"""What operators do to numbers."""
+"""Function of numbers for each operator."""
 
 _PERIODS = {classes.Atan2: 2 * np.pi}
 _RULES: dict[type, Callable[..., Value]] = {

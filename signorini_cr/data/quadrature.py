@@ -43,8 +43,8 @@ STEADY = 1e-13
 """Part of κ by which its bounds on a cell may differ where it is a constant, rounded."""
 
 LOAD_DEGREE, KAPPA_DEGREE = 4, 8
-"""What the certificate's rules integrate exactly: two quadratics, and for q and s quadratic, y and
-∇z affine, s |y − q ∇z|²."""
+"""Degrees of the certificate's rules, which are exact for products of two quadratics, and, for q
+and s quadratic, y and ∇z affine, for s |y − q ∇z|²."""
 
 
 class Rule:
@@ -254,7 +254,7 @@ class Coefficient:
 
     @property
     def varies(self) -> bool:
-        """Whether κ varies within cells, on some rank."""
+        """True if κ varies within cells, on some rank."""
         return self.values is not None or self.tensor is not None
 
     def _of_tensor(self, kappa: Tensor, cells: Cells) -> None:
@@ -438,11 +438,11 @@ def bernstein(hats: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
 KAPPA_PIECES = 20_000
 """Pieces that cells are cut into for it."""
 KAPPA_SHARE = 1e-2
-"""What quadrature may miss of the square of the bound, or thereabouts."""
+"""Part of the square of the bound that quadrature may miss, or thereabouts."""
 
 
 BESIDE = 1e-3, 1e-5
-"""Where on the way from a facet's vertex to its middle it shows whether data have a step there;
+"""Parts of the way from a facet's vertex to its middle that show whether data have a step there;
 FFCx takes what is nearer for the vertex."""
 STEP = 1e-6
 """Part of the values on the facet above which they may."""
@@ -484,7 +484,7 @@ class Trace:
 
     @property
     def vanishes(self) -> bool:
-        """Whether it is the number 0."""
+        """True if it is the number 0."""
         return self.constant == 0.0
 
     @cached_property
@@ -600,7 +600,7 @@ class OnFacets:
 
 @dataclass(frozen=True, eq=False)
 class OnParts:
-    """What conditions of one kind say, on the facets of owned cells, part after part.
+    """Data of conditions of one kind, on the facets of owned cells, part after part.
 
     Attributes:
         parts: The parts' data, seen from the cells.

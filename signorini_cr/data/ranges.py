@@ -1,4 +1,4 @@
-"""How far data are from polynomials, on every cell and facet: enclosed, not sampled.
+"""Distances of data from polynomials, on every cell and facet: enclosed, not sampled.
 
 On a simplex T, data are within R of some quadratic polynomial, and within W ≤ R of a cubic one.
 Both follow from the jets on a box around T.
@@ -32,11 +32,11 @@ from .pieces import EDGES, Levels, Pieces
 from .pointwise import Unknown
 
 Errors = Callable[[Boxes, FloatArray], FloatArray]
-"""What is to be known of data on boxes and simplices of given half extents; shape (rows, n)."""
+"""Function for errors of data on boxes and simplices of given half extents; shape (rows, n)."""
 CHUNK = 1 << 12
 """Boxes that are worked on at a time."""
 BESIDE = 1e-7
-"""How far from a point of a piece another one is beside it, in parts of the piece."""
+"""Distance of a point of a piece from another one beside it, in parts of the piece."""
 _CUBIC = {1: 1.0, 2: 0.5, 3: 0.25}
 """Distance on [−1, 1]^m of xyz, x²y and x³ from quadratics, by the largest exponent."""
 

@@ -22,10 +22,10 @@ more layers, take longer, and bring the bound down by 0.2 to 0.4 %.
 """
 
 LAYERS = 12
-"""How many layers of cells around these are solved for."""
+"""Layers of cells around these that are solved for."""
 
 ROUNDS = 3
-"""How often v is solved for; after each time but the last what is below α is held there, and what
+"""Times that v is solved for; after each but the last what is below α is held there, and what
 promises most then may be elsewhere."""
 
 LITTLE = 0.01
@@ -41,7 +41,7 @@ LEFT = 0.04
 
 
 Near = tuple[BoolArray, BoolArray, IndexArray]
-"""Which values at vertices and which heights to solve for, and the cells that know of these."""
+"""Masks of the values at vertices and heights to solve for, and the cells that know of these."""
 
 
 def solved(
@@ -205,7 +205,7 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class Promise:
-    """What E falls by if one value is put right as if it were alone: its slope's square over this.
+    """Curvatures of E: one value put right as if alone takes off its slope's square over this.
 
     Attributes:
         cells: The mesh.

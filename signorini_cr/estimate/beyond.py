@@ -1,4 +1,4 @@
-"""What y has beyond a Raviart-Thomas field of lowest order on thin cells, see `curl`."""
+"""The part of y beyond a Raviart-Thomas field of lowest order on thin cells, see `curl`."""
 
 from __future__ import annotations
 

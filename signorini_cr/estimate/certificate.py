@@ -1,4 +1,4 @@
-"""How wrong a solution can be: guaranteed bounds of its error and of the energy.
+"""Guaranteed bounds of a solution's error and of the energy.
 
 For v ∈ K and y ∈ H(div) with −div y = f, y·n = g on Γg and y·n ≥ 0 on Γ1 the gap J(v) − D(y) bounds
 what neither of them knows about u. Both come from u_h at linear cost, see `flux` and `companion`.
@@ -45,12 +45,12 @@ if TYPE_CHECKING:
 
 
 SHARES = ("flux", "companion", "contact", "load", "neumann", "boundary", "solver")
-"""Where a bound comes from: the keys of `Certificate.parts`."""
+"""Sources of a bound: the keys of `Certificate.parts`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is certain about a solution; None where nothing is, `reason` then says why.
+    """Guaranteed bounds for a solution; None where there are none, `reason` then says why.
 
     Attributes:
         bound_h1: ‖u − u_h‖_h, the broken norm (1.6), is at most this.
@@ -147,7 +147,7 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What y and v are made of; the cells' geometry is made again when it is needed.
+    """The parts that y and v are made of; the cells' geometry is made again when it is needed.
 
     Attributes:
         level: The mesh, with those below it.
@@ -232,10 +232,10 @@ STEADY = 1e-12
 """Part of κ by which its bounds on a cell may differ where it is constant there."""
 
 DEAR = 1.0
-"""What may be left of the equation, in parts of the bound, before contact is asked to take it."""
+"""Most that may be left of the equation, in parts of the bound, before contact has to take it."""
 
 LIFT_SHARE = 1e-2
-"""What the lifting's norm may be overestimated by, in parts of the bound, or thereabouts."""
+"""Part of the bound that the lifting's norm may be overestimated by, or thereabouts."""
 
 NO_FLUX = "only a Crouzeix-Raviart solution has an equilibrated flux"
 ADRIFT = (
@@ -267,7 +267,7 @@ def certify(solution: Found, sweeps: int = 2, flux_from: Found | None = None) ->
 
 
 class _NoBound(Exception):
-    """Why there is none; raised on all ranks."""
+    """The reason why there is no bound; raised on all ranks."""
 
 
 def _insist(reason: str | None) -> None:
@@ -743,7 +743,7 @@ def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
 ROUNDING = 64 * np.finfo(np.float64).eps
 """Relative error of what a cell adds to the certificate's norms."""
 LOST = 1e-150
-"""What a cell may lose of a norm: squares of what is below 1e-154 are hardly numbers."""
+"""Most that a cell may lose of a norm: squares of what is below 1e-154 are hardly numbers."""
 
 
 def _rounding(

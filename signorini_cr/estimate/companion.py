@@ -46,7 +46,7 @@ and 0.2 and more on thin cells.
 """
 
 SHARED = 0.03
-"""What it costs to move v at a vertex of thin cells, in parts of Σ κ|T||∇λ_i|², which it would cost
+"""Cost of a move of v at a vertex of thin cells, in parts of Σ κ|T||∇λ_i|², which it would cost
 alone: others move along. From 0.01 to 0.1 bounds differ by 2 % at most."""
 
 ALONE = 0.3
@@ -212,7 +212,7 @@ def _improved(
 
 @dataclass(frozen=True, eq=False)
 class Boundary:
-    """What v has to be on Γ0 and above on Γ1.
+    """Values that v has to have on Γ0, and the obstacle that it has to be above on Γ1.
 
     Attributes:
         u_D: Values on Γ0, seen from the cells.

@@ -23,7 +23,7 @@ from .flux import Flux
 from .shapes import best_heights, bubble_slopes, local_thirds, quadrature, third_slopes
 
 TOUCHING = 1e-12
-"""How far v is from α in the middle of a facet where it is meant to be α, in parts of the data."""
+"""Distance of v from α in the middle of a facet where it is meant to be α, in parts of the data."""
 
 
 def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companion:

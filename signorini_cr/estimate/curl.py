@@ -1,4 +1,4 @@
-"""What y gains on thin cells, where fluxes that are constant on facets cannot follow κ∇u.
+"""Correction of y on thin cells, where fluxes that are constant on facets cannot follow κ∇u.
 
 y gets the curl of a continuous function ω, which changes no divergence, and on each cell a field τ
 without normal components that carries the affine part of f − f_T. ω is made of the bumps of facets;

@@ -12,9 +12,9 @@ from ..fem.cells import BoundaryFacets, Cells
 from .functional import Masses
 
 KINK = 0.05
-"""What α is off its interpolant, in parts of this one's bump: an eighth at a kink, else O(h)."""
+"""Deviation of α from its interpolant, in parts of this one's bump: 1/8 at a kink, else O(h)."""
 SLIGHT = 1e-3
-"""What it is off at a kink that counts, in parts of what α differs by on the facet. Where α is a
+"""Deviation at a kink that counts, in parts of what α differs by on the facet. Where α is a
 wave and its second derivative 0, it is a 78th of (ωh)² for the frequency ω."""
 NOISE = 1e-9
 """Part of α below which it is rounding."""
@@ -39,7 +39,7 @@ class Draft:
 
 @dataclass(frozen=True, eq=False)
 class Floors:
-    """What the bounds ask of v: s v is not below the quadratic through three values on each facet.
+    """Bounds of v: s v is not below the quadratic through three values on each facet.
 
     Attributes:
         side: The facets of Γ1, once for each bound.

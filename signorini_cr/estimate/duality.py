@@ -27,7 +27,7 @@ from .shapes import local_thirds, quadrature
 from .sums import Sums
 
 EPS = 1e-14
-"""What rounding may do to an integral, relative."""
+"""Rounding of an integral, relative."""
 
 
 def integrate(
@@ -668,7 +668,7 @@ class Within(NamedTuple):
 
 
 Row = tuple[FloatArray, FloatArray, FloatArray]
-"""What `Within` has of some cells: pull, unsure, mean."""
+"""Figures of some cells for `Within`: pull, unsure, mean."""
 
 
 def _within(cells: Cells, kappa: Coefficient, block: slice, v: Companion, w: FloatArray) -> Row:

@@ -49,7 +49,7 @@ class Certified(Solved, Protocol):
 
 
 class Interval(NamedTuple):
-    """What is known of a number that u has.
+    """Bounds of a number that u has.
 
     Attributes:
         value: The same number of u_h.

@@ -1,4 +1,4 @@
-"""What the conforming function v is to make small, with its slopes.
+"""The functional that the conforming function v is to make small, with its slopes.
 
 E = ‖κ^{1/2}(∇v − ∇u_h)‖² + c‖v − u_h‖² + b‖v − t/b‖², the last over facets that lose heat. A
 function of degree 2 is given by its values at the vertices and the heights of its bumps
@@ -18,7 +18,7 @@ from ..fem.cells import BoundaryFacets, Cells, blocks, dot_rows, measures, pick,
 
 @dataclass(frozen=True, eq=False)
 class Masses:
-    """What E has of terms without gradients: c‖v − u_h‖² on cells, b‖v − t/b‖² on facets.
+    """Terms of E without gradients: c‖v − u_h‖² on cells, b‖v − t/b‖² on facets.
 
     Attributes:
         some: Whether there is a c or a b, here or on other ranks.
@@ -38,7 +38,7 @@ class Masses:
 
     @property
     def reacts(self) -> bool:
-        """Whether there is a c; the same on all ranks."""
+        """True if there is a c; the same on all ranks."""
         return reacts(self.reaction)
 
     def on_cells(self, cells: Cells, block: slice | IndexArray) -> FloatArray:
@@ -86,7 +86,7 @@ class Masses:
 
 @dataclass(frozen=True, eq=False)
 class Functional:
-    """What v is to make small: E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses.
+    """The functional that v is to make small: E = ‖κ^{1/2}(∇v − ∇u_h)‖² and masses.
 
     Attributes:
         cells: The mesh.
@@ -112,7 +112,7 @@ class Functional:
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """How fast E falls, cell by cell.
+    """Rates at which E falls, cell by cell.
 
     Attributes:
         vertices: −½ ∂E by v's values at the vertices with the bumps kept, shape (d + 1, cells).

@@ -1,4 +1,4 @@
-"""What u_D and α have beyond v on boundary facets, enclosed and lifted into the cells.
+"""The parts of u_D and α beyond v on boundary facets, enclosed and lifted into the cells.
 
 δ is u_D − v on Γ0, and (α − α_I)⁺ on Γ1, where α_I ≤ v is the polynomial that α is interpolated by;
 with bounds on both sides, so that v + ℓ passes neither, it is (α − v)⁺ − (v − β)⁺. It vanishes at
@@ -30,9 +30,9 @@ NO_RANGE = "{} holds an operator that has no enclosure: {}"
 CURVED = "u_D or α is not affine on the facets: their lifting is known for d = 2 only"
 
 QUARTERS = 2
-"""How often facets are halved to begin with."""
+"""Halvings of facets to begin with."""
 HALVINGS = 30
-"""How often those are halved on which data are not shown to be below others."""
+"""Most halvings of those on which data are not shown to be below others."""
 POWERS = 0.5, 1e6
 """Between which k is."""
 END = 1e-9
@@ -207,7 +207,7 @@ def _lifted(found: _Enclosed, seen: Triangles, n: int, rough: str) -> Lift:
 
 @dataclass(frozen=True, eq=False)
 class _Enclosed:
-    """What is known of δ, and of the data.
+    """Bounds of δ, and of the data.
 
     Attributes:
         pieces: Pieces of the facets.

@@ -42,7 +42,7 @@ class Loss:
 
     @property
     def varies(self) -> bool:
-        """Whether it may vary within facets."""
+        """True if it may vary within facets."""
         return any(edge.varies for edge in self.data.edges)
 
     def known(self, w: FloatArray) -> Known:

@@ -15,7 +15,7 @@ from .companion import on_facet
 CUSP = 0.5
 """No cusp of the height 1 is larger: t^s − t for s = ½ and ¼."""
 ROUNDING = 1e-14
-"""What rounding may do to ∫ ψ, in parts of ∫ |ψ|."""
+"""Rounding of ∫ ψ, in parts of ∫ |ψ|."""
 
 
 @dataclass(frozen=True)

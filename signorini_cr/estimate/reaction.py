@@ -42,7 +42,7 @@ class Reaction:
 
     @property
     def varies(self) -> bool:
-        """Whether it may vary within cells."""
+        """True if it may vary within cells."""
         return self.high is not self.low
 
     def rest(self, w: FloatArray) -> VolumeMoments:

@@ -30,12 +30,12 @@ from .certificate import Made
 from .lifting import JUMP, Cubic, Lift, lift
 
 SHARE = 1e-2
-"""What ‖Aℓ‖ need not be known better than, in parts of ‖Aφ‖, or thereabouts."""
+"""Accuracy of ‖Aℓ‖ that is enough, in parts of ‖Aφ‖, or thereabouts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """What a weight is against y, and what it has beyond P1; this rank's shares.
+    """Figures of a weight against y, and of its part beyond P1; this rank's shares.
 
     Attributes:
         force: ∫ ω (y·n + t − g̃) over the parts.

@@ -161,7 +161,7 @@ THIN = 25.0
 
 
 class Cells:
-    """What the certificate needs to know of a mesh.
+    """Facets, vertices and measures of a mesh's cells, for the certificate.
 
     Attributes:
         number: Owned cells.
@@ -329,7 +329,7 @@ class Cells:
 
     @cached_property
     def exterior(self) -> BoolArray:
-        """Whether each facet dof lies on the boundary, ghosts included."""
+        """True for each facet dof on the boundary, ghosts included."""
         mark = self._facet_zeros()
         for side in self.sides.values():
             mark[side.dofs] = 1.0

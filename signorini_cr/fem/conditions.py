@@ -134,7 +134,7 @@ def negative(expression: Expr) -> Expr:
 
 @dataclass(frozen=True)
 class Given:
-    """What conditions are made from.
+    """Inputs that conditions are made from.
 
     Attributes:
         expression: Turns data into an expression in the coordinates; `called` is what messages
@@ -150,7 +150,7 @@ class Given:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Condition:
-    """What holds on one part of the boundary; each kind adds what it overrides.
+    """A condition on one part of the boundary; each kind adds what it overrides.
 
     Attributes:
         part: The part's name, once it is known.
@@ -231,7 +231,7 @@ class Condition:
 
     @property
     def optional(self) -> bool:
-        """Whether the main datum, if it is None, follows from an exact solution, or is 0."""
+        """True if the main datum, where it is None, follows from an exact solution, or is 0."""
         return True
 
     @property

@@ -25,7 +25,7 @@ from .snapshot import Snapshot
 
 @dataclass(frozen=True, eq=False)
 class Imposed:
-    """What a condition asks of unknowns on its part of the boundary.
+    """Values or bounds of unknowns that a condition asks for on its part of the boundary.
 
     Attributes:
         key: The data's name, for messages.
@@ -102,7 +102,7 @@ class OnMesh(Protocol):
 
 
 class Physics(Protocol):
-    """What makes the physics; one object for all meshes of a sequence.
+    """The interface of a physics; one object for all meshes of a sequence.
 
     Attributes:
         element: "CR" or "P1".
@@ -116,7 +116,7 @@ class Physics(Protocol):
 
     @property
     def galerkin(self) -> bool:
-        """Whether P1 operators are sure to be the Galerkin products of finer meshes' operators."""
+        """True if P1 operators are sure to be the Galerkin products of finer meshes' operators."""
 
     @property
     def not_definite(self) -> str | None:

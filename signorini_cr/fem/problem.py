@@ -569,17 +569,17 @@ class Forms:
 
     @property
     def uniform(self) -> bool:
-        """Whether κ is a number."""
+        """True if κ is a number."""
         return as_number(self.kappa) is not None
 
     @property
     def steady(self) -> bool:
-        """Whether κ is a number on each cell of the coarsest mesh."""
+        """True if κ is a number on each cell of the coarsest mesh."""
         return self.problem.form is None and (self.uniform or is_by_cells(self.kappa))
 
     @cached_property
     def loaded(self) -> bool:
-        """Whether f or a flux is more than the number 0."""
+        """True if f or a flux is more than the number 0."""
         return any(as_number(data) != 0.0 for data in (self.f, *(c.flux for c in self.natural)))
 
     @cached_property

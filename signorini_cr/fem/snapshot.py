@@ -1,4 +1,4 @@
-"""What data that may change were when something was solved with them."""
+"""Values of data that may change, as they were when something was solved with them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Snapshot:
 
     @property
     def lasts(self) -> bool:
-        """Whether the values are still these, on this rank."""
+        """True if the values are still these, on this rank."""
         return all(np.array_equal(a, b) for a, b in zip(self._now(), self._values, strict=True))
 
     @contextmanager

@@ -124,7 +124,7 @@ def _columns(rows: dict[str, npt.NDArray], order: Int64Array) -> dict[str, npt.N
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """How the boundary passes through the contact facets, Ω to the left.
+    """The boundary's way through the contact facets, Ω to the left.
 
     Attributes:
         ends: Vertices in that order, shape (n, 2, 3).

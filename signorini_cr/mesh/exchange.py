@@ -12,7 +12,7 @@ from ..arrays import IndexArray, Int32Array
 
 
 class Exchange:
-    """Who asks whom for which rows, each of them once.
+    """Rows that ranks ask of one another, each of them once.
 
     Attributes:
         place: Where what was asked for is among the rows fetched, shape (n,).

@@ -12,7 +12,7 @@ from ..errors import InputError
 from .polygon import inside
 
 NEAR = 1e-12
-"""How close, in parts of the extent, points are the same, and points are on a line."""
+"""Distance at which points are the same, or on a line, in parts of the extent."""
 
 
 class Outline(NamedTuple):

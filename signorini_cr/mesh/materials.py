@@ -1,4 +1,4 @@
-"""What the cells of a mesh consist of."""
+"""The materials of a mesh's cells."""
 
 from __future__ import annotations
 

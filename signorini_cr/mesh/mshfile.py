@@ -61,7 +61,7 @@ class Block(NamedTuple):
 
 
 class MshFile(NamedTuple):
-    """What a mesh file says.
+    """Contents of a mesh file.
 
     Attributes:
         tags: Tags of the nodes, ascending, shape (nodes,).

@@ -1,4 +1,4 @@
-"""Which rank gets which cell of a mesh that is made on rank 0."""
+"""Distribution over the ranks of the cells of a mesh that is made on rank 0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether triangles lie side by side in the plane: none over another, no vertex inside a side.
+"""Test that triangles lie side by side in the plane: none over another, no vertex inside a side.
 
 Take all triangles counterclockwise. Where two share a side they must run through it in opposite
 directions, and around a vertex they must not overlap. Then a point is covered as often as the

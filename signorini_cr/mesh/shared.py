@@ -1,4 +1,4 @@
-"""What ranks share: vectors with room for ghosts, and sums over what each has for an entity."""
+"""Data shared by ranks: vectors with room for ghosts, and sums over what each has for an entity."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _gather(mesh: Mesh, index_map: Any, array: FloatArray, block: int, mode: Any
 
 
 class _Exchange(NamedTuple):
-    """What is kept of how ranks share entities: a vector with room for ghosts, and its memory."""
+    """A vector with room for ghosts, and its memory, for entities that ranks share."""
 
     vector: PETSc.Vec
     memory: FloatArray

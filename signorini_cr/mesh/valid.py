@@ -1,4 +1,4 @@
-"""Whether triangles and tetrahedra can be cells: not too thin, and beside one another."""
+"""Test that triangles and tetrahedra can be cells: not too thin, and beside one another."""
 
 from __future__ import annotations
 

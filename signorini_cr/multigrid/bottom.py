@@ -1,4 +1,4 @@
-"""What solves the space at the bottom of the cycle, or takes the cycle's place.
+"""Solver of the space at the bottom of the cycle, or in place of the cycle.
 
 Small matrices are factorised on every rank, algebraic multigrid has the others. Where the cycle has
 been given up, that is what takes few steps for thin cells only if they are aligned with the strong

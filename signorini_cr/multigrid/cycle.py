@@ -155,7 +155,7 @@ class Grid:
 
 
 class TwoGrids:
-    """What a cycle does on a grid that has a coarser one below it."""
+    """A cycle's part on a grid that has a coarser one below it."""
 
     def __init__(self, matrix: PETSc.Mat, dofs: Layout, transfer: Transfer, sweeps: int):
         """Prepare the sweeps, as for `Grid`; collective."""
@@ -229,7 +229,7 @@ class Multigrid:
 
     @property
     def may_give_up(self) -> bool:
-        """Whether there is something else to try than this chain; the same on all ranks."""
+        """True if there is something else to try than this chain; the same on all ranks."""
         return not self.given_up and (len(self.grids) > 1 or not is_small(self.matrix))
 
     @property

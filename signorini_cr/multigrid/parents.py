@@ -35,7 +35,7 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the nodes of CR or P1 are, and how many unknowns each has.
+    """Places of the nodes of CR or P1, and the number of unknowns of each.
 
     Attributes:
         mesh: The mesh.
@@ -113,7 +113,7 @@ class Layout:
 
 
 class Parents:
-    """Which coarse cell each fine cell lies in, and where.
+    """The coarse cell that each fine cell lies in, and its place there.
 
     Attributes:
         cell: For each local fine cell the coarse cell that holds it: its local index, or, where
@@ -206,7 +206,7 @@ class Parents:
 
     @cached_property
     def regular(self) -> bool:
-        """Whether every coarse cell has its 2^d children in a row, on this rank."""
+        """True if every coarse cell has its 2^d children in a row, on this rank."""
         if self._exchange is not None:
             return False
         if self._pattern is not None:

@@ -26,7 +26,7 @@ from .parents import Layout, Parents
 
 
 class Transfer:
-    """What writes functions of a P1 space in a finer space.
+    """Transfer of functions from a P1 space to a finer space.
 
     A rank has the rows of its own fine dofs. Their columns are local coarse dofs, ghosts included,
     so that none has to be given another number, and no matrix of several ranks is put together.
@@ -156,7 +156,7 @@ def prolongation(coarse: Layout, fine: Layout, parents: Parents) -> Transfer:
 
 @dataclass(frozen=True, eq=False)
 class Ancestor:
-    """What a function was prolonged from.
+    """A function that another one was prolonged from.
 
     Attributes:
         u: The function on the mesh below.

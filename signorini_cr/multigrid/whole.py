@@ -25,7 +25,7 @@ COLUMNS = 4_000_000
 
 
 ACCURACY = 1e-6
-"""What the factors may have of constants for an error."""
+"""Largest error that the factors may have for constants."""
 
 
 def suits_whole(matrix: PETSc.Mat, dimension: int, bounded: int) -> bool:

@@ -1,4 +1,4 @@
-"""What a run leaves behind.
+"""The files that a run leaves behind.
 
 Report, tables, fields and pictures, in files that appear whole or not at all.
 """

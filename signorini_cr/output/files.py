@@ -21,7 +21,7 @@ Writer = Callable[[Path], object]
 """Writes one file; called on every rank, and raises on every rank if at all."""
 
 STAGE = ".signorini-cr-"
-"""What the names of hidden folders begin with in which files are written at first."""
+"""Prefix of the names of hidden folders in which files are written at first."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What every figure that a run leaves behind means, told once: legend, help and reference.
+"""Meanings of all figures that a run leaves behind, told once: legend, help and reference.
 
 Nothing heavy is imported here: ``--help columns`` answers at once.
 """

@@ -17,7 +17,7 @@ AT_ONCE = 2**20
 """Pairs of a pixel and a cell near it that are looked at in one go."""
 
 EDGE = 1e-9
-"""What counts as rounding in a barycentric coordinate."""
+"""Rounding in a barycentric coordinate."""
 
 
 def raster(

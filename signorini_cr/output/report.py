@@ -1,4 +1,4 @@
-"""What a run leaves behind: the report, the tables, the fields and the pictures.
+"""The output of a run: the report, the tables, the fields and the pictures.
 
 `level_record` turns a solution into numbers, `table_header` and `table_row` show them on a
 terminal, `write_levels` keeps what is finished, `write_output` fills a folder. Nothing here prints.
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from ..solution import Solution
 
 REPORT = "report.json"
-"""What the other files of a run lie beside."""
+"""Name of the report, which the other files of a run lie beside."""
 CHECKED = "check.png"
 """The mesh of a problem that is checked where the results of a run lie."""
 FILES = (

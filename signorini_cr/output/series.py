@@ -1,4 +1,4 @@
-"""What a run in time leaves behind: a table of the steps, a field for each, and what holds them."""
+"""The output of a run in time: a table of the steps, a field for each, and what holds them."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ SEARCH: tuple[Column, ...] = (
     ("dofs", 8, lambda r: str(r["dofs"])),
     ("bound", 9, lambda r: at_most(r["bound_h1"])),
 )
-"""What is printed of the meshes that an adaptive run in time tries."""
+"""Columns that are printed for the meshes that an adaptive run in time tries."""
 
 MEASURED = {"time": "time", "contact": "x", "force": "force"}
 """The columns whose unit may be told."""

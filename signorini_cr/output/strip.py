@@ -44,7 +44,7 @@ PIXELS = 600
 
 @dataclass(frozen=True)
 class Moment:
-    """What a strip shows of one step.
+    """One step, as a strip shows it.
 
     Attributes:
         time: Its end.

@@ -1,4 +1,4 @@
-"""Where there is contact, as lines and in words, for pictures."""
+"""Places of contact, as lines and in words, for pictures."""
 
 from __future__ import annotations
 

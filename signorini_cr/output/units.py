@@ -1,4 +1,4 @@
-"""What u, the axes and the rest are called and measured in, for pictures, tables and sentences."""
+"""Names and units of u, the axes and the rest, for pictures, tables and sentences."""
 
 from __future__ import annotations
 

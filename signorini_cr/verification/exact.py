@@ -168,7 +168,7 @@ EDGES = ("floor", "right", "top", "left")
 """Those of the unit square, as `made` calls them."""
 
 MARGIN = 0.3
-"""How far from 0 the switch of `made` is where u touches one of two obstacles."""
+"""Least distance from 0 of the switch of `made` where u touches one of two obstacles."""
 
 
 def made(

@@ -1,4 +1,4 @@
-"""What is measured of u − u_h: the broken norm (1.6), L2, λ on Γ1, and the rates."""
+"""Measures of u − u_h: the broken norm (1.6), L2, λ on Γ1, and the rates."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def _forms(domain: Domain, problem: Problem) -> Forms:
 
 @dataclass(frozen=True)
 class Judgement:
-    """How many contact facets there are, over all ranks, and how the discrete solution sees them.
+    """Numbers of contact facets, over all ranks, as u and the discrete solution see them.
 
     Attributes:
         bound: Facets in Γ1h⁰.

@@ -1,4 +1,4 @@
-"""Which dofs the obstacle holds, for everyone who asks: all rules are here.
+"""The dofs that the obstacle holds, for everyone who asks: all rules are here.
 
 It is one criterion, that of the primal-dual method: active is what force − A_ii gap > 0. While it
 solves SNES decides, and `ActiveSet.without` takes that over; `ActiveSet.of` is the same for an

@@ -1,4 +1,4 @@
-"""What dofs must not be below or above; everything about contact is said of the nearer of the two.
+"""Bounds of dofs from below and above; everything about contact is said of the nearer of the two.
 
 A dof's gap is its distance from the nearer bound, its side 1 where that is the lower and −1 where
 it is the upper one. With s its side, s (A u − b) is the force that pushes it off the bound, and so

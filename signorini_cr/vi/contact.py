@@ -1,4 +1,4 @@
-"""What happens on Γ1: active facets, pressure, transition points, and the KKT conditions.
+"""Facts about Γ1: active facets, pressure, transition points, and the KKT conditions.
 
 All figures come from the solution: the residual r = A u_h − b gives on a contact facet F the
 pressure λ_F = r_F / |F|, the piecewise constant ∂ₙu_h that the scheme knows.
@@ -29,7 +29,7 @@ from .system import System
 
 @dataclass(frozen=True)
 class Kkt:
-    """How well u_h satisfies the discrete conditions on Γ1.
+    """Measures of how well u_h satisfies the discrete conditions on Γ1.
 
     Attributes:
         min_gap: Smallest u_h − α, or β − u_h, at a contact dof; 0 or above when feasible.
@@ -227,7 +227,7 @@ def _at_facets(
 
 @dataclass(frozen=True, eq=False)
 class _AtDofs:
-    """What a solution does at the dofs.
+    """Gaps, forces and residuals of a solution at the dofs.
 
     Attributes:
         gap: Distance of the bounded dofs from the nearer bound, shape (n,).

@@ -33,10 +33,10 @@ ROUNDS = 20
 """Refinements in each."""
 
 KNOWN = 1e-2
-"""What a refinement may change, in parts of what may be wrong with the forces."""
+"""Change that a refinement may make, in parts of what may be wrong with the forces."""
 
 GAIN = 0.5
-"""What a refinement must take away of what is wrong to be worth another one."""
+"""Part of what is wrong that a refinement must take away to be worth another one."""
 
 REMAINDER = 1e-9
 """Forces below this part of the loads on their rows, with which others nearly cancel, are measured
@@ -51,7 +51,7 @@ DataRounding = Callable[[int], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What is known of forces in the end.
+    """Accuracy of the forces in the end.
 
     Attributes:
         error: What may be wrong with them, in parts of their sum; where they are none, in parts of

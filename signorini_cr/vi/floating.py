@@ -29,7 +29,7 @@ BELOW = 4.0
 """A piece is put so far below its obstacle, in parts of what its loads could lift it by."""
 
 DOUBT = 4.0
-"""How many times the difference of two fine rules a net force may be wrong by."""
+"""Error that a net force may have, in multiples of the difference of two fine rules."""
 
 
 @dataclass(frozen=True, eq=False)

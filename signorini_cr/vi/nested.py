@@ -96,7 +96,7 @@ def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Expected:
-    """What the bounded dofs are expected to do.
+    """State that is expected of the bounded dofs.
 
     Attributes:
         active: The active set to begin with.
@@ -187,7 +187,7 @@ def _make_forces(
 
 @dataclass(frozen=True, eq=False)
 class _Inherited:
-    """What the parents of contact facets say.
+    """State of the contact facets, as their parents have it.
 
     Attributes:
         active: Whether the parent is active, shape (n,).

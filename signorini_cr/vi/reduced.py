@@ -30,22 +30,22 @@ from .stopping import FORCES, LOST, NOISE, Stiffness
 from .system import Vectors
 
 LINEAR_SHARE = 0.9
-"""What the linear solver leaves at the end, in parts of what the residual may be."""
+"""Part of what the residual may be that the linear solver leaves at the end."""
 
 SET_SHARE = 0.3
-"""What it leaves while the active set is wrong, in parts of what that adds to the residual."""
+"""Part that the linear solver leaves of what a wrong active set adds to the residual."""
 
 SETTLED = 1.0
 """Part of its last change by which a contact dof's sign must be certain before the end."""
 
 SETTLING_LIMIT = 1e-3
-"""Where signs stay open the linear solver goes on to this part of what it may leave."""
+"""Part of what it may leave that the linear solver goes on to where signs stay open."""
 
 FLOOR = 1e-10
 """Residuals below so many times the rounding of A x are not reduced further, whatever is open."""
 
 DIGITS = 1e-6
-"""What a correction may leave of the residual, in parts of it."""
+"""Part of the residual that a correction may leave."""
 
 MOST = 100
 """CG steps of one correction; the next one goes on."""
@@ -300,7 +300,7 @@ class ReducedSolver:
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What a step would leave on the contact boundary, over all ranks.
+    """Effect that a step would have on the contact boundary, over all ranks.
 
     Attributes:
         wrong: Norm of the part of the next residual that pulling forces and penetration will make.

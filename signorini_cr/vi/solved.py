@@ -1,4 +1,4 @@
-"""What the streets above may ask of a solve, whoever keeps its results."""
+"""The interface of a solve to the streets above, whoever keeps its results."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, TOUCHING, Sti
 from .system import DATUM, Vectors
 
 SET_TOLERANCE = 0.01
-"""What dofs in the wrong set may have for a residual, in parts of what all may have together."""
+"""Residual that dofs in the wrong set may have, in parts of what all may have together."""
 
 SET_STEPS = 2
 """Newton steps that are made for that alone, when the residual as a whole is small already.
@@ -48,7 +48,7 @@ ENTRIES = 3.0
 """So many times the largest entry is what c and b have in a row and in those of its neighbours."""
 
 SLIGHT = 0.1
-"""What need not be worked out, in parts of what may be wrong with the forces."""
+"""Part of what may be wrong with the forces that need not be worked out."""
 
 PASSES = 6
 """Newton steps in an active set that does not change any more; they refine the solution."""
@@ -57,7 +57,7 @@ SWAPS = 10
 """Times that dofs may turn out to be in the wrong set when all else is well."""
 
 GAIN = 0.5
-"""What a refinement must take away of what is wrong, or rounding is at work."""
+"""Part of what is wrong that a refinement must take away, or rounding is at work."""
 
 DIVERGED_NAN, DIVERGED_ROUNDING = -4, -5
 """PETSc's number for what is not finite, whose name depends on the version, and for "no gain"."""
@@ -70,7 +70,7 @@ iterations so far; the same on all ranks."""
 
 @dataclass(frozen=True)
 class Iterations:
-    """What the solver did.
+    """Steps that the solver took, and the accuracy that it reached.
 
     Attributes:
         newton: Newton steps.
@@ -94,7 +94,7 @@ class Iterations:
 
 @dataclass(frozen=True, eq=False)
 class SystemData:
-    """What is known of the data that make the system.
+    """Figures of the data that make the system.
 
     Attributes:
         row_sums: `System.row_sums`.
@@ -262,7 +262,7 @@ def _stopped(reason: int, inner: int, contrast: float) -> str:
 
 
 class NewtonTest:
-    """Whether SNES may stop; see `stopping`.
+    """Test that decides when SNES may stop; see `stopping`.
 
     Attributes:
         force_error: What may be wrong with the contact forces, in parts of their sum.

@@ -1,4 +1,4 @@
-"""When the solution of the variational inequality is good enough.
+"""Stopping criteria for the solution of the variational inequality.
 
 The residual as a whole says little where the coefficient varies by orders of magnitude: what is
 small against the stiff part's flows may be all there is in the soft part. So three things are
@@ -52,28 +52,28 @@ square and the ones around it: the end of a contact zone, or a corner, where for
 part of its own, on whichever side of a square's edge it lies."""
 
 BOTTOM = 10.0 ** -(BAND * (BANDS - 1))
-"""What forces and residuals are measured against at least, in parts of the most that rows are made
-of: where the last of the bands begins. Where u falls off by many orders of magnitude, or flows are
-what rounding makes of none, there is no end below."""
+"""Least size that forces and residuals are measured against, in parts of the most that rows are
+made of: where the last of the bands begins. Where u falls off by many orders of magnitude, or
+flows are what rounding makes of none, there is no end below."""
 
 PART = 1e-2
-"""What forces are measured against at least, in parts of what the rows of their class are made of;
+"""Least size that forces are measured against, in parts of what their class's rows are made of;
 but in the first, which are made of most."""
 
 FORCES = 1e-7
-"""What may be wrong with the contact forces, in parts of their sum."""
+"""Error that the contact forces may have, in parts of their sum."""
 
 FLOWS = 1e-8
-"""What the residual of a class of stiffness may be, in parts of its flows."""
+"""Residual that a class of stiffness may have, in parts of its flows."""
 
 ROUNDED = 1e-6
-"""What both may be where rounding allows for no better."""
+"""Size that both may have where rounding allows for no better."""
 
 NOISE = 4.0 * 2.0**-53
 """Rounding of a row of A x, in parts of |A| |x|; measured are 1 to 2 of these 4."""
 
 STORED = NOISE / 32.0
-"""What a row of A x is off, in parts of |A| |x|, as x is stored with 53 digits: as measured."""
+"""Error of a row of A x, in parts of |A| |x|, as x is stored with 53 digits: as measured."""
 
 LOST = 10.0
 """Forces whose sum is below so many times their rounding are lost in it."""
@@ -143,7 +143,7 @@ class Stiffness:
 
     @property
     def varied(self) -> bool:
-        """Whether there are dofs of several magnitudes of stiffness; the same on all ranks."""
+        """True if there are dofs of several magnitudes of stiffness; the same on all ranks."""
         return self._kinds > 1
 
     def _take_differences(self, row_sums: Callable[[], FloatArray]) -> None:

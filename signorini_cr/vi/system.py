@@ -35,7 +35,7 @@ TINY = 1e-130
 A bound of the error counts them, and what it can't count, see `estimate.certificate.LOST`."""
 
 NOTHING = 1e-100
-"""What such a load may move u by: one that does more does so as κ is as small."""
+"""Largest change of u by such a load: one that does more does so as κ is as small."""
 
 BESIDE = 1e-16
 """The same in parts of the bounds, beside which it would be lost in rounding."""
@@ -76,7 +76,7 @@ class Vectors:
 
 @dataclass(frozen=True, eq=False)
 class ContactFacets:
-    """Where the owned facets of Γ1 are, whatever holds there.
+    """Places of the owned facets of Γ1, whatever holds there.
 
     Attributes:
         vertices: Their vertices' coordinates, shape (n, d, 3).
@@ -511,7 +511,7 @@ class System:
 
     @property
     def is_trivial(self) -> bool:
-        """Whether the most trivial function, on its bounds, leaves nothing of the equations."""
+        """True if the most trivial function, on its bounds, leaves nothing of the equations."""
         return self.residual_scale == 0.0
 
     def residual(self, u: fem.Function, r: fem.Function) -> float:
