@@ -15,7 +15,7 @@ from .vi.solved import Solved
 
 BYTES = 800.0
 """Peak memory that a dof more takes, with all coarser meshes and the certificate."""
-TELLING = 20_000
+DOFS_APART = 20_000
 """Dofs that two levels must be apart for their peaks to tell more than that."""
 
 
@@ -92,7 +92,7 @@ class Limits:
         more, grown = dofs - n, max(n - before.dofs, 1)
         seconds = runs * (last.seconds + max(last.seconds - before.seconds, 0.0) * more / grown)
         growth = BYTES * dofmap.index_map.size_local * dofmap.index_map_bs / n
-        if grown >= TELLING:
+        if grown >= DOFS_APART:
             growth = max(growth, (last.peak - before.peak) / grown)
         words = shortage(comm, growth * more)
         left = self._left(comm)

@@ -15,6 +15,7 @@ from .estimate.certificate import Certificate, Made, certify
 from .estimate.force import Certified, Interval, against, extended, square
 from .estimate.pairing import Pairing, in_cells, on_side
 from .estimate.settled import Settled, in_p1, left_by
+from .estimate.sums import INTEGRAL_ROUNDING
 from .estimate.weights import scalar
 from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
@@ -31,8 +32,6 @@ NO_WEIGHT = "the weight's integral may be 0, and there is no mean; its integral 
 AFLOAT = (
     "nothing but contact is known to hold a part of the domain, and no energy tells how high it is"
 )
-ROUNDING = 1e-14
-"""Rounding of an integral, in parts of that of |ψ u|."""
 
 
 def mean(
@@ -112,7 +111,7 @@ def _bounded(
         *_corrected(made, cells, bound, dual),
         *_settled(made, cells, bound, dual, place, weight),
     ]
-    loose = known.unsure + ROUNDING * known.scale
+    loose = known.unsure + INTEGRAL_ROUNDING * known.scale
     return known, Interval(
         known.of_u,
         known.of_v + max(shift - reach for shift, reach in shifts) - loose,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # it is asked before they are loaded, and where they can't be
 
 CGROUPS = Path("/sys/fs/cgroup")
 
-LEAST = 4e8
+LEAST_SPACE = 4e8
 """Bytes of address space; libraries that are loaded with less end the process in many ways."""
 FEWEST = 64
 """Files open at a time. MPI, which would end the process, takes 24 for itself and two ranks."""
@@ -54,11 +54,11 @@ def too_little() -> str | None:
     if files != resource.RLIM_INFINITY and files < FEWEST:
         return f"ulimit -n allows {files} open files, and {FEWEST} are needed"
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit == resource.RLIM_INFINITY or limit >= LEAST:
+    if limit == resource.RLIM_INFINITY or limit >= LEAST_SPACE:
         return None
     return (
         f"out of memory: ulimit -v leaves {_shown(limit)}, and to load the program alone takes"
-        f" {_shown(LEAST)}"
+        f" {_shown(LEAST_SPACE)}"
     )
 
 

@@ -176,18 +176,21 @@ def test_what_is_cited_is_in_the_bibliography():
 
 
 @pytest.mark.serial
-def test_docstrings_say_what_a_function_does():
-    """In the imperative; what a property is may be a noun phrase, or begin with Whether."""
-    asked = {"What", "Where", "How", "Which"}
+def test_docstrings_say_what_a_thing_is():
+    """Of functions in the imperative; of all else, constants among it, by a noun."""
+    asked = {"What", "Where", "How", "Which", "Whether", "When", "Why"}
     found = []
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            words = (ast.get_docstring(node) or "").split()
-            is_property = any("property" in ast.unparse(each) for each in node.decorator_list)
-            if words and words[0] in (asked if is_property else asked | {"Whether"}):
-                found.append(f"{path.relative_to(PACKAGE)}:{node.lineno} {node.name}")
+            texts = []
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                texts = [
+                    each.value.value
+                    for each in node.body
+                    if isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant)
+                ]
+            words = [text.split()[0] for text in texts if isinstance(text, str) and text.split()]
+            found += [f"{path.relative_to(PACKAGE)}: {word}" for word in words if word in asked]
     assert not found, found
 
 

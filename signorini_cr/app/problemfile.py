@@ -72,11 +72,11 @@ from .reference import (
     allowed,
 )
 
-KEYS = {section: allowed(section) for section in SECTIONS if allowed(section)}
+KEYS_IN = {section: allowed(section) for section in SECTIONS if allowed(section)}
 MODES = ("uniform", "adaptive")
 TELLING = ("units", "names")
 """Sections that levels, and what is told of them, do not depend on."""
-ENOUGH = 1000
+UNLIMITED = 1000
 """Levels of an adaptive run that names no limit: others end it."""
 SIMPLE = "the polygon must be simple, its edges must meet at their common vertices only"
 MOST_STEPS = 100_000
@@ -294,7 +294,7 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
     """
     path = Path(path)
     table = parse_toml(on_root(comm, read_text, path))
-    insist_known(table, "", (*allowed(""), *SECTIONS), KEYS)
+    insist_known(table, "", (*allowed(""), *SECTIONS), KEYS_IN)
     heading = get(table, "", "title", title, path.stem)
     parts, materials = _parts(table), _materials(table)
     sections = {name: _section(table, name) for name in SECTIONS}
@@ -330,7 +330,7 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
         problem=_problem(expressions, parts, materials),
         expressions=expressions,
         mode=mode,
-        levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else ENOUGH),
+        levels=get(refine, "refine", "levels", whole, 1 if mode == "uniform" else UNLIMITED),
         adaptive=adaptive,
         time=None if clock is None else _time(sections, expressions, clock),
         quantities=quantities,
@@ -352,7 +352,7 @@ def _parts(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     for name, part in parts.items():
         section = f"boundary.{name}"
         insist_on_name("boundary", name)
-        insist_known(part, section, allowed(PART), KEYS)
+        insist_known(part, section, allowed(PART), KEYS_IN)
         needed = f"one of {', '.join(TYPES)}"
         kind = get(part, section, "type", one_of(tuple(TYPES)), needed=needed)
         for key in part:
@@ -371,7 +371,7 @@ def _materials(table: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         raise InputError(f"material: sections [{MATERIAL}] are needed, found {shown(found)}")
     for name, material in found.items():
         insist_on_name("material", name)
-        insist_known(material, f"material.{name}", allowed(MATERIAL), KEYS)
+        insist_known(material, f"material.{name}", allowed(MATERIAL), KEYS_IN)
     return found
 
 
@@ -426,8 +426,8 @@ def _section(table: Mapping[str, Any], name: str) -> dict[str, Any]:
     section = table.get(name, {})
     if not isinstance(section, dict):
         raise InputError(f"{name}: a section [{name}] is needed, found {shown(section)}")
-    if name in KEYS:
-        insist_known(section, name, KEYS[name], KEYS)
+    if name in KEYS_IN:
+        insist_known(section, name, KEYS_IN[name], KEYS_IN)
     return section
 
 

@@ -40,7 +40,7 @@ SURE = 3
 """So many bounds tell at which rate they fall."""
 OFF = 1e-3
 """Part of an error by which it may be wrong."""
-FAR = 10
+OUT_OF_REACH = 10
 """So many times the unknowns that there may be are out of reach."""
 
 
@@ -214,7 +214,7 @@ def out_of_reach(case: ProblemFile, records: list[output.Record]) -> str | None:
     rate = max(math.log(bound / last) / math.log(m / n), 0.5)
     # the logarithm, as the number itself may be beyond all floats
     digits = math.log10(m) + math.log10(last / tolerance) / rate
-    if digits <= math.log10(FAR * most):
+    if digits <= math.log10(OUT_OF_REACH * most):
         return None
     return (
         f"refine.tolerance: at this rate the tolerance {tolerance:g} takes about"

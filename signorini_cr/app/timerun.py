@@ -127,7 +127,7 @@ class Steps:
         assert case.time is not None
         self._number = case.time.steps
         self._back = len(SCHEMES[case.time.scheme].weights)  # so many steps are behind the next
-        levels = None if case.levels == problemfile.ENOUGH else case.levels
+        levels = None if case.levels == problemfile.UNLIMITED else case.levels
         self._said = {**run.said(), "refine.levels (or --levels)": levels}
         if case.mode == "adaptive":  # the mesh depends on where the search for it ends, too
             self._said |= {f"refine.{key}": value for key, value in case.adaptive.items()}

@@ -56,10 +56,10 @@ SKEW = 1e-12
 COORDINATES = 1e-12
 """Digits of a vertex that a mesh generator gets right, in parts of the domain's diameter."""
 
-SAMPLES, LEAST, MOST = 50_000, 4, 128
+SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 50_000, 4, 128
 """Intervals in which u_D is looked at: about so many in all, and so many a facet."""
 
-HUGE = 1e3
+POLE = 1e3
 """Least value at a pole, in multiples of the largest value looked at first."""
 
 AT_A_TIME = 20_000
@@ -319,7 +319,9 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     length = np.linalg.norm(way, axis=1)
     shortest = SHORTEST * error
     longest = max(comm.allgather(float(length.max(initial=0.0))))
-    pieces = int(min(np.clip(SAMPLES // total, LEAST, MOST), longest / (SPAN * shortest)))
+    pieces = int(
+        min(np.clip(SAMPLES // total, FEWEST_SAMPLES, MOST_SAMPLES), longest / (SPAN * shortest))
+    )
     if pieces < 1:
         return [_far_message(key, u_D.mesh, x) for x in start[:1]]
     intervals = _sampled(u_D, fixed, pieces)
@@ -336,7 +338,7 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
         rough, width = _roughness(u), (s[2] - s[0]) * length[segment]
         roughest = np.where(width <= halfway, np.maximum(rough, intervals.roughest), 0.0)
         middle = start[segment] + s[1][:, None] * way[segment]
-        for i in np.flatnonzero(np.abs(u).max(axis=0) > HUGE * largest):
+        for i in np.flatnonzero(np.abs(u).max(axis=0) > POLE * largest):
             complaints.append(_pole_message(key, u_D.mesh, middle[i]))
         rounding, short = np.maximum(scale, _noise(intervals.e)), width < shortest
         height = np.abs(u[2] - u[0])

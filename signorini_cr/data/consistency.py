@@ -22,7 +22,7 @@ from .pointwise import evaluate
 Values = tuple[FloatArray, FloatArray]
 """Values at points, and what rounding may have done to them."""
 
-ENOUGH = 1e-6
+SAME = 1e-6
 """Gap that is no difference, in parts of the largest value: an exact solution may be a fit."""
 
 JUMP = 2.0
@@ -159,24 +159,24 @@ class _Solution:
         gap = _difference(u, alpha)
         height, force = self._size(u, alpha), self._size(pressure)
         said = self._first(
-            gap[0] < -ENOUGH * height - gap[1],
+            gap[0] < -SAME * height - gap[1],
             x,
             f"u is {{:.6g}}, {'below' if sign > 0 else 'above'} the obstacle, {{:.6g}}",
             (sign * u[0], u[1]),
             (sign * alpha[0], alpha[1]),
         )
-        low = ENOUGH * force + pressure[1]
+        low = SAME * force + pressure[1]
         pulls = (pressure[0] < -low) & (len(contact.bounds) == 1)
         words = "the pressure on the obstacle is {:.6g}, below 0"
         said = said or self._first(pulls, x, words, pressure)
-        apart = (gap[0] > ENOUGH * height + gap[1]) & (pressure[0] > low)
+        apart = (gap[0] > SAME * height + gap[1]) & (pressure[0] > low)
         words = "the pressure on the obstacle is {:.6g} though u is "
         words += ("above" if sign > 0 else "below") + " it by {:.6g}"
         return said or self._first(apart, x, words, pressure, gap)
 
     def _same(self, key: str, x: FloatArray, given: Values, wanted: Values) -> str | None:
         gap = _difference(given, wanted)
-        wrong = np.abs(gap[0]) > ENOUGH * self._size(given, wanted) + gap[1]
+        wrong = np.abs(gap[0]) > SAME * self._size(given, wanted) + gap[1]
         words = f"{key} is {{:.6g}}, but it asks for {{:.6g}}"
         return self._first(wrong, x, words, given, wanted)
 

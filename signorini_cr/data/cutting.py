@@ -25,13 +25,13 @@ PIECES = 6_000
 """Pieces that a mesh's cells are cut into at most, in all, or one for 64 cells."""
 BEHIND = 0.25
 """Part of what may be missed that is left to cells for which a large box is good enough."""
-ROUNDS = 40
+CUTS = 40
 """Rounds of cuts at most."""
 BISECTIONS = 6
 """Steps towards the smallest size that there is room for."""
 CELLS = 60_000
 """Cells that may have boxes of their own, if that is more than twice the pieces."""
-LEAST = 1e-11
+SMALLEST = 1e-11
 """Part of a cell, or of a facet, that is not cut any more: coordinates have so many digits."""
 IN_VAIN = 3
 """Rounds in turn with next to no gain at most."""
@@ -43,7 +43,7 @@ ACROSS = 1.15
 """Factor by which errors must fall better than by quarters for a cut across an axis."""
 DEEP = 60.0
 """Multiple of the threshold from which on pieces are cut twice at once."""
-ENOUGH = 0.5
+DONE = 0.5
 """Sum of errors at which it ends."""
 FALL = 4.0
 """By how much errors fall where pieces are cut, at least, as a rule."""
@@ -172,7 +172,7 @@ def refine(
         finer = apart(pieces[lost])
         front = front[~lost] + _Front.of(finer, np.full(len(finer.part), UNKNOWN), wanted)
     before, idle = np.inf, 0
-    for _ in range(ROUNDS):
+    for _ in range(CUTS):
         share = front.share
         bounded = share[np.isfinite(share)]
         number, have, missing = cells.total(len(share), bounded.sum(), len(share) - len(bounded))
@@ -187,13 +187,13 @@ def refine(
             spare = (FALL * limit.enough - have) / (FALL - 1.0)
             threshold = max(threshold, _negligible(share, spare, cells.comm))
         space = int(limit.pieces - number) // 3 + 1
-        large = (front.pieces.part > LEAST) | ~np.isfinite(share)
+        large = (front.pieces.part > SMALLEST) | ~np.isfinite(share)
         chosen = _worst(np.where(large, share, 0.0), threshold, space, cells.comm)
         found, looked = cells.total(chosen.sum(), np.sum(front.ways[chosen] == UNKNOWN))
         if found == 0:
             break
         before = np.inf if missing or looked else have
-        deep = share > DEEP * (threshold if 8 * number > limit.usual else ENOUGH / number)
+        deep = share > DEEP * (threshold if 8 * number > limit.usual else DONE / number)
         front = front[~chosen] + _split(front[chosen], deep[chosen], wanted)
     pieces, origin = front.pieces.triangles()
     return pieces, front.inside[:, origin]
@@ -220,7 +220,7 @@ class _Room:
     @property
     def enough(self) -> float:
         """The sum of errors at which it ends."""
-        return MUCH if self.pieces > self.usual else ENOUGH
+        return MUCH if self.pieces > self.usual else DONE
 
 
 @dataclass(frozen=True, eq=False)

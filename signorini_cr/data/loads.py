@@ -198,7 +198,7 @@ class Certain:
             quadratic, cubic = deviation(Enclosure(boxes, inner=inner), half, hats=points)
             return np.stack([cubic, quadratic**2])
 
-        goal = SHARE * size
+        goal = TOLERANCE * size
         weights = np.empty((2, cells.number))
         np.multiply(2.0 / (np.sqrt(low) * goal), cells.volume, out=weights[0])
         # J(v) asks for the first of these, the bound for the second
@@ -250,7 +250,7 @@ def reacts(reaction: FloatArray) -> bool:
     return reaction.ndim > 0 or bool(reaction > 0.0)
 
 
-SHARE = 4e-3
+TOLERANCE = 4e-3
 """Part of the bound that may be missed of f, or thereabouts."""
 UNBOUNDED = "f is not bounded on the mesh, or not known to be"
 
@@ -311,7 +311,7 @@ class NeumannMoments:
 
 def bounds_on_facets(b: Expr, cells: Cells, side: BoundaryFacets) -> tuple[FloatArray, FloatArray]:
     """Enclose b on facets, shapes (n,); infinite for no bounds, 0 for below 0 by rounding."""
-    pieces, n = Pieces.of_facets(cells, side).finer(ROUNDS), len(side.cells)
+    pieces, n = Pieces.of_facets(cells, side).finer(HALVINGS), len(side.cells)
     low, high = np.full(n, np.inf), np.full(n, -np.inf)
     found = range_on(b, pieces, cells)
     if found is None:
@@ -321,7 +321,7 @@ def bounds_on_facets(b: Expr, cells: Cells, side: BoundaryFacets) -> tuple[Float
     return np.where((low < 0.0) & (low >= -ROUNDED * high), 0.0, low), high
 
 
-ROUNDS = 3
+HALVINGS = 3
 """Halvings of facets on which b varies."""
 ROUNDED = 1e-13
 """Part of b on a facet by which it may seem to be below 0."""
@@ -502,7 +502,7 @@ class Segments:
             norms: Whether ‖g − q‖ is to be small, too, and not the integrals alone.
         """
         g, facets, n = edge.g, edge.side, len(edge.measure)
-        pieces, reason = Pieces.of_facets(cells, facets).finer(ROUNDS * edge.varies), None
+        pieces, reason = Pieces.of_facets(cells, facets).finer(HALVINGS * edge.varies), None
         inside: FloatArray = np.zeros((2, len(pieces.part)))
         points, weights = facet_quadrature(cells.domain.mesh, max(LOAD_DEGREE, g.degree))
         hats = np.column_stack([1.0 - points.sum(axis=1), points])
@@ -513,7 +513,7 @@ class Segments:
                 quadratic, cubic = g.deviation(Enclosure(boxes), half, hats=hats.T)
                 return np.stack([cubic, quadratic**2])
 
-            here, goal = pick(low, facets.cells), SHARE * size
+            here, goal = pick(low, facets.cells), TOLERANCE * size
             most = trace_constant(cells, facets) ** 2 / here
             inverse = np.divide(1.0, edge.loss, out=np.full(n, np.inf), where=edge.loss > 0.0)
             scales = np.stack(

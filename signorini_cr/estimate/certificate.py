@@ -244,7 +244,7 @@ ADRIFT = (
     " the equation"
 )
 CROSSED = "{} is not shown to be nowhere above the upper bound of the part"
-HUGE = "a figure is not finite: some datum has no square integral, or squares overflow"
+NOT_FINITE = "a figure is not finite: some datum has no square integral, or squares overflow"
 
 
 def certify(solution: Found, sweeps: int = 2, flux_from: Found | None = None) -> Certificate:
@@ -580,7 +580,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
 
     ball = _Ball.of(total, known.left, hidden, rounding)
     _insist(v.reason or (ADRIFT if np.isposinf(known.left) else None))
-    _insist(None if np.isfinite(ball.bound) else HUGE)
+    _insist(None if np.isfinite(ball.bound) else NOT_FINITE)
     bound_h1 = np.sqrt(total.of_gradients) / 2
     bound_h1 += (rounding / 2 + ball.radius) / np.sqrt(kappa.smallest)
     lift = np.sqrt(total.lift)
@@ -740,9 +740,9 @@ def _size(cells: Cells, kappa: Coefficient, w: FloatArray, flux: Flux) -> float:
     return float(np.sqrt(max(square, 1e-16 * scale, 1e-200)))
 
 
-ROUNDING = 64 * np.finfo(np.float64).eps
+NORM_ROUNDING = 64 * np.finfo(np.float64).eps
 """Relative error of what a cell adds to the certificate's norms."""
-LOST = 1e-150
+UNDERFLOW = 1e-150
 """Most that a cell may lose of a norm: squares of what is below 1e-154 are hardly numbers."""
 
 
@@ -783,8 +783,8 @@ def _rounding(
     own = total, cells.number, float(cells.volume.sum()), some
     total, number, volume, there = cells.total(*own)
     size, stiff = np.sqrt(np.max(cells.comm.allgather((size, stiff)), axis=0))
-    lost = LOST * (stiff + (1.0 + size) * (1.0 + np.sqrt(volume)) / np.sqrt(kappa.smallest))
-    return float(ROUNDING * np.sqrt(total) + lost * np.sqrt(number) * (there > 0.0))
+    lost = UNDERFLOW * (stiff + (1.0 + size) * (1.0 + np.sqrt(volume)) / np.sqrt(kappa.smallest))
+    return float(NORM_ROUNDING * np.sqrt(total) + lost * np.sqrt(number) * (there > 0.0))
 
 
 def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from .companion import Companion
 from .flux import Flux
 from .shapes import best_heights, bubble_slopes, local_thirds, quadrature, third_slopes
 
-TOUCHING = 1e-12
+AT_OBSTACLE = 1e-12
 """Distance of v from α in the middle of a facet where it is meant to be α, in parts of the data."""
 
 
@@ -44,7 +44,7 @@ def cubed(cells: Cells, kappa: FloatArray, flux: Flux, v: Companion) -> Companio
         if data.condition.fixed is None:  # v need not follow α where it is above it
             middle = v.vertices[side.ends].mean(axis=0) + v.bumps[side.dofs]
             apart = np.abs(data.sign * middle - data.middle)
-            own = np.where(apart <= TOUCHING * boundary.scale, own, 0.0)
+            own = np.where(apart <= AT_OBSTACLE * boundary.scale, own, 0.0)
         thirds[side.dofs] = own
     cells.share(thirds)
     heights, bubbles = _fitted(cells, kappa, replace(v, thirds=thirds))

@@ -24,10 +24,7 @@ from .companion import Companion, bend_squares, on_facet
 from .flux import Flux, field_squares
 from .heights import distance
 from .shapes import local_thirds, quadrature
-from .sums import Sums
-
-EPS = 1e-14
-"""Rounding of an integral, relative."""
+from .sums import INTEGRAL_ROUNDING, Sums
 
 
 def integrate(
@@ -272,7 +269,7 @@ class _DualityGap:
             size = sum_rows(W) ** 2 + dot_rows(W, W)
             own = 0.5 * float(np.sum(mass * size / ((d + 1) * (d + 2))))
             totals.energy -= own
-            totals.energy_slack += EPS * own
+            totals.energy_slack += INTEGRAL_ROUNDING * own
         else:
             less = pick(self.most - self.reaction, block) * self.cells.volume[block]
             totals.energy_slack += 0.5 * float(np.sum(less * distance(c, height)))
@@ -382,7 +379,7 @@ class _DualityGap:
         own = np.einsum("qin,in->qn", edge.hats, trace_of(cells, edge.side, self.w))
         size = 0.5 * float(np.sum(steady * (edge.weights @ own**2)))
         sums.totals.energy += 0.5 * float(np.sum(apart)) - size
-        sums.totals.energy_slack += EPS * size
+        sums.totals.energy_slack += INTEGRAL_ROUNDING * size
         sums.totals.energy_slack += 0.5 * float(np.sum((most - least) * squares))
         sums.totals.companion += float(np.sum(apart))
         given = edge.taken(flux.shed, flux.beyond is not None)

@@ -297,7 +297,7 @@ class _Relaxed:
 
         down = -assembled(self.slopes(flux.excess, flux.left, np.zeros(len(self.of_edge))))
         change = np.zeros_like(down)
-        descend(self.cells, image, change, down, self.diagonal(), STEPS)
+        descend(self.cells, image, change, down, self.diagonal(), CG_STEPS)
         return self.sign * change[self.cells.facets]
 
     def slopes(self, excess: FloatArray, left: FloatArray, shed: FloatArray) -> FloatArray:
@@ -415,7 +415,7 @@ def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound:
 
 STRONG = 3.0
 """c h_T²/κ from which on c takes up what y lacks."""
-STEPS = 30
+CG_STEPS = 30
 """Of conjugate gradients, for a small field of given divergence."""
 WORTH = 1e-3
 """Part of the bound from which on what is left of the equation is carried away by y itself."""
@@ -594,7 +594,7 @@ def _diffused(cells: Cells, left: FloatArray, kappa: FloatArray) -> FloatArray:
     def image(way: FloatArray) -> FloatArray:
         return assembled(residuals(way)) + losses * way
 
-    descend(cells, image, z, down, diagonal, STEPS)
+    descend(cells, image, z, down, diagonal, CG_STEPS)
     fluxes = residuals(z) - load
     half = 0.5 * cells.over_facets(fluxes)
     half[cells.exterior] = 0.0

@@ -22,7 +22,7 @@ from ..jit import compiled
 from ..mesh.shared import shared_sum
 from ..options import DUAL, ESTIMATE_PREFIX, solve_once
 from ..vi.solved import Solved
-from .certificate import LOST, Certificate, Made
+from .certificate import UNDERFLOW, Certificate, Made
 from .companion import bend_squares
 from .duality import apart
 from .heights import distance
@@ -123,7 +123,7 @@ def lost_of_norms(made: Made, cells: Cells) -> float:
     """Bound what norms of φ and ℓ lack where squares are below all numbers; collective."""
     stiff = max(cells.comm.allgather(float(np.max(made.kappa, initial=0.0))))
     (number,) = cells.total(cells.number)
-    return float(LOST * (1.0 + np.sqrt(stiff)) * np.sqrt(number))
+    return float(UNDERFLOW * (1.0 + np.sqrt(stiff)) * np.sqrt(number))
 
 
 def through(made: Made, cells: Cells, condition: Condition) -> float:

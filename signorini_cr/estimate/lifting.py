@@ -37,7 +37,7 @@ POWERS = 0.5, 1e6
 """Between which k is."""
 END = 1e-9
 """Part of a facet where its data's limit at the end is looked for."""
-ROUNDING = 1e-11
+DATA_ROUNDING = 1e-11
 """Part of the largest value that counts as rounding of data, and as 0."""
 JUMP = 1e-9
 """Part of the largest value that counts as a jump."""
@@ -370,7 +370,7 @@ def _bounds(
     the best. With `signed` the first is an upper bound of δ itself.
     """
     boxes = pieces.boxes(cells, decide=True)
-    over = Enclosure(boxes, rounding=ROUNDING * scale)(expression)
+    over = Enclosure(boxes, rounding=DATA_ROUNDING * scale)(expression)
     at, s = pieces.parent, pieces.hats[:, 1].mean(axis=0)
     e = 0.5 * length[at] * pieces.part
     there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(expression)
@@ -397,7 +397,7 @@ def _bounds(
             size = np.fmin(above, middle + m[0][1] + e * steep)
         else:
             size = np.fmin(np.maximum(above, below), np.abs(middle) + m[0][1] + e * steep)
-            rounding = np.isinf(steep) & (size <= ROUNDING * scale)
+            rounding = np.isinf(steep) & (size <= DATA_ROUNDING * scale)
             steep, size = np.where(rounding, 0.0, steep), np.where(rounding, 0.0, size)
         low = m[0][0] - m[0][1]
         least = np.fmax.reduce(

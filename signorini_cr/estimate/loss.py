@@ -12,7 +12,7 @@ from ..arrays import FloatArray
 from ..data.diffusion import DiffusionOnMesh
 from ..data.loads import Known, Segments
 from ..data.quadrature import Coefficient
-from .duality import EPS
+from .sums import INTEGRAL_ROUNDING
 
 UNKNOWN = "{}: its coefficient is not known to be bounded, and 0 or more, on each facet"
 
@@ -76,5 +76,5 @@ def half(squares: Sequence[Segments]) -> tuple[float, float]:
     value, off = 0.0, 0.0
     for each in squares:
         value += 0.5 * float(np.sum(each.through))
-        off += 0.5 * float(np.sum(each.missed + EPS * np.abs(each.through)))
+        off += 0.5 * float(np.sum(each.missed + INTEGRAL_ROUNDING * np.abs(each.through)))
     return value, off

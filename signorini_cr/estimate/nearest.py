@@ -24,7 +24,7 @@ from ..mesh.shared import shared_maximum, shared_sum
 from ..options import COMPANION, ESTIMATE_PREFIX, solve_once
 from .functional import Masses, Slopes
 
-SHARE = 1e-10
+TOLERANCE = 1e-10
 """Part of the way, in the energy norm, that is left when the linear solver stops: equal bounds on
 any number of ranks."""
 
@@ -59,7 +59,7 @@ def nearest(
     patch = _Patch.of(cells, free_vertices, free_facets)
     A, x = patch.matrix(kappa, masses), fem.Function(patch.V)
     load, found = (ghosted_vector(patch.V, array) for array in (patch.fall(slopes), x.x.array))
-    solve_once(A, load, found, COMPANION | {"ksp_rtol": SHARE}, ESTIMATE_PREFIX)
+    solve_once(A, load, found, COMPANION | {"ksp_rtol": TOLERANCE}, ESTIMATE_PREFIX)
     release(A, load, found)
     # aggregates of fixed and free values mix what an iteration leaves of both
     x.x.array[patch.held] = 0.0

@@ -11,11 +11,10 @@ from ..data.loads import THIRD, Certain, Segments, trace_of
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
 from .certificate import Made
 from .companion import on_facet
+from .sums import INTEGRAL_ROUNDING
 
 CUSP = 0.5
 """No cusp of the height 1 is larger: t^s − t for s = ½ and ¼."""
-ROUNDING = 1e-14
-"""Rounding of ∫ ψ, in parts of ∫ |ψ|."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def in_cells(made: Made, cells: Cells, psi: Certain, there: FloatArray) -> Pairi
     return Pairing(
         float(volume @ there),
         float(volume @ load.mean),
-        float(np.sum(missed) + ROUNDING * (root @ norm)),
+        float(np.sum(missed) + INTEGRAL_ROUNDING * (root @ norm)),
         float(volume @ against),
         float(volume @ found),
         float(np.sum(unsure) + norm[lifted] @ areas),
@@ -128,7 +127,7 @@ def on_side(made: Made, cells: Cells, psi: Segments) -> Pairing:
     return Pairing(
         float(np.sum(length)),
         float(np.sum(psi.through)),
-        float(np.sum(psi.missed) + ROUNDING * np.sum(over(np.abs(psi.values)))),
+        float(np.sum(psi.missed) + INTEGRAL_ROUNDING * np.sum(over(np.abs(psi.values)))),
         float(np.sum(over(psi.values * u))),
         float(np.sum(over(psi.values * v))),
         float(unsure),

@@ -9,9 +9,9 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import Cells
 from .descent import descend, nonzero
 
-STEPS = 200
+CG_STEPS = 200
 """Of conjugate gradients, at most."""
-SHARE = 1e-20
+SQUARED_TOLERANCE = 1e-20
 """Square of the part of the way that is left when they stop: the same on any number of ranks."""
 
 
@@ -66,5 +66,5 @@ def best_heights(cells: Cells, matrix: FloatArray, pull: FloatArray, free: BoolA
     def image(way: FloatArray) -> FloatArray:
         return cells.over_facets(np.einsum("ijn,jn->in", matrix, way[cells.facets])) * free
 
-    descend(cells, image, heights, down, diagonal, STEPS, SHARE)
+    descend(cells, image, heights, down, diagonal, CG_STEPS, SQUARED_TOLERANCE)
     return heights

@@ -9,6 +9,9 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fem.cells import Cells
 
+INTEGRAL_ROUNDING = 1e-14
+"""Rounding of an integral, in parts of that of the absolute value."""
+
 
 @dataclass(eq=False)
 class Totals:

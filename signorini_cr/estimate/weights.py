@@ -29,7 +29,7 @@ from ..mesh.shared import shared_sum
 from .certificate import Made
 from .lifting import JUMP, Cubic, Lift, lift
 
-SHARE = 1e-2
+TOLERANCE = 1e-2
 """Accuracy of ‖Aℓ‖ that is enough, in parts of ‖Aφ‖, or thereabouts."""
 
 
@@ -141,7 +141,7 @@ class Weight:
         dofs = self.values.function_space.dofmap.list
         ends = self.values.x.array[dofs[side.cells[:, None], cells.others[side.local]].T]
         none, height = np.zeros(len(side.cells)), self.parts.middle - ends.mean(axis=0)
-        goal = SHARE * size / np.sqrt(max(cells.comm.allgather(made.most.max(initial=1e-300))))
+        goal = TOLERANCE * size / np.sqrt(max(cells.comm.allgather(made.most.max(initial=1e-300))))
         coarse, fine = (
             lift(cells, side, self.trace, None, Cubic(ends, bend, none), self.scale, goal, False)
             for bend in (none, height)

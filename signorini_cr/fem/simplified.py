@@ -27,7 +27,7 @@ Monomial: TypeAlias = tuple[tuple[int, Fraction], ...]
 """Atoms by number, in order, with their exponents."""
 Polynomial: TypeAlias = dict[Monomial, Fraction]
 
-MOST = 200
+MOST_TERMS = 200
 """Terms; with more of them a formula is left as it is."""
 WHOLE = 8
 """Up to this power sums are multiplied out."""
@@ -139,7 +139,7 @@ class _Reader:
         """Return the normal form."""
         if e not in self.known:
             self.known[e] = self._read(e)
-            if len(self.known[e]) > MOST:
+            if len(self.known[e]) > MOST_TERMS:
                 raise _TooLong
         return self.known[e]
 
@@ -228,7 +228,7 @@ class _Reader:
 
     def _product(self, a: Polynomial, b: Polynomial) -> Polynomial:
         found: Polynomial = {}
-        if len(a) * len(b) > MOST**2:
+        if len(a) * len(b) > MOST_TERMS**2:
             raise _TooLong
         for (m, x), (n, y) in ((s, t) for s in a.items() for t in b.items()):
             exponents = dict(m)

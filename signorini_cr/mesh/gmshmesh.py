@@ -20,7 +20,7 @@ from ..errors import InputError, naming
 from ..rounding import counted
 from . import mshfile
 from .lines import arranged, sorted_out
-from .mshfile import KINDS, MshFile
+from .mshfile import ELEMENTS, MshFile
 from .planar import overlap, pieces
 from .polygon import MOST_EDGES
 from .valid import too_thin
@@ -450,7 +450,7 @@ def _check_names(
 def _check_cells(file: MshFile) -> None:
     """Insist on triangles in the x-y plane, with straight sides, and nothing else."""
     kinds = sorted({block.kind for block in file.blocks if len(block.nodes)})
-    properties = [(kind, *KINDS[kind][:2]) for kind in kinds]
+    properties = [(kind, *ELEMENTS[kind][:2]) for kind in kinds]
     wrong = [name for _, name, dim in properties if dim == 3]
     if wrong:
         raise InputError(f"a mesh in three dimensions ({wrong[0]}): a planar one is needed")

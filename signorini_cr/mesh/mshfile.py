@@ -25,7 +25,7 @@ from .polygon import FARTHEST
 
 Array = npt.NDArray[Any]
 
-KINDS = {
+ELEMENTS = {
     1: ("Line 2", 1, 2), 2: ("Triangle 3", 2, 3), 3: ("Quadrilateral 4", 2, 4),
     4: ("Tetrahedron 4", 3, 4), 5: ("Hexahedron 8", 3, 8), 6: ("Prism 6", 3, 6),
     7: ("Pyramid 5", 3, 5), 8: ("Line 3", 1, 3), 9: ("Triangle 6", 2, 6),
@@ -50,7 +50,7 @@ class Block(NamedTuple):
     """Elements of one type with the same physical groups.
 
     Attributes:
-        kind: gmsh's element type, a key of `KINDS`.
+        kind: gmsh's element type, a key of `ELEMENTS`.
         groups: Tags of the physical groups of the type's dimension.
         nodes: Tags of the nodes, shape (elements, nodes of the type).
     """
@@ -78,12 +78,12 @@ class MshFile(NamedTuple):
     def groups(self, dim: int) -> list[int]:
         """Return the tags of the physical groups of one dimension."""
         named = {tag for d, tag in self.names if d == dim}
-        return sorted(named.union(*(b.groups for b in self.blocks if KINDS[b.kind][1] == dim)))
+        return sorted(named.union(*(b.groups for b in self.blocks if ELEMENTS[b.kind][1] == dim)))
 
     def elements(self, kind: int, group: int | None = None) -> Int64Array:
         """Return the node tags of all elements of a type, or of those in one physical group."""
         found = [b.nodes for b in self.blocks if b.kind == kind and group in (None, *b.groups)]
-        return np.concatenate([np.empty((0, KINDS[kind][2]), dtype=np.int64), *found])
+        return np.concatenate([np.empty((0, ELEMENTS[kind][2]), dtype=np.int64), *found])
 
 
 class _Damaged(Exception):
@@ -504,8 +504,8 @@ class _Reader:
                 dim, entity, kind, count = source.take("iiin")
                 source.end_row()
                 width = self.nodes_of(kind)
-                if KINDS[kind][1] != dim:
-                    raise _Damaged(f"{KINDS[kind][0]} elements in a block of dimension {dim}")
+                if ELEMENTS[kind][1] != dim:
+                    raise _Damaged(f"{ELEMENTS[kind][0]} elements in a block of dimension {dim}")
                 if self.groups is not None and (dim, entity) not in self.groups:
                     raise _Damaged(f"{DIMENSIONS[dim]} {entity} is not among $Entities")
                 groups = (self.groups or {}).get((dim, entity), frozenset())
@@ -553,13 +553,13 @@ class _Reader:
             if len(words) < 3 or not (words[1].isdigit() and words[2].isdigit()):
                 source.fail("an element's number, type and tags are expected")
             kind, labels = int(words[1][:9]), int(words[2][:9])
-            if kind not in KINDS:
+            if kind not in ELEMENTS:
                 source.fail(f"there is the type {kind}, which is unknown here")
-            if len(words) != 3 + labels + KINDS[kind][2]:
-                source.fail(f"{3 + labels + KINDS[kind][2]} numbers are expected")
+            if len(words) != 3 + labels + ELEMENTS[kind][2]:
+                source.fail(f"{3 + labels + ELEMENTS[kind][2]} numbers are expected")
             alike.setdefault((kind, labels), []).append(line)
         for (kind, labels), found in alike.items():
-            values = _parsed(found, 3 + labels + KINDS[kind][2], "n")
+            values = _parsed(found, 3 + labels + ELEMENTS[kind][2], "n")
             if values is None:
                 raise _Damaged("whole numbers are expected")
             self.add(kind, labels, values[:, 2:])
@@ -574,9 +574,9 @@ class _Reader:
 
     @staticmethod
     def nodes_of(kind: int) -> int:
-        if kind not in KINDS:
+        if kind not in ELEMENTS:
             raise _Damaged(f"there are elements of the type {kind}, which is unknown here")
-        return KINDS[kind][2]
+        return ELEMENTS[kind][2]
 
     @staticmethod
     def insist_count(announced: int, found: int, what: str) -> None:

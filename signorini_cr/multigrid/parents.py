@@ -29,7 +29,7 @@ from ..mesh.shared import shared_maximum, shared_sum
 _DIRECTION = np.sqrt([2.0, 3.0, 5.0])
 """No edge or median of a cell is at right angles to it, unless on purpose."""
 
-ROUNDING = 1e-6
+COORDINATE_ROUNDING = 1e-6
 """Barycentric coordinates below this are 0: far from the origin few digits of a cell are left."""
 
 
@@ -259,7 +259,7 @@ class Parents:
         if fine.cr:  # facet midpoints
             at = (at.sum(axis=1, keepdims=True) - at) / d
         weights = 1.0 - d * at if coarse.cr else at.copy()
-        weights[np.abs(weights) < ROUNDING] = 0.0
+        weights[np.abs(weights) < COORDINATE_ROUNDING] = 0.0
         return weights
 
 

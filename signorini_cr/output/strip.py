@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from ..solution import Solution
 
-MOST = 6
+MOST_MOMENTS = 6
 """Moments in a strip."""
 
 PIXELS = 600
@@ -88,7 +88,7 @@ def from_arrays(arrays: Mapping[str, Any]) -> list[Moment]:
 
 def chosen(steps: int) -> set[int]:
     """Choose the steps of so many that a strip shows, evenly apart, first and last among them."""
-    return set(np.rint(np.linspace(1, steps, min(MOST, steps))).astype(int).tolist())
+    return set(np.rint(np.linspace(1, steps, min(MOST_MOMENTS, steps))).astype(int).tolist())
 
 
 def moment(time: float, solution: Solution) -> Moment:

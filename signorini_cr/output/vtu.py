@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 CELL_TYPES = {2: 3, 3: 5, 4: 10}
 """VTK's numbers for interval, triangle and tetrahedron, by the number of corners."""
 
-KINDS = {"f": "Float", "i": "Int", "u": "UInt"}
+NUMBERS = {"f": "Float", "i": "Int", "u": "UInt"}
 """VTK's names for NumPy's kinds of numbers."""
 
 HEAD = """<?xml version="1.0"?>
@@ -146,7 +146,7 @@ def _write(
     for tag, group in groups.items():
         head += f"<{tag}>\n"
         for name, values in group.items():
-            kind = f"{KINDS[values.dtype.kind]}{8 * values.dtype.itemsize}"
+            kind = f"{NUMBERS[values.dtype.kind]}{8 * values.dtype.itemsize}"
             shape = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
             texts.append(f'{head}<DataArray type="{kind}" Name="{name}"{shape} format="binary">')
             arrays.append(values)

@@ -23,20 +23,17 @@ from ..multigrid.constrained import ConstrainedMatrix
 from .active import ActiveSet
 from .bounds import Bounds
 from .reduced import ReducedSolver
-from .stopping import BOTTOM, FORCES, LOST, TOUCHING, Stiffness
+from .stopping import BOTTOM, FORCES, GAIN, LOST, TOUCHING, Stiffness
 from .system import DATUM, Vectors
 
 SETS = 40
 """Active sets that are tried."""
 
-ROUNDS = 20
+REFINEMENTS = 20
 """Refinements in each."""
 
 KNOWN = 1e-2
 """Change that a refinement may make, in parts of what may be wrong with the forces."""
-
-GAIN = 0.5
-"""Part of what is wrong that a refinement must take away to be worth another one."""
 
 REMAINDER = 1e-9
 """Forces below this part of the loads on their rows, with which others nearly cancel, are measured
@@ -168,7 +165,7 @@ class Extended:
         self._remainder.array[dofs] = 0.0
         self._compute_residual()
         changed: FloatArray = np.full(self._stiffness.number, np.inf)
-        for _ in range(ROUNDS):
+        for _ in range(REFINEMENTS):
             before, last = self.residual.array_r[self.active.bounded].copy(), changed
             step = self._linear.correction(self.active, self.residual)
             moved = np.abs(step.array_r[self.active.bounded])

@@ -37,10 +37,10 @@ from .level import Level
 from .solved import Solved
 from .system import System
 
-ENOUGH = 0.5
+TRUSTED = 0.5
 """Part of the parent's force from which on the residual is left as the prolongation has it."""
 
-ROUNDS = 3
+SWEEPS = 3
 """Neighbours share facets, so that corrections disturb one another a little."""
 
 
@@ -173,11 +173,11 @@ def _make_forces(
     free[system.dirichlet] = free[system.bounded] = False
     side, force = expected.side, expected.force
     surplus = side * (operator.times(vector) - b) - force
-    weak = (force > 0.0) & (surplus < (ENOUGH - 1.0) * force)
+    weak = (force > 0.0) & (surplus < (TRUSTED - 1.0) * force)
     movable = free[others] & weak[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
     layout, moves = Layout.of_space(V), np.zeros(len(free))
-    for _ in range(ROUNDS):
+    for _ in range(SWEEPS):
         shift = side * surplus / operator.diagonal * (others.shape[1] - 1) / number
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
         start.x.array[:] += layout.shared_sum(moves)

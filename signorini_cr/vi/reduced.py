@@ -47,13 +47,13 @@ FLOOR = 1e-10
 DIGITS = 1e-6
 """Part of the residual that a correction may leave."""
 
-MOST = 100
+CG_STEPS = 100
 """CG steps of one correction; the next one goes on."""
 
 CAREFUL = 15
 """Newton steps after which a step must lower the energy: sets of active dofs may come back else."""
 
-ENOUGH, HALVES = 0.1, 40
+ARMIJO, HALVES = 0.1, 40
 """Part of what the slope promises by which it must, and how often a step is halved for that."""
 
 Reason = PETSc.KSP.ConvergedReason
@@ -227,7 +227,7 @@ class ReducedSolver:
             way.array[at] = moved - x[at]
             self.matrix.mult(way, image)
             slope = self._residual.dot(way)
-            if slope + 0.5 * way.dot(image) <= ENOUGH * slope:
+            if slope + 0.5 * way.dot(image) <= ARMIJO * slope:
                 break
             share *= 0.5
         clipped = bool((moved != x[at] - share * self._step.array_r[at]).any())
@@ -274,7 +274,7 @@ class ReducedSolver:
                 return Reason.DIVERGED_NANORINF
             if norm <= DIGITS * start:
                 return Reason.CONVERGED_RTOL
-            return Reason.ITERATING if iteration < MOST else Reason.CONVERGED_ITS
+            return Reason.ITERATING if iteration < CG_STEPS else Reason.CONVERGED_ITS
 
         with self._cycle.constrained(active.dofs, deep=self._uses_cycle):
             self.ksp.setConvergenceTest(test)

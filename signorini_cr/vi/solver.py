@@ -29,7 +29,7 @@ from .active import ActiveSet
 from .bounds import Bounds
 from .extended import DataRounding, Extended
 from .reduced import LINEAR_SHARE, SET_SHARE, FullJacobian, ReducedSolver
-from .stopping import FLOWS, FORCES, LOST, NOISE, ROUNDED, STORED, TOUCHING, Stiffness
+from .stopping import FLOWS, FORCES, GAIN, LOST, NOISE, ROUNDED, STORED, TOUCHING, Stiffness
 from .system import DATUM, Vectors
 
 SET_TOLERANCE = 0.01
@@ -55,9 +55,6 @@ PASSES = 6
 
 SWAPS = 10
 """Times that dofs may turn out to be in the wrong set when all else is well."""
-
-GAIN = 0.5
-"""Part of what is wrong that a refinement must take away, or rounding is at work."""
 
 DIVERGED_NAN, DIVERGED_ROUNDING = -4, -5
 """PETSc's number for what is not finite, whose name depends on the version, and for "no gain"."""

@@ -56,7 +56,7 @@ BOTTOM = 10.0 ** -(BAND * (BANDS - 1))
 made of: where the last of the bands begins. Where u falls off by many orders of magnitude, or
 flows are what rounding makes of none, there is no end below."""
 
-PART = 1e-2
+LEAST_MEASURE = 1e-2
 """Least size that forces are measured against, in parts of what their class's rows are made of;
 but in the first, which are made of most."""
 
@@ -74,6 +74,10 @@ NOISE = 4.0 * 2.0**-53
 
 STORED = NOISE / 32.0
 """Error of a row of A x, in parts of |A| |x|, as x is stored with 53 digits: as measured."""
+
+GAIN = 0.5
+"""Part of what is wrong that a refinement must take away to be worth another one; else rounding is
+at work."""
 
 LOST = 10.0
 """Forces whose sum is below so many times their rounding are lost in it."""
@@ -171,7 +175,7 @@ class Stiffness:
         band = np.clip(decades / BAND, 0, BANDS - 1).astype(np.intp)
         self.bounded = BANDS * self._kind + band
         self.made_of = self.totals(made_of)
-        self.least = PART * self.made_of
+        self.least = LEAST_MEASURE * self.made_of
         self.least[::BANDS] = 0.0
 
     def sums(self, values: FloatArray) -> FloatArray:

@@ -27,12 +27,12 @@ from ..options import MATRICES, defaults
 from .bounds import Bounds
 from .stopping import windows
 
-ROUNDING = 1e-5
+LEAST_SCALE = 1e-5
 """Least scale, in parts of what it would be from zero: A u is not known to all digits of u."""
 
 TINY = 1e-130
 """Loads that are smaller count as 0: their squares are multiplied with small numbers, and are lost.
-A bound of the error counts them, and what it can't count, see `estimate.certificate.LOST`."""
+A bound of the error counts them, and what it can't count, see `estimate.certificate.UNDERFLOW`."""
 
 NOTHING = 1e-100
 """Largest change of u by such a load: one that does more does so as κ is as small."""
@@ -345,7 +345,7 @@ class System:
         with np.errstate(over="ignore", invalid="ignore"):
             squares = np.array([each @ each for each in residuals])
         norms = np.sqrt(summed(comm, squares))
-        scale = norms[0] if self.offset else max(norms[0], ROUNDING * norms[-1])
+        scale = norms[0] if self.offset else max(norms[0], LEAST_SCALE * norms[-1])
         if self.drifts:  # loads are what is left where u is 0
             scale = norms[-1]
         if not np.isfinite(norms).all():

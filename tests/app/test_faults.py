@@ -104,7 +104,7 @@ def test_where_memory_ends_at_the_beginning_one_message_tells(most: int, tmp_pat
     program = f"import resource\nresource.setrlimit(resource.RLIMIT_AS, ({most}, {most}))"
     done = helpers.altered(tmp_path, kills.CASE.replace("9", "1"), program, "-q")
     if done.returncode == 0:
-        assert most > memory.LEAST
+        assert most > memory.LEAST_SPACE
         return
     words = " ".join(done.stderr.split())
     assert done.returncode == cli.NOT_CONVERGED, words

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from signorini_cr import InputError, Problem, solve
 from signorini_cr.output import canvas
 from signorini_cr.output.plots import drawn
-from signorini_cr.output.strip import MOST, chosen, moment, plot_strip
+from signorini_cr.output.strip import MOST_MOMENTS, chosen, moment, plot_strip
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +20,7 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parametrize("steps", [1, 2, 5, 6, 7, 24, 1000])
 def test_first_and_last_are_among_the_steps_chosen(steps):
     found = sorted(chosen(steps))
-    assert found[0] == 1 and found[-1] == steps and len(found) == min(MOST, steps)
+    assert found[0] == 1 and found[-1] == steps and len(found) == min(MOST_MOMENTS, steps)
     if steps > 1:
         assert np.ptp(np.diff(found)) <= 1
 
