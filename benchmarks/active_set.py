@@ -43,7 +43,7 @@ def forces(solution: Solution) -> npt.NDArray[np.float64]:
 
 
 def wrong(solution: Solution, exact: Solution) -> str:
-    """How many facets are in another set than in the exact solution, and what is at stake."""
+    """Count the facets in another set than in the exact solution, and say what is at stake."""
     mine, other = forces(solution), forces(exact)
     differ = (mine > 0.0) != (other > 0.0)
     number = comm.allreduce(int(differ.sum()))

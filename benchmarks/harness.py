@@ -1,4 +1,4 @@
-"""What all benchmarks share: their command line, turns, processes, medians and tables.
+"""Tools that all benchmarks share: their command line, turns, processes, medians and tables.
 
 Nothing here starts MPI, as mpirun cannot be started from a process that has: what needs it is in
 `cases.py`.
@@ -24,7 +24,7 @@ Key = TypeVar("Key", bound=Hashable)
 Found = TypeVar("Found")
 
 PUBLISHED = Path(__file__).parent / "results"
-"""What the documents quote; written to with `--publish` and never else."""
+"""Folder of the results that documents quote; written to with `--publish` and never else."""
 
 NEVER = -1
 """For glibc's mallopt: memory is not given back."""
@@ -128,7 +128,7 @@ def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def machine() -> str:
-    """What was measured on: processor, cores, Python, and the day."""
+    """Say what was measured on: processor, cores, Python, and the day."""
     model, info = platform.machine(), Path("/proc/cpuinfo")
     if info.exists():
         names = [line for line in info.read_text().splitlines() if line.startswith("model name")]

@@ -41,7 +41,7 @@ SHOWN = 4e4
 """Meshes with more dofs are in the table and in the picture."""
 
 LARGE = 3e5
-"""What is claimed of times is so from so many dofs on."""
+"""Dofs from which on the claims about times hold."""
 
 ALIKE = {
     "S1, A, C 7/2, C 11/2": ("S1", "A", "C 7/2", "C 11/2"),
@@ -110,7 +110,7 @@ def product(A: PETSc.Mat) -> float:
 
 
 def facts(solution: Solution) -> dict[str, float]:
-    """What one mesh shows in one repetition."""
+    """Return the figures of one mesh in one repetition."""
     memory = peak()
     linear, linear_cg = solved_once(solution)
     times = {name: slowest(value) for name, value in solution.seconds.items()}

@@ -46,7 +46,7 @@ CYCLES = (*WHAT, "dofs", "grids", "own cycle, ms", "PCMG, ms", "PCMG / own", "di
 FIRST = ("first of all, ms: own / PCMG", "first, ms: own / PCMG", "Newton / CG", "solve, ms")
 SOLVES = (*WHAT, "made in, ms", *FIRST, "with PCMG / own", "without transfers")
 KINDS = ("matrices", "shells")
-"""What PCMG has for transfers."""
+"""Kinds of transfers that PCMG has."""
 
 PREFIX = "pcmg_"
 

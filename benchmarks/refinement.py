@@ -22,11 +22,11 @@ from harness import command_line, head, in_turns, keep, keep_memory, launched, l
 TURNS, REPEATS = 3, 3
 """New processes for each way, and what each of them repeats."""
 WAYS = ("handed over", "looked for")
-"""How the facets come about."""
+"""Origins of the facets."""
 
 
 def run(way: str, dofs: float) -> None:
-    """What one process does; rank 0 prints the cells, and seconds of refinements and of solves."""
+    """Run one process; rank 0 prints the cells, and seconds of refinements and of solves."""
     from cases import comm, timed
 
     from signorini_cr import compat, exact, solve_levels

@@ -35,7 +35,7 @@ WAYS: dict[str, Way] = {
     "again": lambda A, dofs, known: A.createSubMatrix(dofs, dofs, known),
     "virtual": lambda A, dofs, _: PETSc.Mat().createSubMatrixVirtual(A, dofs, dofs),
 }
-"""How a matrix, the dofs, and a submatrix of them give a submatrix.
+"""Ways to make a submatrix from a matrix, the dofs, and a submatrix of them.
 
 Whatever petsc4py says, `createSubMatrix` takes all columns where none are named.
 """

@@ -48,7 +48,7 @@ def heat(x, t):
 
 
 class ByHand:
-    """What one writes: `__init__`, `load` and `solve`."""
+    """A solver as one writes it by hand: `__init__`, `load` and `solve`."""
 
     def __init__(self, domain: Domain, steps: int):
         """Assemble the matrix."""

@@ -67,7 +67,7 @@ class Solve:
 
 
 def run(name: str) -> None:
-    """What one process does; rank 0 prints its solves as JSON."""
+    """Run one process; rank 0 prints its solves as JSON."""
     import numpy as np
     from cases import cases, comm, slowest, timed
 
@@ -194,7 +194,7 @@ def by_bandwidth(points: list[Point]) -> Iterator[list[str]]:
 
 
 def picture(cases: list[Case], path: Path) -> None:
-    """How much faster each solve on two ranks was, over its bandwidth."""
+    """Draw how much faster each solve on two ranks was, over its bandwidth."""
     from signorini_cr.output import canvas
 
     points = sorted((p for case in cases for p in case.points()), key=lambda p: p.memory)

@@ -54,7 +54,7 @@ class Run:
 
     @property
     def title(self) -> str:
-        """What stands above the column."""
+        """The heading of the column."""
         words = [f"{self.levels} mesh" + "es" * (self.levels > 1)]
         words += ["the first time"] * self.fresh + [f"{self.ranks} ranks"] * (self.ranks > 1)
         return ", ".join(words)
@@ -95,7 +95,7 @@ class Clock:
 
 
 def run(meshes: int, folder: str, began: float) -> None:
-    """What a process does; rank 0 prints its times as JSON."""
+    """Run one process; rank 0 prints its times as JSON."""
     clock = Clock()
     clock.seconds[PACKAGES] = time.time() - began
     with clock.part(PACKAGES):

@@ -99,7 +99,7 @@ study.picture(
 
 
 def draw(left, right):
-    """What is left of the errors when the expected power of N is taken out."""
+    """Draw what is left of the errors when the expected power of N is taken out."""
     for axes, norm, power, label in (
         (left, "h1", 0.5, r"$\sqrt{N}\,\|u-u_h\|_h$"),
         (right, "l2", 1.0, r"$N\,\|u-u_h\|$"),

@@ -99,7 +99,7 @@ assert abs(exits[-1] - exit_height(12.0)) < solution.h
 
 # %%
 def draw_bank(field, beside, table):
-    """What leaves the bank at which height."""
+    """Draw what leaves the bank at which height."""
     field.set_ylabel("height above the river in m", fontsize=13)
     order = np.argsort(table["y"])
     y, flow = table["y"][order], -table["pressure"][order]
@@ -168,7 +168,7 @@ assert np.abs(flows / discharge(expected) - 1.0).max() < 1e-3 * solution.h
 
 # %%
 def draw(axes):
-    """What leaves at which head."""
+    """Draw what leaves at which head."""
     fine = np.linspace(0.4, 9.4, 200)
     dupuit = CONDUCTIVITY * (heads * THICKNESS - THICKNESS**2 / 2) / LENGTH
     axes.plot(head(fine), discharge(fine), color=canvas.BLUE)

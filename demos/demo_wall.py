@@ -64,12 +64,12 @@ class Totals:
 
 
 def stored(u, domain):
-    """What the ground holds above the sea's mean, in m³."""
+    """Return what the ground holds above the sea's mean, in m³, as a form."""
     return CAPACITY * u * ufl.dx(domain.mesh)
 
 
 def leaked(u, domain):
-    """What goes to the land, in m³/h."""
+    """Return what goes to the land, in m³/h, as a form."""
     ds = ufl.Measure("ds", domain.mesh, subdomain_data=domain.tags)
     return LEAK * u * ds(domain.parts["land"])
 

@@ -1,4 +1,4 @@
-"""What the demos share: runs over a sequence of meshes, tables, pictures, and where they go.
+"""Tools that the demos share: runs over a sequence of meshes, tables, pictures, and their folder.
 
 A demo takes a folder as its argument (`demo-output` without one) and leaves there its pictures
 and its tables, as Markdown. SIGNORINI_DEMO_LEVELS in the environment limits the number of meshes.
@@ -51,14 +51,14 @@ COLOURS = (
 MARKERS = "osD^vP*X"
 
 ENDS = "contact begins or ends"
-"""What pictures of a solution call such points."""
+"""Name of such points in pictures of a solution."""
 
 CALLED = {"C": "C 7/2", "C2": "C 11/2"}
-"""What examples are called where their names in `exact.ALL` say too little."""
+"""Names of examples whose names in `exact.ALL` say too little."""
 
 
 def called(name: str) -> str:
-    """What an example is called in tables and pictures."""
+    """Return the name of an example in tables and pictures."""
     return CALLED.get(name, name)
 
 
@@ -77,7 +77,7 @@ LARGE = 100_000
 
 @dataclass(frozen=True)
 class Row:
-    """What is kept of a solution; None or not a number where it is not known."""
+    """Figures of a solution; None or not a number where one is not known."""
 
     h: float
     cells: int

@@ -26,15 +26,15 @@ from signorini_cr import (
 COMM = MPI.COMM_WORLD
 
 SLACK = 1e-7
-"""What the integration of the exact error may be wrong by, relative."""
+"""Error that the integration of the exact error may have, relative."""
 NEARLY = 1e-8
 """The same for J(u), relative to what it is made of."""
 MISSING = 0.05
 """Part of the cases of a class that may be left without bounds."""
 LEAST = 1e-12
-"""What is found wrong with a solution is told from here on; below it depends on the machine."""
+"""Least fault of a solution that is told; below it depends on the machine."""
 SOLVES = 1e-7
-"""What `Exact.checked` may find wrong with a solution."""
+"""Fault that `Exact.checked` may find in a solution."""
 
 Run = Callable[[Exact], Solution]
 

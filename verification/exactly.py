@@ -27,7 +27,7 @@ Corner = tuple[float, float, float]
 GAUSS = 8
 """Points in each direction: exact to degree 14."""
 DEEPEST = 40
-"""How often a triangle is cut in four at most."""
+"""Times that a triangle is cut in four at most."""
 
 
 def split(triangles: FloatArray, owner: IntArray, line: Line) -> tuple[FloatArray, IntArray]:

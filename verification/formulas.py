@@ -47,7 +47,7 @@ Formula = Callable[[Any, Any, Any, Sequence[Any]], Any]
 
 
 def symbolic(formula: Formula, mesh: Mesh, parameters: Sequence[float]) -> Callable[[Any], Any]:
-    """What `signorini_cr.Problem` takes: a function of x = ufl.SpatialCoordinate.
+    """Make of a formula what `signorini_cr.Problem` takes: a function of x = ufl.SpatialCoordinate.
 
     Args:
         formula: Evaluated with UFL.

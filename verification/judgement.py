@@ -13,12 +13,12 @@ from signorini_cr import Domain, NotConverged, Problem, Solution, solve_levels
 EXACT = 1e-6
 """Largest error of the contact forces, relative, their sum and the sum of all facets' errors."""
 NEAR = 1e-6
-"""How far transition points may be off, in parts of the facet's length."""
+"""Error that transition points may have, in parts of the facet's length."""
 NOTHING = 1e-12
-"""Where nothing touches, forces of this part of what they are made of are none."""
+"""Part of what forces are made of that counts as none where nothing touches."""
 EPSILON = float(np.finfo(float).eps)
 STANDING = 1e-9
-"""What the reference's last refinement may have changed of the forces, relative."""
+"""Change of the forces by the reference's last refinement at most, relative."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,13 @@ class Verdict:
 
     @property
     def right(self) -> bool:
-        """Whether it is what the reference says."""
+        """True if it is what the reference says."""
         apart = self.transitions > NEAR
         return not (self.refused or self.fault or self.facets or apart) and self.exact
 
     @property
     def exact(self) -> bool:
-        """Whether the forces are."""
+        """True if the forces are."""
         return self.error <= EXACT and self.total <= EXACT
 
 
@@ -102,7 +102,7 @@ class Judge:
         self._asked = False
 
     def twice(self) -> float:
-        """How far the reference is from itself started from the opposite set; rank 0."""
+        """Compute how far the reference is from itself started from the opposite set; rank 0."""
         assert self._cells is not None and self._found is not None
         other = Discrete(self._cells, self.data).solve(start=True)
         size = self._size(self._found)
@@ -153,7 +153,7 @@ class Judge:
         )
 
     def _size(self, found: Found) -> float:
-        """What errors of the forces are relative to.
+        """Return the scale of errors of the forces.
 
         Their sum; not less than what the rounding of data in double precision makes of them, unless
         the judgement is bare.
@@ -167,7 +167,7 @@ class Judge:
 
 
 def _apart(points: FloatArray, found: Found) -> float:
-    """How far points are from the reference's transition points; ∞ if their numbers differ."""
+    """Compute how far points are from the reference's transitions; ∞ if their numbers differ."""
     expected, length = found.transitions
     if len(points) != len(expected):
         return np.inf

@@ -67,7 +67,7 @@ class Exact:
         return Polygon(np.array(self.vertices), self.boundary)
 
     def problem(self, domain: Domain) -> Problem:
-        """What the program gets: the data, not the solution."""
+        """Return the program's part: the data, not the solution."""
         keys = {"f": 0.0, "g": 0.0, "obstacle": 0.0, "dirichlet": 0.0, "coefficient": 1.0}
         data: dict[str, Any] = {}
         for key, number in keys.items():
@@ -132,7 +132,7 @@ class Exact:
         return total
 
     def checked(self) -> float:
-        """How far this is from a solution: the largest of several relative figures."""
+        """Compute how far this is from a solution: the largest of several relative figures."""
         n = 7
         i, j = np.meshgrid(np.arange(n), np.arange(n))
         v = np.array(self.vertices)
@@ -845,4 +845,4 @@ CLASSES: dict[Callable[[np.random.Generator], Exact], int] = {
     waves: 60,
     coefficient_slow: 90,
 }
-"""What makes a problem of each class, and how many are made."""
+"""Functions that make a problem of each class, and the numbers that are made."""

@@ -245,7 +245,7 @@ class Discrete:
         return self.matrix.diagonal()[self.contact]
 
     def _transitions(self, active: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Where u_h − α changes its sign on the half of a free facet that is next to contact.
+        """Find where u_h − α changes its sign on the half of a free facet that is next to contact.
 
         Else it is the vertex between the two. u_h is that of the free facet's cell.
         """

@@ -1,4 +1,4 @@
-"""What a group of cases came to, and the document that tells it."""
+"""The results of a group of cases, and the document that tells them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Row:
 
     @property
     def passed(self) -> bool:
-        """Whether none failed, and there were any."""
+        """True if none failed, and there were any."""
         return self.cases > 0 and not self.failures
 
 

@@ -1,4 +1,4 @@
-"""How near bounds are to errors where coefficients jump, cells are thin, or corners are sharp."""
+"""Sharpness of bounds where coefficients jump, cells are thin, or corners are sharp."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMM = MPI.COMM_WORLD
 GOAL = 1.5
 """Bound over error in the energy norm, at most."""
 WITHIN = 0.01
-"""How much more than the published figures it may be."""
+"""Excess over the published figures that it may have."""
 SLACK = 1e-6
 
 
@@ -175,7 +175,7 @@ KELLOGG = Harmonic(
 
 
 def _kellogg_transmits() -> float:
-    """How far u and κ∂ₙu are from the same on both sides of the axes; relative."""
+    """Compute how far u and κ∂ₙu are from the same on both sides of the axes; relative."""
     worst = 0.0
     for k in range(4):
         angle, other = (k + 1) * np.pi / 2, (k + 1) % 4
@@ -188,7 +188,7 @@ def _kellogg_transmits() -> float:
 
 
 def _angles(x: Any) -> tuple[Any, Any, Any]:
-    """Whether |y| > |x|, and the angles from the axes of x and y, without atan2.
+    """Tell whether |y| > |x|, and the angles from the axes of x and y, without atan2.
 
     Where the other one is asked for they are 0: nothing is divided by 0.
     """

@@ -73,7 +73,7 @@ def squashed(domain: Domain, factor: float) -> Domain:
 
 
 def tell(case: Case, way: str, verdict: Verdict) -> str:
-    """What went wrong, in a line."""
+    """Say what went wrong, in a line."""
     words = f"{case.name}, {way}: "
     if verdict.fault:
         return words + verdict.fault

@@ -44,9 +44,9 @@ CORNERS = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
 KINDS = ["contact", "dirichlet", "neumann", "robin"]
 NORMALS = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 SIZES = (0.0, 1.0, 1e2, 1e4, 1e6, 1e8)
-"""What c and b are."""
+"""Values of c and b."""
 GAP = 0.1
-"""How far u is above the obstacle, in parts of what the pressure is where they touch."""
+"""Distance of u from the obstacle, in parts of what the pressure is where they touch."""
 BETWEEN = 0.3
 """m, in parts of the wave's amplitude."""
 MOST = 1.3
@@ -55,7 +55,7 @@ MOST = 1.3
 
 @dataclass(frozen=True)
 class Side:
-    """What holds on an edge of the square.
+    """Conditions on an edge of the square.
 
     Attributes:
         kind: "contact", "dirichlet", "neumann" or "robin".
@@ -75,7 +75,7 @@ class Side:
 
     @property
     def middle(self) -> float:
-        """Where λ = 0 between the bounds."""
+        """Value of s up to which λ = 0 between the bounds."""
         return (BETWEEN if self.bounds == "both" else -self.pressed) * self.wave[0]
 
     def pressure(self, s: Any, largest: Callable[[Any, Any], Any] = np.maximum) -> Any:
@@ -484,7 +484,7 @@ class Waving(Leaky):
 
 
 CUT = 0.55
-"""Where the line that cuts c off meets y = 0."""
+"""Place where the line that cuts c off meets y = 0."""
 
 
 class Alone(Case):
@@ -776,7 +776,7 @@ def _drawn(seed: int, number: int, kind: type[Case], name: str) -> Row:
 
 
 Found = Iterator[tuple[str, force.Interval, float]]
-"""What was asked for, its interval and the exact number."""
+"""The quantities asked for, each with its interval and the exact number."""
 
 
 def _intervals(
@@ -981,7 +981,7 @@ def terms(seed: int, quick: bool) -> Group:
 
 
 def quantities(seed: int, quick: bool) -> Group:
-    """What flows through parts, and integrals, of such problems."""
+    """Check fluxes through parts, and integrals, of such problems."""
     return Group(
         "quantities",
         "Forces, fluxes, means and integrals",

@@ -76,7 +76,7 @@ SPAN = 64.0
 """Length of the first intervals in parts of that, at least: u_D must have room to fall."""
 
 LOOKS = 16
-"""Into how many parts a facet's edge is cut by the points at which two bounds are compared."""
+"""Parts that a facet's edge is cut into by the points at which two bounds are compared."""
 
 FACTORISED = 100_000
 """Largest matrix of a form of the user's own that is looked at for eigenvalues below 0."""
@@ -219,7 +219,7 @@ def differs(
 
 @dataclass(frozen=True)
 class Precision:
-    """By how much coordinates may be wrong.
+    """Errors that coordinates may have.
 
     Attributes:
         vertices: Of vertices, as they were given or made by a mesh generator.

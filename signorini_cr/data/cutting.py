@@ -38,7 +38,7 @@ IN_VAIN = 3
 ROOMY, STEEP = 10, 1.2
 """More room for pieces where errors fall faster than with this power of their number."""
 MUCH = 1.5
-"""For how large a sum of errors, 1 being the goal, there is more room."""
+"""Sum of errors, 1 being the goal, for which there is more room."""
 ACROSS = 1.15
 """Factor by which errors must fall better than by quarters for a cut across an axis."""
 DEEP = 60.0
@@ -46,7 +46,7 @@ DEEP = 60.0
 DONE = 0.5
 """Sum of errors at which it ends."""
 FALL = 4.0
-"""By how much errors fall where pieces are cut, at least, as a rule."""
+"""Factor by which errors fall where pieces are cut, at least, as a rule."""
 IDLE = 0.25
 """Exponent of the number of pieces by which a cut lowers the error that does little."""
 _FEW = 1e-9
@@ -200,7 +200,7 @@ def refine(
 
 
 class _Room:
-    """At how many pieces it ends: later where errors fall faster than the number grows."""
+    """Number of pieces at which it ends: later where errors fall faster than the number grows."""
 
     def __init__(self, pieces: int):
         """Begin with what is usual."""

@@ -115,7 +115,7 @@ STRIP = 1e-13
 """Rounding of a coordinate, in parts of it."""
 
 STEPS = 6
-"""To where a condition changes, by a fixed slope: on small pieces a step leaves little."""
+"""Steps to where a condition changes, by a fixed slope: on small pieces a step leaves little."""
 
 ALWAYS = np.array(True)
 """Branches that are joined continuously wherever they meet."""

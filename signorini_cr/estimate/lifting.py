@@ -34,7 +34,7 @@ QUARTERS = 2
 HALVINGS = 30
 """Most halvings of those on which data are not shown to be below others."""
 POWERS = 0.5, 1e6
-"""Between which k is."""
+"""Least and largest k."""
 END = 1e-9
 """Part of a facet where its data's limit at the end is looked for."""
 DATA_ROUNDING = 1e-11

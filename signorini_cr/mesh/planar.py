@@ -23,7 +23,7 @@ _NEAR = 1e-12
 """Distance from a line, in parts of the lengths at hand, that counts as none."""
 
 _DIRECTION = np.array([0.8090, 0.5878])
-"""In which sides are ordered; few domains have many sides across it."""
+"""Direction in which sides are ordered; few domains have many sides across it."""
 
 _AT_A_TIME = 1_000_000
 """Pairs of sides looked at together."""

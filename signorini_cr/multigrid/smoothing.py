@@ -157,7 +157,7 @@ class Jacobi:
 
 
 SMOOTHERS: dict[str, type[Smoother]] = {"gauss-seidel": GaussSeidel, "jacobi": Jacobi}
-"""By what ``-signorini_smoother`` calls them; the first is the default."""
+"""Smoothers by what ``-signorini_smoother`` calls them; the first is the default."""
 
 
 def smoother(matrix: PETSc.Mat, dofs: Layout, sweeps: int) -> Smoother:
