@@ -76,7 +76,7 @@ def frames(page: Path) -> list[Path]:
 
 
 def complaints(frame: Path, dom: str) -> list[str]:
-    """What is wrong with a page, by the DOM of one of its frames."""
+    """Find what is wrong with a page, by the DOM of one of its frames."""
     found = re.findall('<pre id="measured">(.*?)</pre>', dom)
     if len(found) != 1:
         return ["nothing has been measured"]

@@ -1,4 +1,4 @@
-"""What all tests share: a time limit, one folder for all ranks, the marker `serial`."""
+"""Tools that all tests share: a time limit, one folder for all ranks, the marker `serial`."""
 
 import faulthandler
 import gc

@@ -36,7 +36,7 @@ DRAWN = (
     plot_contact,
     plot_error,
 )
-"""What is drawn of each level."""
+"""Pictures that are drawn of each level."""
 DATA: tuple[dict[str, Any], ...] = (
     {"f": -9.0, "obstacle": -0.05, "coefficient": 2.0},
     {"f": lambda x: -20 * x[0], "obstacle": lambda x: 0.1 * x[0] - 0.1},
@@ -69,7 +69,7 @@ def round_of(number: int, folder: Path, drawn: bool) -> None:
 
 
 def held() -> int:
-    """What this process holds when all that can be given back has been, in bytes."""
+    """Return the bytes that this process holds when all that can be given back has been."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     words = Path("/proc/self/status").read_text().split()

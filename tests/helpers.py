@@ -1,4 +1,4 @@
-"""What tests share: folders of the checkout, and processes started as users start them."""
+"""Tools that tests share: folders of the checkout, and processes started as users start them."""
 
 import contextlib
 import io
@@ -187,7 +187,7 @@ def undrawn(patch: pytest.MonkeyPatch) -> None:
 
 
 def is_picture(path: Path) -> bool:
-    """Whether it is a PNG with something on it."""
+    """Tell whether it is a PNG with something on it."""
     return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
 
 
@@ -237,7 +237,7 @@ def smallest_angle(mesh: Mesh) -> float:
 
 
 def integral(form: ufl.Form, comm: MPI.Comm = MPI.COMM_WORLD) -> float:
-    """What the form is, over all ranks."""
+    """Compute what the form is, over all ranks."""
     return comm.allreduce(fem.assemble_scalar(fem.form(form)))
 
 
@@ -247,7 +247,7 @@ def on_the_square(problem: Problem, levels: int = 4, size: float = 0.25) -> list
 
 
 def widths_of(intervals: Iterable[tuple[float, float]], inside: float | None = None) -> np.ndarray:
-    """How wide intervals are, each of which must hold a number if there is one."""
+    """Return the widths of intervals, each of which must hold a number if there is one."""
     found = []
     for lower, upper in intervals:
         assert lower <= upper and (inside is None or lower <= inside <= upper)
@@ -256,7 +256,7 @@ def widths_of(intervals: Iterable[tuple[float, float]], inside: float | None = N
 
 
 def orders(found: np.ndarray) -> np.ndarray:
-    """Of what is found on meshes each of which is twice as fine as the one before."""
+    """Compute orders of what is found on meshes, each twice as fine as the one before."""
     return np.log2(found[:-1] / found[1:])
 
 

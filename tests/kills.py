@@ -59,7 +59,7 @@ PATIENCE = 5.0
 
 
 class End(NamedTuple):
-    """How a run ended.
+    """The end of a run.
 
     Attributes:
         kind: Ranks, signal, who got it, and of which case the run was.
@@ -88,7 +88,7 @@ def family(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process is there and no zombie."""
+    """Tell whether a process is there and no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
@@ -124,12 +124,12 @@ def own_cache(folder: Path) -> Path:
 
 
 def finished(report: dict[str, Any]) -> int:
-    """How many levels a report has, or how many meshes that were tried and steps."""
+    """Count the levels of a report, or the meshes that were tried and steps."""
     return len(report.get("times", report["levels"])) + len(report.get("search", []))
 
 
 def levels_in(out: Path) -> int:
-    """How many levels, or meshes that were tried and steps, the report has."""
+    """Count the levels, or meshes that were tried and steps, in the report."""
     try:
         return finished(json.loads((out / "report.json").read_text()))
     except (OSError, ValueError, KeyError, TypeError):
@@ -223,7 +223,7 @@ def killed(
 
 
 def _left(out: Path, new: bool) -> tuple[int, list[str]]:
-    """How many levels are kept, and what is wrong with the folder; `new` if it was not there."""
+    """Count the levels kept, and find what is wrong with the folder; `new` if it was not there."""
     faults = []
     looked = time.monotonic()
     check_writable(out)  # as the next run does

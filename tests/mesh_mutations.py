@@ -158,7 +158,7 @@ _MUTATIONS = {"bytes": _bytes, "lines": _lines, "numbers": _numbers, "meaning": 
 
 
 def faults(raw: Triangulation) -> list[str]:
-    """What is wrong with a mesh, looked at by brute force."""
+    """Find what is wrong with a mesh, by brute force."""
     found = []
     x, t = raw.points, raw.triangles
     if not np.isfinite(x).all():
@@ -209,7 +209,7 @@ def faults(raw: Triangulation) -> list[str]:
 
 
 def outcome(path: Path, data: bytes) -> tuple[str, str]:
-    """What reading such a file comes to: read, refused, or wrong; and the words."""
+    """Read such a file: the result is read, refused, or wrong; and the words."""
     path.write_bytes(data)
     began = time.perf_counter()
     try:

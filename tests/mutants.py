@@ -35,9 +35,9 @@ TESTS = {
     "vi": "vi fem/test_conditions.py",
     "multigrid": "multigrid vi/test_steps_pinned.py",
 }
-"""What is run on the mutants of a street."""
+"""Tests that are run on the mutants of a street."""
 SLOW = "not waving and not need_two_sweeps and not rates"
-"""What is left out of it."""
+"""Tests of these that are left out."""
 
 
 def _table(pairs: str) -> dict[type[ast.AST], type[ast.AST]]:
@@ -54,9 +54,9 @@ NEGATED = _table(
 NAMES = {"min": "max", "minimum": "maximum", "any": "all", "low": "high"}
 NAMES |= {new: old for old, new in NAMES.items()}
 ELSEWHERE = ("scatter_forward()", "scatter_reverse(InsertMode.add)", "destroy()")
-"""What only other ranks or the memory would notice is not dropped."""
+"""Calls that only other ranks or the memory would miss, which are not dropped."""
 OTHERS = "comm.size > 1"
-"""What hangs on this, and the condition, are left alone: it is what a rank says to others, and here
+"""Condition that is left alone, with what hangs on it: it is what a rank says to others, and here
 there is one, which has nobody to say it to."""
 MUTANT = "SIGNORINI_CR_MUTANT"
 """Number and file of the mutant that a process under mpirun, which has this for a plugin of pytest,
@@ -162,7 +162,7 @@ def load(path: Path, index: int) -> Mutated:
 
 
 def end_of(mutated: Mutated | None, tests: list[str], seconds: float) -> str:
-    """How the tests end: passed, failed, or timeout."""
+    """Return the end of the tests: passed, failed, or timeout."""
     child = os.fork()
     if not child:
         os.setpgid(0, 0)

@@ -437,7 +437,7 @@ def test_what_a_solver_cannot_do_with_is_refused():
 
 
 def known(solution):
-    """What is certain about a solution."""
+    """Return what is certain about a solution."""
     found = solution.certificate
     return [found.bound_energy_norm, *found.energy, *solution.mean("domain"), *solution.flux("top")]
 

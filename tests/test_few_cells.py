@@ -76,7 +76,7 @@ COMPILED = Problem(
     coefficient=lambda x: 2.0 + ufl.bessel_J(0, x[0] * x[1]),
     reaction=lambda x: 2.0 + ufl.bessel_J(0, x[1]),
 )
-"""What NumPy has no functions for; there is no certificate, by which meshes could be adapted."""
+"""Data that NumPy has no functions for; there is no certificate that meshes could be adapted by."""
 
 
 def solved(

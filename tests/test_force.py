@@ -1,4 +1,4 @@
-"""What flows through parts, corrected by a dual solution: orders, and intervals that hold."""
+"""Flows through parts, corrected by a dual solution: orders, and intervals that hold."""
 
 from functools import lru_cache
 

@@ -43,7 +43,7 @@ few = settings(
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 ENDS: Counter[str] = Counter()
-"""How the examples of a long run ended."""
+"""Ends of the examples of a long run."""
 SECONDS = 20.0
 """Nothing that is drawn here takes a second; this is for machines that are busy."""
 

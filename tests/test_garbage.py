@@ -22,7 +22,7 @@ from signorini_cr.multigrid.smoothing import GaussSeidel
 
 
 class Watch:
-    """Which of some communicators are there, by their names."""
+    """The communicators of some that are still there, by their names."""
 
     def __init__(self) -> None:
         self.there: list[object] = []

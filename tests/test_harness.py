@@ -1,4 +1,4 @@
-"""What benchmarks and demos share, and the picture in ARCHITECTURE.md."""
+"""Tools that benchmarks and demos share, and the picture in ARCHITECTURE.md."""
 
 import re
 import runpy

@@ -38,7 +38,7 @@ def sources(cache: Path) -> list[Path]:
 
 
 def left_by_a_killed_run(cache: Path, age: float) -> None:
-    """What is there when a process ends between the empty source and the mark."""
+    """Leave what is there when a process ends between the empty source and the mark."""
     make(1.0)
     COMM.Barrier()
     if COMM.rank == 0:

@@ -1,4 +1,4 @@
-"""What is told of the program in several files is the same in all of them."""
+"""Facts about the program that several files tell are the same in all of them."""
 
 import ast
 import importlib

@@ -15,7 +15,7 @@ ROWS = [
     if line.startswith("| ") and not line.startswith("| promise")
 ]
 COMMANDED = {"… and memory does not grow"}
-"""Which takes a process too long for a test."""
+"""Promises whose test takes a process too long for a test."""
 
 
 def names_in(file: str) -> set[str]:

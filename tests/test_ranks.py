@@ -1,4 +1,4 @@
-"""What iterations leave depends on the ranks; what is made of it must not, but for as much."""
+"""Results of iterations depend on the ranks; what is made of them must not, but for as much."""
 
 import numpy as np
 import pytest

@@ -149,7 +149,7 @@ class Lifted(InCorner):
 
 
 class Coupled:
-    """What makes the physics."""
+    """A physics of two coupled unknowns."""
 
     element, problem, exact = "CR", None, None
     galerkin, not_definite = True, None
@@ -167,7 +167,7 @@ class Coupled:
         return Snapshot([], [])
 
     def certify(self, solution):
-        """How far u_h is from what averages at vertices make of it: no bound, but it marks."""
+        """Compute how far u_h is from averages at vertices: no bound, but it marks."""
         u, mesh = solution.u, solution.domain.mesh
         local, p1 = at_corners(u), Layout.of_p1(mesh, 2)
         local = local[: mesh.topology.index_map(2).size_local]

@@ -1,4 +1,4 @@
-"""What is left where a run is ended from outside, or by lack of memory."""
+"""The files that are left where a run is ended from outside, or by lack of memory."""
 
 import importlib
 import json

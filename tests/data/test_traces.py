@@ -39,7 +39,7 @@ OF_MESHES = {
     "affine, with steps": lambda mesh: ufl.exp(affine(mesh, "DG", 1)),
     "steps": lambda mesh: 1 + affine(mesh, "DG", 0),
 }
-"""What depends on more than x."""
+"""Data that depend on more than x."""
 
 
 def written(name, mesh):
@@ -78,7 +78,7 @@ def test_in_cells_they_have_them_too(name, monkeypatch):
 
 
 class Cube:
-    """What is asked of a domain here."""
+    """The part of a domain that is asked for here."""
 
     def __init__(self):
         self.mesh = create_unit_cube(MPI.COMM_WORLD, 2, 3, 2)

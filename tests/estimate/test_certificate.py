@@ -50,7 +50,7 @@ pytestmark = pytest.mark.slow
 
 WORLD = MPI.COMM_WORLD
 GOAL = 1.45
-"""What the effectivity must stay below on uniform meshes."""
+"""Goal that the effectivity must stay below on uniform meshes."""
 
 
 def integral(expression, mesh, measure=ufl.dx, degree=8):

@@ -1,4 +1,4 @@
-"""What the certificate's fields are against given functions, by quadrature at points."""
+"""The certificate's fields against given functions, by quadrature at points."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -98,7 +98,7 @@ def psi(x):
 
 
 def moments(at, values):
-    """What is known of a load from its values at the points."""
+    """Compute the moments of a load from its values at the points."""
     mean = values @ at.weights
     off = values - mean[:, None]
     bumps = [4 * np.delete(at.hats, i, axis=0).prod(axis=0) for i in range(3)]

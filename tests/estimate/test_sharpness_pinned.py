@@ -1,4 +1,4 @@
-"""How sharp bounds, brackets and intervals are on small problems: no looser, and no sharper.
+"""Sharpness of bounds, brackets and intervals on small problems: no looser, and no sharper.
 
 The figures in `TODAY` are those of today. Looser ones break a promise; sharper ones are good news
 or a mistake, and either is to be looked at before it is taken for the new figure. What they are
@@ -45,9 +45,9 @@ pytestmark = pytest.mark.slow
 
 WORLD = MPI.COMM_WORLD
 WITHIN, OF_INTERVALS = 5e-4, 3e-3
-"""What figures may change by, relative; the intervals' hang on dual solutions, not converged."""
+"""Relative changes that figures may have; the intervals' hang on dual solutions, not converged."""
 SLACK = 1e-9
-"""What the exact figures may be wrong by, relative."""
+"""Errors that the exact figures may have, relative."""
 
 
 def grid(columns, rows, layered):
@@ -289,7 +289,7 @@ square; then the widths of intervals over the same.
 
 
 def figures(name):
-    """What `TODAY` has of a problem; insists that bounds hold; collective."""
+    """Return the figures of a problem for `TODAY`; insists that bounds hold; collective."""
     small = SMALL[name]
     solution = small.solution()
     certificate = solution.certificate

@@ -110,7 +110,7 @@ def smallest_curl(gradients, local, reference, weights):
 
 
 def figures(solution, certificate, f, g=None, kappa=1.0, obstacle=0.0, carried=False, phi=None):
-    """What the certificate should say where f and g are affine and κ is constant on the cells.
+    """Compute the certificate's figures where f and g are affine and κ is constant on the cells.
 
     Each cell has at most one facet on Γg. With `carried` the flux balances all of f and g. Where κ
     varies within cells they are least values. The force is bounded with the weight φ.
@@ -484,7 +484,7 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     complete = module._complete
 
     def unknown_above(known, *others):
-        """What is known of κ from above makes no difference to gradients."""
+        """Double the upper bound of κ, which makes no difference to gradients."""
         known.kappa.high = 2 * known.kappa.high
         complete(known, *others)
 

@@ -1,4 +1,4 @@
-"""What is chosen for the bottom of the cycle, and figures of its grids, by dense matrices."""
+"""Choice for the bottom of the cycle, and figures of its grids, by dense matrices."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""What a notebook shows of a solution."""
+"""Displays of a solution in a notebook."""
 
 import base64
 import json

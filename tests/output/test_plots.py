@@ -45,7 +45,7 @@ def holed():
 
 
 def share(path, color):
-    """How much of a picture, in percent, has this colour; on rank 0, 0 elsewhere."""
+    """Compute the percentage of a picture that has this colour; on rank 0, 0 elsewhere."""
     if WORLD.rank != 0:
         return 0.0
     wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255

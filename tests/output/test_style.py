@@ -28,7 +28,7 @@ def solved(vertices, contact, size=0.25):
 
 
 def overhang(figure):
-    """By how many inches what is drawn goes beyond the edges of the figure."""
+    """Compute the inches that what is drawn goes beyond the edges of the figure."""
     figure.canvas.draw()
     box = figure.get_tightbbox(figure.canvas.get_renderer())
     return max(-box.x0, -box.y0, box.x1 - figure.get_figwidth(), box.y1 - figure.get_figheight())

@@ -1,4 +1,4 @@
-"""What is printed beside the table."""
+"""Lines that are printed beside the table."""
 
 import re
 

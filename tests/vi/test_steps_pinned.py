@@ -1,4 +1,4 @@
-"""How many steps the solver takes on small problems: as many as today.
+"""Steps of the solver on small problems: as many as today.
 
 What is solved is shown elsewhere to be right; these are the figures that say at what price. More
 steps break a promise; fewer are good news or a mistake, and either is to be looked at before the

@@ -79,7 +79,7 @@ class Reference:
 
     @property
     def transitions(self) -> npt.NDArray[np.float64]:
-        """Where the gap becomes 0 in free facets beside active ones, or the vertices between."""
+        """Places of a zero gap in free facets beside active ones, or the vertices between."""
         order = np.argsort(self.midpoints[:, 0])
         x, gaps, active = self.ends[order], self.gaps[order], self.forces[order] > 0
         found = []
