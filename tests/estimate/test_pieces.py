@@ -744,7 +744,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
 
 def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     """Conjugate gradients to the end: orthogonal to all that have no divergence."""
-    monkeypatch.setattr(flux, "STEPS", 200)
+    monkeypatch.setattr(flux, "CG_STEPS", 200)
     domain = square(3, ("contact", "neumann", "dirichlet", "neumann"))
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(WORLD.rank)
@@ -764,7 +764,7 @@ def test_the_smallest_field_of_a_given_divergence(monkeypatch):
     least, other, apart = (square_of(one) for one in (smallest, some, some - smallest))
     assert least < other and np.isclose(other, least + apart, rtol=1e-7)
     # A few steps, and what is left carried as a walk does, are between the two
-    monkeypatch.setattr(flux, "STEPS", 10)
+    monkeypatch.setattr(flux, "CG_STEPS", 10)
     nearly = flux._diffused(cells, left, kappa)
     assert not np.allclose(nearly.sum(axis=0), -left, atol=1e-2)
     jumps = cells.over_facets(nearly)
@@ -823,7 +823,7 @@ def test_conjugate_gradients_for_heights(monkeypatch):
     assert np.allclose(found[free], truth)
     assert not found[~free].any()
     # each way is conjugate to those before: a step for each height is enough
-    monkeypatch.setattr(shapes, "STEPS", np.sum(free))
+    monkeypatch.setattr(shapes, "CG_STEPS", np.sum(free))
     matrix += 3 * np.eye(3)[:, :, None]
     found = best_heights(cells, matrix, pull, free)
     whole = local_matrices(cells, matrix)[np.ix_(free, free)]
