@@ -59,7 +59,6 @@ def settings(top: int) -> dict[str, object]:
     found: dict[str, object] = {
         "pc_mg_distinct_smoothup": None,
         "mg_coarse_ksp_type": "preonly",
-        "mg_coarse_pc_type": "cholesky",
         **{f"mg_coarse_{name}": value for name, value in SMALL_FACTORS.items()},
     }
     for level, way in itertools.product(range(1, top + 1), ("forward", "backward")):

@@ -78,6 +78,7 @@ REDUCED: dict[str, object] = {
 """The linear systems; the preconditioner in Python is the multigrid cycle."""
 
 BOOMERAMG: dict[str, object] = {
+    "pc_type": AMG,
     # Gauss-Seidel forward on the way down and backward on the way up: as symmetric as PETSc's
     # default, which goes both ways each time, and a third cheaper
     "pc_hypre_boomeramg_relax_type_down": "SOR/Jacobi",
@@ -111,6 +112,7 @@ DUAL: dict[str, object] = {
 """The linear problems of bounds of means and flows: dual ones, and weights that are harmonic."""
 
 LARGE_FACTORS: dict[str, object] = {
+    "pc_type": PETSc.PC.Type.CHOLESKY,
     "pc_factor_mat_solver_type": "mumps",
     # minimum degree takes least time for matrices of plane meshes, on two ranks as well
     "mat_mumps_icntl_7": 0,
@@ -118,6 +120,7 @@ LARGE_FACTORS: dict[str, object] = {
 """Factors in the place of the cycle."""
 
 WHOLE_FACTORS: dict[str, object] = {
+    "pc_type": PETSc.PC.Type.CHOLESKY,
     "pc_factor_zeropivot": 1e-300,
     # a fifth less to solve with than nested dissection's, and no slower to make
     "pc_factor_mat_ordering_type": "qmd",
@@ -125,11 +128,15 @@ WHOLE_FACTORS: dict[str, object] = {
 """Factors of a small matrix that is solved with again and again."""
 
 SMALL_FACTORS: dict[str, object] = {
+    "pc_type": PETSc.PC.Type.CHOLESKY,
     # PETSc's smallest pivot is absolute and would refuse coefficients of small magnitude
     "pc_factor_zeropivot": 1e-300,
     "redundant_pc_factor_zeropivot": 1e-300,
 }
-"""Factors at the bottom of the cycle, on every rank."""
+"""Factors at the bottom of the cycle, on one rank."""
+
+REDUNDANT_FACTORS: dict[str, object] = {**SMALL_FACTORS, "pc_type": PETSc.PC.Type.REDUNDANT}
+"""The same on several ranks: each has all of them."""
 
 
 class OptionRefused(InputError):

@@ -31,7 +31,7 @@ from .companion import Companion, Lifted, companion, on_facet
 from .cubic import cubed, with_cubics
 from .curl import improve, promising
 from .cusps import Cusps
-from .duality import Within, integrate, integrate_edge
+from .duality import DualityGap, Within, integrate
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .functional import Functional, Masses
 from .lifting import below
@@ -511,8 +511,9 @@ def _integrated(known: _Known, v: Companion) -> Sums:
 def _complete(known: _Known, v: Companion, sums: Sums) -> None:
     """Add to what was integrated over cells what facets, ℓ, and c and b that vary have of it."""
     cells, kappa, segments, totals = known.cells, known.kappa, known.segments, sums.totals
-    load = known.certain.load
-    integrate_edge(cells, kappa, known.w, load, segments, known.flux, v, sums, known.c.low)
+    load, c = known.certain.load, known.c
+    gap = DualityGap(cells, kappa, known.w, load, known.flux, v, c.low, c.high, sums)
+    gap.add_edge(segments)
     totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
     lost, unsure = half(known.squares)

@@ -51,41 +51,10 @@ def integrate(
     """
     sums = Sums.empty(cells.number, reacts(reaction))
     most = reaction if most is None else most
-    duality_gap = _DualityGap(cells, kappa, w, load, flux, v, reaction, most, sums)
+    duality_gap = DualityGap(cells, kappa, w, load, flux, v, reaction, most, sums)
     for block in blocks(cells.number):
         duality_gap.add(block)
     return sums
-
-
-def integrate_edge(
-    cells: Cells,
-    kappa: Coefficient,
-    w: FloatArray,
-    load: VolumeMoments,
-    edge: Segments,
-    flux: Flux,
-    v: Companion,
-    sums: Sums,
-    reaction: FloatArray = NOTHING,
-) -> None:
-    """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
-
-    σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
-    Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f. Where b
-    is large it takes up g − g_F, as c does with f.
-
-    Args:
-        cells: The mesh.
-        kappa: The coefficient.
-        w: u_h at the cells' vertices, shape (d + 1, cells).
-        load: Moments of f.
-        edge: Values of g − b u_h.
-        flux: y.
-        v: v.
-        sums: What to add to.
-        reaction: c, shape (cells,) or ().
-    """
-    _DualityGap(cells, kappa, w, load, flux, v, reaction, reaction, sums).add_edge(edge)
 
 
 @dataclass(frozen=True)
@@ -112,7 +81,7 @@ class _Products:
 
 
 @dataclass(frozen=True, eq=False)
-class _DualityGap:
+class DualityGap:
     """The gap between y and v, which is added up range by range of cells.
 
     Attributes but for the last are the arguments of `integrate`.
@@ -328,7 +297,15 @@ class _DualityGap:
     # what there is on facets
 
     def add_edge(self, edge: Segments) -> None:
-        """Add what facets have of the gap, see `integrate_edge`."""
+        """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
+
+        σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
+        Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f. Where
+        b is large it takes up g − g_F, as c does with f.
+
+        Args:
+            edge: Values of g − b u_h.
+        """
         cells, kappa, flux, sums = self.cells, self.kappa, self.flux, self.sums
         jump = apart(cells, self.w, edge, self.v.vertices, self.v.bumps)
         at, sizes = edge.oscillation(flux.beyond is not None)

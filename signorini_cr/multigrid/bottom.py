@@ -18,11 +18,11 @@ from ..arrays import Int32Array
 from ..garbage import release
 from ..options import (
     ALONE_PREFIX,
-    AMG,
     BOOMERAMG,
     BOTTOM_PREFIX,
     HAS_MUMPS,
     LARGE_FACTORS,
+    REDUNDANT_FACTORS,
     SMALL_FACTORS,
     defaults,
     read,
@@ -62,7 +62,7 @@ class Bottom:
             alone: Whether it takes the place of the cycle.
         """
         self._matrix, self._prefix = matrix, ALONE_PREFIX if alone else BOTTOM_PREFIX
-        self._type, self._options = _choice(matrix, dimension, alone)
+        self._options = _choice(matrix, dimension, alone)
         self._pc: PETSc.PC | None = None
         self._constrained: Int32Array | None = None
         self._stale = True
@@ -79,7 +79,6 @@ class Bottom:
         if self._pc is None:
             self._pc = PETSc.PC().create(self._matrix.getComm())
             self._pc.setOptionsPrefix(self._prefix)
-            self._pc.setType(self._type)
             self._pc.setOperators(self._matrix)
             with defaults(self._options, self._prefix):
                 read(self._pc)
@@ -94,8 +93,9 @@ class Bottom:
 
     def describe(self, why: str = "") -> str:
         """Say in words what it is, and why unless it is what users have asked for."""
-        kind = self._type if self._pc is None else self._pc.getType()
-        if kind != self._type:
+        usual = self._options["pc_type"]
+        kind = usual if self._pc is None else self._pc.getType()
+        if kind != usual:
             return f"{kind} (option -{self._prefix}pc_type)"
         words = {PETSc.PC.Type.HYPRE: "BoomerAMG", PETSc.PC.Type.GAMG: NO_HYPRE}
         return words.get(kind, "a direct solver") + why
@@ -105,23 +105,22 @@ class Bottom:
         release(self._pc)
 
 
-def _choice(matrix: PETSc.Mat, dimension: int, alone: bool) -> tuple[str, Mapping[str, object]]:
-    """Choose the solver for a matrix unless options say otherwise, and its settings; collective.
+def _choice(matrix: PETSc.Mat, dimension: int, alone: bool) -> Mapping[str, object]:
+    """Choose the settings of what solves with a matrix unless options say otherwise; collective.
 
     Some are read when it is made, some when it is set up.
     """
     if not is_small(matrix):
         if not alone or matrix.getSize()[0] > FACTORISED[dimension] or _suits_amg(matrix):
-            return AMG, BOOMERAMG
+            return BOOMERAMG
         if HAS_MUMPS:
-            return PETSc.PC.Type.CHOLESKY, LARGE_FACTORS
-    one = matrix.getComm().getSize() == 1
-    return PETSc.PC.Type.CHOLESKY if one else PETSc.PC.Type.REDUNDANT, SMALL_FACTORS
+            return LARGE_FACTORS
+    return SMALL_FACTORS if matrix.getComm().getSize() == 1 else REDUNDANT_FACTORS
 
 
 def _suits_amg(matrix: PETSc.Mat) -> bool:
     """Tell whether the matrix is, nearly, an M-matrix: BoomerAMG was made for these; collective."""
-    if AMG != PETSc.PC.Type.HYPRE:
+    if BOOMERAMG["pc_type"] != PETSc.PC.Type.HYPRE:
         return False
     start, column, value = matrix.getValuesCSR()
     row = np.repeat(np.arange(len(start) - 1), np.diff(start))

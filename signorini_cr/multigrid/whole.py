@@ -55,7 +55,6 @@ class Whole:
         self._columns = np.empty((len(dofs), matrix.getSize()[0]))
         self._pc = PETSc.PC().create(matrix.getComm())
         self._pc.setOptionsPrefix(ALONE_PREFIX)
-        self._pc.setType(PETSc.PC.Type.CHOLESKY)
         self._pc.setOperators(matrix)
         with defaults(WHOLE_FACTORS, ALONE_PREFIX):
             read(self._pc)
@@ -101,7 +100,7 @@ class Whole:
     def describe(self, why: str = "") -> str:
         """Say in words what it is."""
         kind = self._pc.getType()
-        if kind != PETSc.PC.Type.CHOLESKY:
+        if kind != WHOLE_FACTORS["pc_type"]:
             return f"{kind} (option -{ALONE_PREFIX}pc_type)"
         return "a direct solver" + why
 

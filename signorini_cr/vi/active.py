@@ -47,8 +47,10 @@ class ActiveSet:
     mask: BoolArray
 
     def __post_init__(self) -> None:
-        """Close the mask for writing."""
-        self.mask.setflags(write=False)
+        """Close both for writing; the dofs are the caller's, too, who may write to theirs."""
+        object.__setattr__(self, "bounded", self.bounded.view())
+        for each in (self.bounded, self.mask):
+            each.setflags(write=False)
 
     @classmethod
     def of(cls, bounded: Int32Array, gap: FloatArray | float, force: FloatArray) -> ActiveSet:
@@ -114,4 +116,8 @@ class ActiveSet:
 
     def exchanged(self, force: FloatArray, gap: FloatArray) -> ActiveSet:
         """Return the set that the solution in this one asks for; see `indicator`."""
-        return ActiveSet(self.bounded, self.indicator(force, gap) > 0.0)
+        return self.changed(self.indicator(force, gap))
+
+    def changed(self, indicator: FloatArray) -> ActiveSet:
+        """Return the set that an indicator asks for, shape (n,)."""
+        return ActiveSet(self.bounded, indicator > 0.0)

@@ -352,7 +352,7 @@ class ReducedSystem:
     def outlook(self, now: FloatArray, before: FloatArray) -> Outlook:
         """Judge a step by its indicator and by that of the step before; collective."""
         active, sums = self.active.mask, self.stiffness.sums
-        wrong = np.where(active == (now > 0.0), 0.0, now)
+        wrong = np.where(active == self.active.changed(now).mask, 0.0, now)
         change = np.abs(now - before)
         facts = np.concatenate(
             [

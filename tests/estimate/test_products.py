@@ -990,7 +990,8 @@ def test_the_gap_on_sides(reacts):
     y = SimpleNamespace(excess=excess, beyond=None, shed=shed)
     load = SimpleNamespace(variance=variance)
     reaction = np.where(np.arange(number) % 2, 1e3, 0.1) if reacts else np.array(0.0)
-    duality.integrate_edge(cells, kappa, w, load, edge, y, v, sums, reaction)
+    gap = duality.DualityGap(cells, kappa, w, load, y, v, reaction, reaction, sums)
+    gap.add_edge(edge)
     assert sums.totals.loose == 0.0
     jump = on.affine(made.vertices[cells.vertices] - w) + on.bump(made.bumps)
     rest = np.sin(4 * on.x[..., 1]) - 0.3 + on.x[..., 0]

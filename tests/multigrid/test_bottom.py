@@ -47,14 +47,14 @@ def test_what_solves(monkeypatch):
     amg, direct = PETSc.PC.Type.HYPRE, PETSc.PC.Type.CHOLESKY
 
     def choice(matrix, alone):
-        return bottom._choice(matrix, 2, alone)[0]
+        return bottom._choice(matrix, 2, alone)["pc_type"]
 
     monkeypatch.setattr(bottom, "DIRECT", 20)
     assert choice(good, False) == choice(bad, True) == direct
     monkeypatch.setattr(bottom, "DIRECT", 19)
     assert [choice(good, False), choice(bad, False)] == [amg, amg]
     assert [choice(good, True), choice(bad, True)] == [amg, direct]
-    assert bottom._choice(bad, 2, True)[1] is bottom.LARGE_FACTORS
+    assert bottom._choice(bad, 2, True) is bottom.LARGE_FACTORS
     monkeypatch.setitem(bottom.FACTORISED, 2, 20)
     assert choice(bad, True) == direct
     monkeypatch.setitem(bottom.FACTORISED, 2, 19)
