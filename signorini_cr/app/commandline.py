@@ -1,6 +1,7 @@
 """The command line of `signorini-cr`, and how the program was launched.
 
-Everything here answers before NumPy, MPI or DOLFINx are loaded.
+Everything here answers before NumPy, MPI or DOLFINx are loaded, but for a key of problem files that
+is taken for an option.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,14 +32,6 @@ EXIT_NOTE = (
     " or 129 where a terminal is closed, terminated. Report and tables of a level, or step, are"
     " kept as soon as it is finished, whatever ends the run then."
 )
-
-
-KEYS_OF = {
-    **dict.fromkeys(("mode", "tolerance", "max_dofs", "fraction"), "refine"),
-    **dict.fromkeys(("end", "steps", "scheme", "initial", "capacity"), "time"),
-    **dict.fromkeys(("size", "mesh"), "domain"),
-}
-"""Keys of problem files that are no options, and their sections."""
 
 
 OPTIONS_READ = ("-options_file", "-options_file_yaml")
@@ -301,8 +295,12 @@ def _unknown(word: str, command: _Parser) -> NoReturn:
     options = [name for name in command._option_string_actions if name.startswith("--")]
     near = difflib.get_close_matches(word.split("=")[0], options, n=1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(options)}"
-    if section := KEYS_OF.get(key := word.split("=")[0].lstrip("-").replace("-", "_")):
-        hint = f"{key} is a key of [{section}] in the problem file"
+    key = word.split("=")[0].lstrip("-").replace("-", "_")
+    with suppress(ImportError):  # DOLFINx may be missing, which is not what this is about
+        from .reference import section_of
+
+        if (section := section_of(key)) is not None:
+            hint = f"{key} is a key of {section} in the problem file"
     command.error(f"there is no option {word.split('=')[0]}; {hint}")
 
 

@@ -255,6 +255,12 @@ def allowed(section: str) -> tuple[str, ...]:
     return tuple(key.name for key in KEYS if key.section == section)
 
 
+def section_of(name: str) -> str | None:
+    """Find the section that a key belongs to, in brackets; None if it belongs to none."""
+    section = next((key.section for key in KEYS if key.name == name), "")
+    return f"[{section}]" if section else None
+
+
 def page() -> str:
     """Write the reference of the problem file, in Markdown."""
     lines = [

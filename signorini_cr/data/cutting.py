@@ -136,8 +136,8 @@ def cut(
     )
     for row, amounts in zip(found, inside, strict=True):
         row[pending] = 0.0
-        np.add.at(row, pieces.parent, pieces.part * amounts)
-    kept = np.flatnonzero(pieces.part < 1.0)
+        np.add.at(row, pieces.parent, pieces.share * amounts)
+    kept = np.flatnonzero(pieces.share < 1.0)
     kept = kept[np.argsort(pieces.parent[kept], kind="stable")]
     return Cut(found, pieces[kept], inside[:, kept])
 
@@ -166,11 +166,11 @@ def refine(
         Pieces, and the errors on them.
     """
     wanted, limit = _Wanted(errors, weights, levels), _Room(room)
-    front = _Front.of(pieces, np.full(len(pieces.part), UNKNOWN), wanted)
+    front = _Front.of(pieces, np.full(len(pieces.share), UNKNOWN), wanted)
     lost = np.asarray(~np.isfinite(front.inside).all(axis=0))
     if apart is not None and lost.any():
         finer = apart(pieces[lost])
-        front = front[~lost] + _Front.of(finer, np.full(len(finer.part), UNKNOWN), wanted)
+        front = front[~lost] + _Front.of(finer, np.full(len(finer.share), UNKNOWN), wanted)
     before, idle = np.inf, 0
     for _ in range(CUTS):
         share = front.share
@@ -187,7 +187,7 @@ def refine(
             spare = (FALL * limit.enough - have) / (FALL - 1.0)
             threshold = max(threshold, _negligible(share, spare, cells.comm))
         space = int(limit.pieces - number) // 3 + 1
-        large = (front.pieces.part > SMALLEST) | ~np.isfinite(share)
+        large = (front.pieces.share > SMALLEST) | ~np.isfinite(share)
         chosen = _worst(np.where(large, share, 0.0), threshold, space, cells.comm)
         found, looked = cells.total(chosen.sum(), np.sum(front.ways[chosen] == UNKNOWN))
         if found == 0:
@@ -233,7 +233,7 @@ class _Wanted:
 
     def shares(self, pieces: Pieces, inside: FloatArray) -> FloatArray:
         """Compute weighted errors of pieces, shape (n,)."""
-        return pieces.part * _shares(self.weights[:, pieces.parent], inside)
+        return pieces.share * _shares(self.weights[:, pieces.parent], inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +318,7 @@ def _directed(front: _Front, wanted: _Wanted) -> _Front:
     probes = [pieces.shrunk(axes) for axes in ((0, 1), (0,), (1,))]
     inside = wanted.errors(probes[0] + probes[1] + probes[2])
     left = _shares(wanted.weights[:, np.tile(pieces.parent, 3)], inside).reshape(3, n)
-    rates = np.log(np.clip(left * pieces.part, 1e-300, 1e300))
+    rates = np.log(np.clip(left * pieces.share, 1e-300, 1e300))
     rates -= np.log(np.clip(front.share, 1e-300, 1e300))
     known = np.isfinite(front.share)
     best = (rates / np.array([[2.0], [ACROSS], [ACROSS]])).argmin(axis=0) + QUARTERS

@@ -1,4 +1,4 @@
-"""The problem on one mesh: its data, each sampled once, for the system and for the certificate."""
+"""The problem on one mesh: its data, each sampled once while they are kept, for all who ask."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ class DiffusionOnMesh:
         return DiffusionOnMesh(self.compiled, self.domain, source, rate, self._earlier or self)
 
     def tidy(self) -> None:
-        """Make room: what is large is made again, should anybody ask for it."""
+        """Make room: what is large is sampled again, should anybody ask for it later."""
         self.moments = replace(self.moments)
 
     @property

@@ -127,7 +127,7 @@ class VolumeMoments:
             return self
         rule = f.plain
         values = f.deviation.values(cut.pieces, cells, rule.hats)
-        weights = rule.weights[:, None] * cut.pieces.part
+        weights = rule.weights[:, None] * cut.pieces.share
         hats = at_points(cut.pieces.hats, rule.hats)
         bumps = np.stack([4.0 * np.delete(hats, i, axis=0).prod(axis=0) for i in range(len(hats))])
 
@@ -503,7 +503,7 @@ class Segments:
         """
         g, facets, n = edge.g, edge.side, len(edge.measure)
         pieces, reason = Pieces.of_facets(cells, facets).finer(HALVINGS * edge.varies), None
-        inside: FloatArray = np.zeros((2, len(pieces.part)))
+        inside: FloatArray = np.zeros((2, len(pieces.share)))
         points, weights = facet_quadrature(cells.domain.mesh, max(LOAD_DEGREE, g.degree))
         hats = np.column_stack([1.0 - points.sum(axis=1), points])
         known = g.constant is not None or not cells.comm.allreduce(n)
@@ -523,7 +523,7 @@ class Segments:
                 ]
             )
             scales[1] *= norms
-            room = 8 * cells.comm.allreduce(len(pieces.part)) + 1000
+            room = 8 * cells.comm.allreduce(len(pieces.share)) + 1000
             try:
                 pieces, inside = refine(
                     pieces,
@@ -540,8 +540,8 @@ class Segments:
                 reason = G_UNBOUNDED
         reasons = [words for words in cells.comm.allgather(reason) if words]
         if known or reasons:
-            values = np.full((len(weights), len(pieces.part)), g.constant or 0.0)
-        at, measure = pieces.parent, edge.measure[pieces.parent] * pieces.part
+            values = np.full((len(weights), len(pieces.share)), g.constant or 0.0)
+        at, measure = pieces.parent, edge.measure[pieces.parent] * pieces.share
 
         def total(amounts: FloatArray) -> FloatArray:
             return np.bincount(at, measure * amounts, minlength=n).astype(np.float64)

@@ -64,7 +64,7 @@ class Pieces:
         parent: The cell, or the facet, shape (n,).
         corners: Coordinates of the vertices, shape (d + 1, gdim, n).
         hats: The cell's barycentric coordinates there, shape (d + 1, d + 1, n), vertices first.
-        part: The piece's part of the cell's volume, shape (n,).
+        share: The piece's share of the cell's volume, shape (n,).
         frame: Of facets.
         span: Where pieces begin and end on the way from their first corner (0) to the opposite
             side (1), shape (2, n): slabs of triangles lie between two parallels of that side.
@@ -73,14 +73,14 @@ class Pieces:
     parent: IndexArray
     corners: FloatArray
     hats: FloatArray
-    part: FloatArray
+    share: FloatArray
     frame: Frame | None = None
     span: FloatArray = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
         """Make them simplices where there is no span."""
-        if self.span.shape[1] != len(self.part):
-            span = np.stack([np.zeros(len(self.part)), np.ones(len(self.part))])
+        if self.span.shape[1] != len(self.share):
+            span = np.stack([np.zeros(len(self.share)), np.ones(len(self.share))])
             object.__setattr__(self, "span", span)
 
     @classmethod
@@ -109,7 +109,7 @@ class Pieces:
             self.parent[which],
             self.corners[..., which],
             self.hats[..., which],
-            self.part[which],
+            self.share[which],
             self.frame,
             self.span[:, which],
         )
@@ -120,7 +120,7 @@ class Pieces:
             np.concatenate([self.parent, others.parent]),
             np.concatenate([self.corners, others.corners], axis=-1),
             np.concatenate([self.hats, others.hats], axis=-1),
-            np.concatenate([self.part, others.part]),
+            np.concatenate([self.share, others.share]),
             self.frame,
             np.concatenate([self.span, others.span], axis=1),
         )
@@ -137,7 +137,7 @@ class Pieces:
             corners, hats = self.corners.copy(), self.hats.copy()
             for array in (corners, hats):
                 array[end, :, at] = 0.5 * (array[end, :, at] + array[other, :, at])
-            halves.append(Pieces(self.parent, corners, hats, 0.5 * self.part, self.frame))
+            halves.append(Pieces(self.parent, corners, hats, 0.5 * self.share, self.frame))
         return halves[0] + halves[1]
 
     def finer(self, rounds: int) -> Pieces:
@@ -151,17 +151,17 @@ class Pieces:
         for i, part in enumerate(hats):
             corners, coordinates = self.corners.copy(), self.hats.copy()
             corners[i], coordinates[i] = point[:, None], own
-            new = Pieces(self.parent, corners, coordinates, part * self.part, self.frame)
+            new = Pieces(self.parent, corners, coordinates, part * self.share, self.frame)
             found.append(new[np.flatnonzero(part > 1e-15)])
         return sum(found[1:], found[0])
 
     def quarters(self) -> tuple[Pieces, IndexArray]:
         """Cut each into four; also tell from which."""
-        return self.halves().halves(), np.tile(np.arange(len(self.part)), 4)
+        return self.halves().halves(), np.tile(np.arange(len(self.share)), 4)
 
     def slabs(self, axis: int) -> tuple[Pieces, IndexArray]:
         """Cut triangles across an axis, at the middle vertex and in between; tell from which."""
-        at, x = np.arange(len(self.part)), self.corners[:, axis]
+        at, x = np.arange(len(self.share)), self.corners[:, axis]
         low, middle, high = np.argsort(x, axis=0)
         length = x[high, at] - x[low, at]
         s = np.divide(
@@ -175,7 +175,7 @@ class Pieces:
                 for x in (self.corners, self.hats)
             )
             corners, hats = corners[..., there], hats[..., there]
-            whole = self.part[there] * part[there]
+            whole = self.share[there] * part[there]
             for k in range(SLABS):
                 span = np.repeat([[k / SLABS], [(k + 1) / SLABS]], len(there), axis=1)
                 share = whole * (2 * k + 1) / SLABS**2
@@ -206,7 +206,7 @@ class Pieces:
         Args:
             level: Its values at the vertices, shape (3, n).
         """
-        at = np.arange(len(self.part))
+        at = np.arange(len(self.share))
         order = np.argsort(level, axis=0)
         low, middle, high = level[order, at]
         crossed = np.flatnonzero((low < 0.0) & (high > 0.0))
@@ -229,7 +229,7 @@ class Pieces:
             there = np.flatnonzero(share > 1e-15)
             corners, hats = (x[list(vertices)][..., there] for x in ends)
             of = crossed[there]
-            part = self.part[of] * share[there]
+            part = self.share[of] * share[there]
             pieces.append(Pieces(self.parent[of], corners, hats, part, self.frame))
             origin.append(of)
         return pieces[0] + pieces[1] + pieces[2] + pieces[3], np.concatenate(origin)
@@ -239,21 +239,21 @@ class Pieces:
         start, end = self.span
         middle, halves = 0.5 * (start + end), []
         for a, b in ((start, middle), (middle, end)):
-            part = self.part * ((a + b) * (b - a) / ((start + end) * (end - start)))
-            halves.append(replace(self, part=part, span=np.stack([a, b])))
-        return halves[0] + halves[1], np.tile(np.arange(len(self.part)), 2)
+            part = self.share * ((a + b) * (b - a) / ((start + end) * (end - start)))
+            halves.append(replace(self, share=part, span=np.stack([a, b])))
+        return halves[0] + halves[1], np.tile(np.arange(len(self.share)), 2)
 
     def triangles(self) -> tuple[Pieces, IndexArray]:
         """Cut slabs into triangles; return all, and from which."""
         thin = ~self.whole
         if not thin.any():
-            return self, np.arange(len(self.part))
+            return self, np.arange(len(self.share))
         slab, which = self[thin], np.flatnonzero(thin)
         (start, end), made, origin = slab.span, [self[~thin]], [np.flatnonzero(~thin)]
         corners, hats = slab._ends(slab.corners), slab._ends(slab.hats)
         for rows, part in (((0, 2, 3), end), ((0, 3, 1), start)):
             there = np.flatnonzero(part > 0)
-            part = (slab.part * part / (start + end))[there]
+            part = (slab.share * part / (start + end))[there]
             new = corners[list(rows)][..., there], hats[list(rows)][..., there]
             made.append(Pieces(slab.parent[there], *new, part, self.frame))
             origin.append(which[there])

@@ -56,7 +56,7 @@ def range_of(expression: ufl.core.expr.Expr, cells: Cells) -> Range | None:
 
 def range_on(expression: ufl.core.expr.Expr, whole: Pieces, cells: Cells) -> Range | None:
     """Bound an expression below and above on pieces, shapes (n,); see `range_of`."""
-    data, n = lowered(expression), len(whole.part)
+    data, n = lowered(expression), len(whole.share)
     try:
         jet = Enclosure(whole.boxes(cells), order=0)(data)
         low, high = (np.array(np.broadcast_to(x, n)) for x in (jet.low, jet.high))
@@ -176,7 +176,7 @@ class Deviation:
         """Cut pieces so that no point at which the data may be singular is inside of one."""
         while self.singular and (found := first_inside(self.expression, pieces.corners)):
             point, which, hats = found
-            rest = np.setdiff1d(np.arange(len(pieces.part)), which)
+            rest = np.setdiff1d(np.arange(len(pieces.share)), which)
             pieces = pieces[rest] + pieces[which].around(point, hats)
         return pieces
 
@@ -187,7 +187,7 @@ class Deviation:
         hats = np.hstack([np.eye(3), EDGES])
 
         def at(pieces: Pieces) -> FloatArray:
-            points, shape = pieces.points(cells, hats), (hats.shape[1], len(pieces.part))
+            points, shape = pieces.points(cells, hats), (hats.shape[1], len(pieces.share))
             return np.stack([values(each, points).reshape(shape) for each in self.differences])
 
         return at
@@ -260,7 +260,7 @@ def chunks(n: int) -> list[slice]:
 
 def errors_on(pieces: Pieces, errors: Errors, cells: Cells, decide: bool = True) -> FloatArray:
     """Work out what is to be known on boxes around pieces; for `decide` see `Boxes.corners`."""
-    n = len(pieces.part)
+    n = len(pieces.share)
     if n > CHUNK:
         parts_of = [errors_on(pieces[part], errors, cells, decide) for part in chunks(n)]
         return np.concatenate(parts_of, axis=1)

@@ -475,8 +475,8 @@ def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[_Way]:
     highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     functional = _functional(known, plain)
-    for touching in (False, True):
-        v = companion(functional, flux, u_D, alpha, sweeps, goal, highest, touching)
+    for on_obstacle in (False, True):
+        v = companion(functional, flux, u_D, alpha, sweeps, goal, highest, on_obstacle)
         sums = _integrated(known, v)
         of_y, of_alpha = promising(cells, kappa.mean, flux, v, sums)
         _complete(known, v, sums)

@@ -118,7 +118,7 @@ def companion(
     sweeps: int,
     goal: float,
     highest: float,
-    touching: bool = False,
+    on_obstacle: bool = False,
 ) -> Companion:
     """Make v; collective.
 
@@ -130,10 +130,10 @@ def companion(
         sweeps: How often the bumps are improved.
         goal: What ‖∇ℓ‖ need not be known better than.
         highest: The largest κ.
-        touching: Whether v is α wherever y says that there is contact, whatever that costs.
+        on_obstacle: Whether v is α wherever y says that there is contact, whatever that costs.
     """
     cells, floors = functional.cells, Floors.of(functional.cells, alpha, functional.masses)
-    draft = _started(functional, u_D, floors, flux, touching)
+    draft = _started(functional, u_D, floors, flux, on_obstacle)
     largest = max(1e-300, float(np.abs(draft.vertices).max(initial=0.0)))
     scale = max(cells.comm.allgather(largest))
     boundary = Boundary(u_D, alpha, scale, goal, highest, functional.masses)
@@ -153,7 +153,7 @@ def companion(
 
 
 def _started(
-    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, touching: bool
+    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, on_obstacle: bool
 ) -> Draft:
     """Make a v that is admissible, with bumps where data ask for them; collective.
 
@@ -162,10 +162,10 @@ def _started(
         u_D: Values on Γ0, seen from the cells.
         floors: What the bounds ask of v.
         flux: y, which knows where there is contact.
-        touching: As in `companion`.
+        on_obstacle: As in `companion`.
     """
     cells, fixed, contact = functional.cells, u_D.side, floors.side
-    v, at_bound = _at_vertices(functional, u_D, floors, flux, touching)
+    v, at_bound = _at_vertices(functional, u_D, floors, flux, on_obstacle)
     held = np.zeros(len(v))
     held[fixed.ends] = held[contact.ends[:, at_bound]] = 1.0
     bumps, taken = np.zeros((2, floors.facets))
@@ -272,7 +272,7 @@ class Boundary:
 
 
 def _at_vertices(
-    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, touching: bool
+    functional: Functional, u_D: OnParts, floors: Floors, flux: Flux, on_obstacle: bool
 ) -> tuple[FloatArray, BoolArray]:
     """Average u_h at vertices, weighted by what it costs to leave its values; or take α, β, u_D.
 
@@ -300,12 +300,12 @@ def _at_vertices(
         v /= np.maximum(collect(flat, None), 1.0)
     at_bound, loss = flux.touching.copy(), np.zeros(floors.facets)
     loss[masses.side.dofs] = masses.loss
-    moving = None if touching else _moving(functional, floors)
+    moving = None if on_obstacle else _moving(functional, floors)
     for sign, limit in floors.at_vertices:
         here = flux.touching & (floors.signs == sign)
         there = floors.side.ends[:, here]
         held = collect(there.ravel(), None) > 0
-        if not touching and (masses.some or moving is not None):
+        if not on_obstacle and (masses.some or moving is not None):
             # what leaving t/b and u_h for α costs in ‖p − b‖², and what not doing so costs in 4C
             costs, of_force = (
                 collect(there.ravel(), np.tile(each[here], len(there)))

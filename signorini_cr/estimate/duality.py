@@ -299,7 +299,7 @@ class DualityGap:
     def add_edge(self, edge: Segments) -> None:
         """Add what g has beyond its means on Γg, and where there is a b what v − u_h is.
 
-        σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so that ∫_T σ·∇φ = ∫_F (g − g_F) φ.
+        σ gets a part with div σ = 0 in T and σ·n = g − g_F on F, so ∫_T σ·∇φ = ∫_F (g − g_F) φ.
         Where κ varies within cells, y − κ∇u_h is no gradient, and there is a slack as with f. Where
         b is large it takes up g − g_F, as c does with f.
 
@@ -550,7 +550,7 @@ def _over_pieces(kappa: Coefficient, block: slice, integrals: Integrals) -> Floa
         pieces = cut.pieces[np.arange(first, last)]
         hats = at_points(pieces.hats, rule.hats).swapaxes(0, 1)
         known = cut.errors_inside[:, first:last], kappa.inside[:, first:last]
-        there = integrals(pieces.parent, *known, hats) * pieces.part
+        there = integrals(pieces.parent, *known, hats) * pieces.share
         which, place = np.unique(pieces.parent - block.start, return_inverse=True)
         rows[:, which] = [np.bincount(place, row, minlength=len(which)) for row in there]
     return rows

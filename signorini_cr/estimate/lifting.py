@@ -186,7 +186,7 @@ def _lifted(found: _Enclosed, seen: Triangles, n: int, rough: str) -> Lift:
     pieces, length, height = found.pieces, seen.length, seen.height
 
     def mean(values: FloatArray) -> FloatArray:
-        sums = np.bincount(pieces.parent, pieces.part * values, minlength=n)
+        sums = np.bincount(pieces.parent, pieces.share * values, minlength=n)
         return np.asarray(sums, dtype=np.float64)
 
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -372,7 +372,7 @@ def _bounds(
     boxes = pieces.boxes(cells, decide=True)
     over = Enclosure(boxes, rounding=DATA_ROUNDING * scale)(expression)
     at, s = pieces.parent, pieces.hats[:, 1].mean(axis=0)
-    e = 0.5 * length[at] * pieces.part
+    e = 0.5 * length[at] * pieces.share
     there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(expression)
     c, m = _balls(over, len(at)), _balls(there, len(at))
     slope = base.slope(at, s) / length[at]
@@ -426,7 +426,7 @@ def _jump_at_ends(
     for end in (0, 1):
         corners = whole.corners.copy()
         corners[1 - end] = corners[end] + END * (whole.corners[1 - end] - corners[end])
-        near = Pieces(whole.parent, corners, whole.hats, whole.part, whole.frame)
+        near = Pieces(whole.parent, corners, whole.hats, whole.share, whole.frame)
         jet = Enclosure(near.boxes(cells, decide=True))(expression)
         found |= jet.low > base.ends[end] + jump
         if not obstacle:

@@ -46,20 +46,21 @@ class Walk:
         """
         columns: dict[str, npt.NDArray] = {"vertices": vertices, "measure": measure}
         if mesh.topology.dim == 2:
-            columns["reverse"] = _clockwise(mesh, facets, vertices)
-            columns["nodes"] = _nodes(mesh, facets)
+            entities = facet_entities(mesh, facets)
+            columns["reverse"] = _clockwise(mesh, entities, vertices)
+            columns["nodes"] = _nodes(mesh, entities)
         rows = _gathered(mesh.comm, columns)
         if not rows:
             return cls(mesh.comm, {}, np.empty(0, dtype=np.int64), None)
         midpoints, length = rows["vertices"].mean(axis=1), rows["measure"]
         # The same order whatever the ranks held: by coordinates first
         order, way = np.lexsort(midpoints.T[::-1]), None
-        part: Int64Array = np.zeros(len(order), dtype=np.int64)
+        piece: Int64Array = np.zeros(len(order), dtype=np.int64)
         arc_length: FloatArray = np.full(len(order), np.nan)
         if mesh.topology.dim == 2:
-            way, part, arc_length = _Way.of(rows)
-            order = np.lexsort([way.steps, part])
-        place = {"part": part, "arc_length": arc_length, "x": midpoints[:, 0]}
+            way, piece, arc_length = _Way.of(rows)
+            order = np.lexsort([way.steps, piece])
+        place = {"part": piece, "arc_length": arc_length, "x": midpoints[:, 0]}
         place |= {"y": midpoints[:, 1], "length": length}
         return cls(mesh.comm, {name: each[order] for name, each in place.items()}, order, way)
 
@@ -94,20 +95,20 @@ def _gathered(comm: MPI.Comm, columns: dict[str, npt.NDArray]) -> dict[str, npt.
     gathered = comm.gather(columns, root=0)
     if gathered is None:
         return {}
-    return {name: np.concatenate([part[name] for part in gathered]) for name in columns}
+    return {name: np.concatenate([own[name] for own in gathered]) for name in columns}
 
 
-def _clockwise(mesh: Mesh, facets: Int32Array, vertices: FloatArray) -> npt.NDArray:
+def _clockwise(mesh: Mesh, entities: Int32Array, vertices: FloatArray) -> npt.NDArray:
     """Tell whether Ω lies to the right on the way from a facet's first vertex to its second."""
-    cells, local = facet_entities(mesh, facets).T
+    cells, local = entities.T
     apex = mesh.geometry.x[cell_nodes(mesh)[cells, local]]
     along, inward = vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]
     return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
 
 
-def _nodes(mesh: Mesh, facets: Int32Array) -> Int64Array:
+def _nodes(mesh: Mesh, entities: Int32Array) -> Int64Array:
     """Find the numbers of facets' vertices that all ranks have for them, shape (n, 2)."""
-    nodes = facet_nodes(mesh, facet_entities(mesh, facets))
+    nodes = facet_nodes(mesh, entities)
     numbers = mesh.geometry.index_map().local_to_global(nodes.ravel())
     return np.asarray(numbers, dtype=np.int64).reshape(nodes.shape)
 
@@ -130,19 +131,19 @@ class _Way:
         ends: Vertices in that order, shape (n, 2, 3).
         flip: Whether they have changed places, shape (n,).
         before: For each facet the one that ends where it begins, itself where there is none.
-        part: The connected piece of Γ1, from 0.
+        piece: The connected piece of Γ1, from 0.
         steps: How many facets there are from the first one of it.
     """
 
     ends: FloatArray
     flip: BoolArray
     before: Int64Array
-    part: Int64Array
+    piece: Int64Array
     steps: Int64Array
 
     @classmethod
     def of(cls, rows: dict[str, npt.NDArray]) -> tuple[_Way, Int64Array, FloatArray]:
-        """Find it, and the part of each facet and how far its midpoint is from the beginning.
+        """Find it, and the piece of each facet and how far its midpoint is from the beginning.
 
         Args:
             rows: Vertices, shape (n, 2, 3), their numbers, shape (n, 2), whether Ω lies to the
@@ -156,14 +157,14 @@ class _Way:
         rank = np.empty(len(ends), dtype=np.int64)
         rank[np.lexsort([*along.T[::-1], *midpoints.T[::-1]])] = np.arange(len(ends))
         first, steps, distance = _way_from_first(_cut(before, rank), length)
-        part = np.unique(rank[first], return_inverse=True)[1]
-        return cls(ends, flip, before, part, steps), part, distance + 0.5 * length[first]
+        piece = np.unique(rank[first], return_inverse=True)[1]
+        return cls(ends, flip, before, piece, steps), piece, distance + 0.5 * length[first]
 
     def transitions(self, rows: dict[str, npt.NDArray]) -> FloatArray:
         """Find the transition points, in order along the boundary, shape (m, 3)."""
         gaps = _turned(rows["gap_at_vertices"], self.flip)
         points, behind = _transitions(self.before, self.ends, gaps, rows)
-        found: FloatArray = points[np.lexsort([self.steps[behind], self.part[behind]])]
+        found: FloatArray = points[np.lexsort([self.steps[behind], self.piece[behind]])]
         return found
 
 

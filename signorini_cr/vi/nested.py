@@ -25,7 +25,6 @@ from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.space import (
     facet_corners,
     facet_entities,
-    facet_measures,
     ghosted_vector,
     simplex_measures,
 )
@@ -68,7 +67,7 @@ def nested_start(
         return
     vector = ghosted_vector(level.V, start.x.array)
     facets = system.bounded_facets[system.facets_by_dof()]
-    expected = _Expected.of(_Inherited.of(coarse, level, facets), system, vector)
+    expected = _Expected.of(_Inherited.of(coarse, level), system, vector)
     _put_on_bounds(start, system, expected)
     _make_forces(start, vector, system, facets, expected)
     release(vector)
@@ -200,12 +199,14 @@ class _Inherited:
     at_front: BoolArray
 
     @classmethod
-    def of(cls, coarse: Solved, level: Level, facets: Int32Array) -> _Inherited:
-        """Ask the parents of some fine contact facets; collective."""
+    def of(cls, coarse: Solved, level: Level) -> _Inherited:
+        """Ask the parents of the fine contact facets, in the order of their dofs; collective."""
         mesh, V = coarse.domain.mesh, coarse.u.function_space
-        parents = level.parents
+        parents, system = level.parents, level.system
         assert parents is not None
-        x, measure = facet_measures(level.domain.mesh, facets)
+        order = system.facets_by_dof()
+        x, measure = (each[order] for each in system.measured)
+        facets = system.bounded_facets[order]
         cells = facet_entities(level.domain.mesh, facets)[:, 0]
         # The parent facet lies opposite the vertex whose barycentric coordinate vanishes on it
         simplices = parents.take(mesh.geometry.x, compat.cell_nodes(mesh), cells)

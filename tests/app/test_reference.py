@@ -17,7 +17,7 @@ import signorini_cr
 from signorini_cr import Contact, options, solve
 from signorini_cr.adaptive import adapt_to_run
 from signorini_cr.app.cli import main
-from signorini_cr.app.commandline import KEYS_OF, _parser
+from signorini_cr.app.commandline import UsageError, _parser, read_arguments
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, ADAPTIVE, KEYS, MATERIAL, PART, QUANTITY, TYPES
 from signorini_cr.fem.problem import Material, Problem
@@ -242,16 +242,19 @@ def test_runs_in_time_seek_their_mesh_by_the_same_keys() -> None:
         assert name in in_time and in_time[name].default == default, name
 
 
-def test_what_is_no_option_is_a_key() -> None:
-    known = {(key.section, key.name) for key in KEYS}
-    told = {(section, key) for key, section in KEYS_OF.items()}
-    assert told <= known
-    parser, commands = _parser()
-    actions = (each._option_string_actions for each in (parser, *commands.values()))
-    taken = {name.lstrip("-").replace("-", "_") for names in actions for name in names}
-    for section in ("refine", "time"):
-        keys = {name for where, name in known if where == section}
-        assert keys <= {name for where, name in told if where == section} | taken, section
+@pytest.mark.parametrize("key", KEYS, ids=lambda key: f"{key.section}.{key.name}")
+def test_a_key_that_is_taken_for_an_option_is_told(key) -> None:
+    """Those of sections; that of the top of the file is nothing that one would look for."""
+    words = ["solve", "FILE", f"--{key.name.replace('_', '-')}=1"]
+    if f"--{key.name}" in _parser()[1]["solve"]._option_string_actions:
+        return
+    sections = {f"[{each.section}]" for each in KEYS if each.name == key.name}
+    with pytest.raises(UsageError) as caught:
+        read_arguments(words)
+    told = re.search(r"; (\w+) is a key of (\[\S+\]) in the problem file", str(caught.value))
+    assert (told and told[1] == key.name and told[2] in sections) or (
+        told is None and not key.section
+    )
 
 
 @pytest.mark.serial

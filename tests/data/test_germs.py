@@ -122,7 +122,7 @@ def test_slivers_at_a_singular_point_are_not_cut_into_slabs():
         sliver, lambda p: errors_on(p, errors, cells), weights, 300, cells, deviation.apart
     )
     assert np.isfinite(found).all()
-    assert len(pieces.part) < 20
+    assert len(pieces.share) < 20
 
 
 @pytest.mark.parametrize("off", [0.0, 3e-17, -3e-17, 4e-14, -4e-14])
@@ -138,6 +138,6 @@ def test_a_singular_point_on_a_side(off):
     pieces = Pieces(np.zeros(1, dtype=int), corners, np.eye(3)[:, :, None], np.ones(1))
     cut = deviation.apart(pieces)
     assert first_inside(expression, cut.corners) is None
-    assert np.isclose(cut.part.sum(), 1.0, rtol=1e-12)
+    assert np.isclose(cut.share.sum(), 1.0, rtol=1e-12)
     rule = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])
     assert np.isfinite(allowance(expression, cut.corners, rule)[0]).any()

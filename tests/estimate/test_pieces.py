@@ -1340,9 +1340,7 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     none, w = np.zeros(len(cells.exterior)), np.zeros((3, cells.number))
     v = SimpleNamespace(vertices=none, bumps=none)
     none_at_all = np.array(0.0)
-    gap = duality.DualityGap(
-        data.cells, kappa, w, None, fluxes, v, none_at_all, none_at_all, sums
-    )
+    gap = duality.DualityGap(data.cells, kappa, w, None, fluxes, v, none_at_all, none_at_all, sums)
     gap.add_edge(edge)
     at, sizes = edge.oscillation(True)
     assert sums.totals.loose == 0.0 and len(at) == 4 and sizes.min() > 1e-3

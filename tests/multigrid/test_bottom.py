@@ -8,9 +8,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from signorini_cr.multigrid import bottom
-from signorini_cr.multigrid.bottom import AMG, Bottom
+from signorini_cr.multigrid.bottom import Bottom
 from signorini_cr.multigrid.constrained import ConstrainedMatrix
 from signorini_cr.multigrid.cycle import Grid, Multigrid
+from signorini_cr.options import AMG
 
 pytestmark = pytest.mark.serial
 HAS_HYPRE = PETSc.PC.Type.HYPRE == AMG
