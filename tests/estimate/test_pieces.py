@@ -245,7 +245,7 @@ def test_bounds_by_taylors_formula(signed, monkeypatch):
         points=lambda *_: "there",
         parent=np.arange(n),
         hats=np.stack([np.stack([1 - t, t]) for t in (a, b)]),
-        part=b - a,
+        share=b - a,
     )
     scale = 100.0
     found = lifting._bounds(None, pieces, base, None, length, scale, signed)
