@@ -5,7 +5,8 @@
 draws mutants of a street (or of one file), runs the street's tests on each in a process of its
 own, forked from this one so that nothing large is imported twice, and prints those that survive.
 With `--ranks 2` tests are run once more on those that survive on one rank, for what only ranks say
-to each other.
+to each other. `--only signorini_cr/multigrid/smoothing.py:GaussSeidel._sweep` takes the mutants of
+a function, and with `:text` behind it those of its lines that have this text.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from collections.abc import Callable, Iterator
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
 from types import CodeType
+from typing import Any
 
 import numpy as np
 
@@ -161,6 +163,26 @@ def load(path: Path, index: int) -> Mutated:
     return mutated
 
 
+def lines_of(place: str) -> tuple[Path, set[int]]:
+    """The lines of a function, as `FILE:NAME`, or those with a text in them, as `FILE:NAME:TEXT`.
+
+    The name is the qualified one, `Class.method`; a class stands for all of it.
+    """
+    file, name, *text = place.split(":", 2)
+    source = (ROOT / file).read_text()
+    lines = source.splitlines()
+    found: list[Any] = [ast.parse(source)]
+    for part in name.split("."):
+        inside = [one for node in found for one in getattr(node, "body", ())]
+        found = [one for one in inside if getattr(one, "name", None) == part]
+    numbers = {i for node in found for i in range(node.lineno, node.end_lineno + 1)}
+    if text:
+        numbers = {i for i in numbers if text[0] in lines[i - 1]}
+    if not numbers:
+        raise argparse.ArgumentTypeError(f"{place}: there is no such line")
+    return ROOT / file, numbers
+
+
 def end_of(mutated: Mutated | None, tests: list[str], seconds: float) -> str:
     """Return the end of the tests: passed, failed, or timeout."""
     child = os.fork()
@@ -217,7 +239,13 @@ def main() -> None:
     parser.add_argument("what", help="a street of the package, or one of its files")
     parser.add_argument("--count", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", metavar="FILE:LINE", nargs="*", help="the mutants of these lines")
+    parser.add_argument(
+        "--only",
+        metavar="FILE:NAME[:TEXT]",
+        nargs="*",
+        type=lines_of,
+        help="the mutants of these functions, or of their lines with this text",
+    )
     parser.add_argument("--tests", nargs="*", help="what to run instead of the street's tests")
     parser.add_argument(
         "--ranks", type=int, default=1, help="for a second try of those that survive"
@@ -239,22 +267,22 @@ def main() -> None:
             sys.exit(f"the tests fail as it is on {arguments.ranks} ranks")
         limit_on_ranks = 30 + 5 * (time.monotonic() - began)
     pool = [
-        (path, i, f"{path.relative_to(ROOT)}:{line}: {what}")
+        (path, i, line, what)
         for path in files
         for i, (line, what, _) in enumerate(mutants(ast.parse(path.read_text())))
     ]
     drawn = [pool[i] for i in np.random.default_rng(arguments.seed).permutation(len(pool))]
     if arguments.only:
-        wanted = tuple(f"{place}: " for place in arguments.only)
-        drawn = [one for one in drawn if one[2].startswith(wanted)]
+        wanted = {(path, line) for path, lines in arguments.only for line in lines}
+        drawn = [one for one in drawn if (one[0], one[2]) in wanted]
     ends: Counter[str] = Counter()
-    for path, index, what in drawn[: arguments.count]:
+    for path, index, line, what in drawn[: arguments.count]:
         end = end_of(load(path, index), tests, limit)
         if end == "passed" and arguments.ranks > 1:
             end = end_on(arguments.ranks, path, index, tests, limit_on_ranks)
         ends[end] += 1
         if end == "passed" or arguments.all:
-            print(f"{end}: {what}", flush=True)
+            print(f"{end}: {path.relative_to(ROOT)}:{line}: {what}", flush=True)
     noticed, number = ends["failed"] + ends["timeout"], ends.total()
     print(f"{noticed} of {number} mutants noticed, {noticed / number:.1%}; {len(pool)} there are")
 
