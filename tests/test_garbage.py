@@ -135,7 +135,7 @@ def test_meshes_go_after_an_error_inside_the_cycle(
         raise ArithmeticError("in the cycle")
 
     def end() -> None:
-        for solution in solve_levels(exact.A.problem, exact.A.structured(4), 3):
+        for solution in solve_levels(exact.A.problem, exact.A.structured(3), 3):
             watch.add(solution.domain.mesh.comm, solution.level.number)
             if solution.level.number == 1:
                 monkeypatch.setattr(GaussSeidel, "backward", fail)

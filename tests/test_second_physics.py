@@ -291,6 +291,7 @@ def uniformly(solution):
     return (*refine(solution.domain), None) if solution.level.number < 2 else None
 
 
+@pytest.mark.slow
 def test_nested_meshes(domain):
     solutions = list(solve_physics(Coupled(), domain, uniformly))
     assert [s.cells for s in solutions] == [4**i * solutions[0].cells for i in range(3)]

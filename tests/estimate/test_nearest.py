@@ -112,7 +112,7 @@ def test_a_small_system_has_the_same_solution(kappa, monkeypatch):
 
 def test_multigrid_of_petsc_on_thin_cells(monkeypatch):
     """GAMG is in every PETSc: it gets to the end in time, and leaves alone what is not free."""
-    mesh = create_rectangle(WORLD, [(-1, 0), (1, 1)], [6, 90])
+    mesh = create_rectangle(WORLD, [(-1, 0), (1, 1)], [5, 75])
     mesh.topology.create_connectivity(1, 2)
     rim = exterior_facet_indices(mesh.topology)
     domain = Domain(mesh, meshtags(mesh, 1, rim, np.full_like(rim, CONTACT)))

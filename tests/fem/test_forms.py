@@ -46,8 +46,8 @@ def anisotropic(u, v, dx, ds):
     return bulk * dx(degree=4) + 3.0 * u * v * ds("right")
 
 
-@pytest.mark.parametrize(("element", "levels"), [("CR", 4), ("P1", 3)])
-def test_rates_with_contact_on_half_of_the_floor(element, levels):
+@pytest.mark.parametrize("element", ["CR", "P1"])
+def test_rates_with_contact_on_half_of_the_floor(element):
     """λ = max(x, 0)² and u − α = max(−x, 0)²: complementary, and u is any smooth function."""
 
     def u(x):
@@ -70,7 +70,7 @@ def test_rates_with_contact_on_half_of_the_floor(element, levels):
             "left": Dirichlet(),
         },
     )
-    found = list(solve_levels(problem, SQUARE.mesh(0.25), levels, element))
+    found = list(solve_levels(problem, SQUARE.mesh(0.35), 3, element))
     h, h1, l2 = np.array([(s.h, *s.errors) for s in found]).T
     assert norms.rates(h, h1)[-1] == pytest.approx(1.0, abs=0.05)
     assert norms.rates(h, l2)[-1] == pytest.approx(2.0, abs=0.15)
@@ -94,7 +94,7 @@ def test_the_models_form_as_ones_own():
         reaction=2.0,
         conditions=WALLS | {"floor": Contact(-0.01), "right": Neumann()},
     )
-    domain = SQUARE.mesh(0.2)
+    domain = SQUARE.mesh(0.4)
     for theirs, ours in zip(*(solve_levels(p, domain, 3) for p in (given, own)), strict=True):
         assert ours.u.x.array == pytest.approx(theirs.u.x.array, abs=1e-9)
         assert ours.contact.force == pytest.approx(theirs.contact.force, rel=1e-7)
@@ -102,7 +102,7 @@ def test_the_models_form_as_ones_own():
 
 
 def test_functions_of_degree_0_go_along():
-    domain = SQUARE.mesh(0.25)
+    domain = SQUARE.mesh(0.4)
     k = fem.Function(fem.functionspace(domain.mesh, ("DG", 0)))
     k.interpolate(lambda x: 1.0 + 9.0 * (x[0] > 0.0))
     walls = WALLS | {"floor": Contact(-0.02)}
@@ -114,7 +114,7 @@ def test_functions_of_degree_0_go_along():
 
 def test_tensors_of_degree_0_go_along():
     """Like the matrix of what their entries are, which are scalars; the error's bound, too."""
-    domain = SQUARE.mesh(0.25)
+    domain = SQUARE.mesh(0.4)
     cells = {shape: fem.functionspace(domain.mesh, ("DG", 0, shape)) for shape in ((), (2, 2))}
     whole = fem.Function(cells[2, 2])
     whole.interpolate(lambda x: np.stack([2 + x[0], 0.2 * x[1], 0.2 * x[1], 1 + x[1] ** 2]))
@@ -146,7 +146,7 @@ def test_dx_of_a_material(named):
     """κ and f of two materials, or of one and the rest, on meshes that are refined."""
     kappa, load = {"left": 3.0, "right": 0.25}, {"left": -1.0, "right": 2.0}
     polygons = {name: HALVES[name] for name in named}
-    domain = Polygon(SQUARE.vertices, EDGES, names=EDGES, materials=polygons).mesh(0.3)
+    domain = Polygon(SQUARE.vertices, EDGES, names=EDGES, materials=polygons).mesh(0.4)
     rest = {} if len(named) == 2 else {"coefficient": kappa["left"], "f": load["left"]}
     materials = {name: Material(coefficient=kappa[name], f=load[name]) for name in named}
     conditions = WALLS | {"floor": Contact(-0.02)}

@@ -243,13 +243,13 @@ def test_short_edges_get_a_facet_and_angles_stay_away_from_zero(size: float):
 
 
 def test_triangles_grow_away_from_short_edges():
-    """A disk with 200 corners at the size of its radius: far fewer cells than if all were small."""
-    angle = 2 * np.pi * np.arange(200) / 200
-    labels = ["contact", "dirichlet"] * 100
+    """A disk with 120 corners at the size of its radius: far fewer cells than if all were small."""
+    angle = 2 * np.pi * np.arange(120) / 120
+    labels = ["contact", "dirichlet"] * 60
     domain = Polygon(np.stack([np.cos(angle), np.sin(angle)], axis=1), labels).mesh(1.0)
-    assert area(domain) == pytest.approx(100 * np.sin(np.pi / 100))
-    assert counts(domain) == [100, 100, 0]
-    assert domain.mesh.topology.index_map(2).size_global < 2500  # 7300 equilateral ones
+    assert area(domain) == pytest.approx(60 * np.sin(np.pi / 60))
+    assert counts(domain) == [60, 60, 0]
+    assert domain.mesh.topology.index_map(2).size_global < 1000  # 2600 equilateral ones
     assert smallest_angle(domain.mesh) > 20
 
 
@@ -264,7 +264,7 @@ def test_the_same_polygon_gives_the_same_mesh():
     assert len(set(COMM.allgather(a.tobytes()))) == 1
 
 
-@pytest.mark.parametrize("size", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
 def test_every_rank_gets_its_share(size: float):
     cells = Polygon(RECTANGLE, LABELS).mesh(size).mesh.topology.index_map(2)
     fair = cells.size_global / COMM.size

@@ -47,14 +47,14 @@ def own(mode: dolfinx.mesh.GhostMode, n: int) -> Domain:
 def domain(request) -> Domain:
     none, shared = dolfinx.mesh.GhostMode.none, dolfinx.mesh.GhostMode.shared_facet
     makers = {
-        "rectangle": lambda: SHAPES["rectangle"].mesh(0.3),
-        "hole": lambda: SHAPES["hole"].mesh(0.2),
+        "rectangle": lambda: SHAPES["rectangle"].mesh(0.4),
+        "hole": lambda: SHAPES["hole"].mesh(0.4),
         "few cells": lambda: SHAPES["rectangle"].mesh(2.2),
         "one cell": lambda: Polygon(
             [[0, 0], [1, 0], [0, 1]], ["contact", "dirichlet", "neumann"]
         ).mesh(2**0.5),
-        "own": lambda: own(none, 5),
-        "own, ghosts": lambda: own(shared, 5),
+        "own": lambda: own(none, 3),
+        "own, ghosts": lambda: own(shared, 3),
         "own, two cells": lambda: own(shared, 1),
     }
     return makers[request.param]()
@@ -125,7 +125,7 @@ def test_cells_are_cut_alike(domain):
 
 def test_refinement_keeps_the_domain(domain):
     before = geometry(domain)
-    for level in range(1, 4):
+    for level in range(1, 3):
         cells = domain.mesh.topology.index_map(2).size_global
         parts = [COMM.allreduce(len(domain.facets(part))) for part in (1, 2, 3)]
         domain, _ = refine(domain)
@@ -232,8 +232,8 @@ def outside(domain: Domain) -> list[np.ndarray]:
 @pytest.mark.parametrize("shape", SHAPES)
 def test_neighbours_have_numbers_that_lie_close_together(shape: str):
     """A cell's vertices are about √n numbers apart, not n/2 as with corners before midpoints."""
-    domain = SHAPES[shape].mesh(0.2)
-    for _ in range(4):
+    domain = SHAPES[shape].mesh(0.4)
+    for _ in range(2):
         domain, _ = refine(domain)
     topology = domain.mesh.topology
     owned = topology.index_map(0).size_local
@@ -242,6 +242,7 @@ def test_neighbours_have_numbers_that_lie_close_together(shape: str):
     assert np.ptp(inside, axis=1).mean() < 2.0 * np.sqrt(owned)
 
 
+@pytest.mark.slow
 def test_eight_levels_keep_the_angles():
     domain = SHAPES["rectangle"].mesh(2)
     angle, width = smallest_angle(domain.mesh), np.linalg.norm(sides(domain.mesh), axis=2)
@@ -303,7 +304,7 @@ def near(mesh: dolfinx.mesh.Mesh, point) -> np.ndarray:
 
 def test_marked_refinement_keeps_the_domain_and_the_angles(domain):
     before, angle = geometry(domain), smallest_angle(domain.mesh)
-    for level in range(6):
+    for level in range(5):
         marked = near(domain.mesh, (0, 0))
         coarse = domain
         domain, parent = refine_marked(coarse, marked)

@@ -27,6 +27,7 @@ def of_materials(domain: Domain) -> dict[str, float]:
     }
 
 
+@pytest.mark.slow
 def test_polygons_that_meet_in_every_way():
     """Beyond the domain, around and beside a hole, side by side, and apart from all others."""
     polygons = {

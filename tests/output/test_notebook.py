@@ -61,6 +61,7 @@ def test_the_notebook_begins_with_us():
     assert first.startswith("import signorini_cr")
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_the_cells_of_the_notebook_run():
     """As plain Python, where there is no Jupyter; they end in assertions of their own."""

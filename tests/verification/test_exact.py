@@ -86,6 +86,7 @@ def levels(name, n, number, **family):
     return h1, [energy for _, energy, _ in found], [solution for *_, solution in found]
 
 
+@pytest.mark.slow
 def test_reference_figures_of_s1():
     """Errors, energies from below and the error of the pressure, to the digits known."""
     h1, energies, solutions = levels("S1", 8, 5)
@@ -97,22 +98,21 @@ def test_reference_figures_of_s1():
     assert np.allclose(pressure, [0.066, 0.035, 0.0184, 0.0096, 0.0050], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_reference_figures_of_e():
     _, energies, _ = levels("E", 16, 4)
     assert np.allclose(energies, [-0.462937, -0.462065, -0.461833, -0.461774], rtol=0, atol=1.01e-6)
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
+@pytest.mark.slow
+def test_reference_figures_with_facet_means():
+    """The reference takes u_D at midpoints: means change an error by a share of O(h²)."""
+    for name, expected in (
         ("A", [0.1724, 0.0870, 0.0436, 0.0218]),
         ("B", [0.0870, 0.0438, 0.0219, 0.0110]),
         ("D", [0.176, 0.126, 0.0896, 0.0636]),
-    ],
-)
-def test_reference_figures_with_facet_means(name, expected):
-    """The reference takes u_D at midpoints: means change an error by a share of O(h²)."""
-    assert np.allclose(levels(name, 8, 4)[0], expected, rtol=0.02)
+    ):
+        assert np.allclose(levels(name, 8, 4)[0], expected, rtol=0.02), name
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
@@ -133,7 +133,7 @@ def test_a_new_solution_is_one_call():
         lambda t: exact.positive(0.3 - t) ** 2,
         lambda x: 2.0 - x[1] ** 2,
     )
-    solutions = list(solve_levels(pair.problem, pair.mesh(0.25), 4))
+    solutions = list(solve_levels(pair.problem, pair.mesh(0.35), 3))
     h1 = [solution.errors[0] for solution in solutions]
     assert np.all(abs(norms.rates([s.h for s in solutions], h1)[-2:] - 1.0) < 0.05)
     assert np.allclose(solutions[-1].contact.transitions[:, 0], 0.3, atol=0.15)
@@ -185,10 +185,10 @@ def test_each_term_and_condition_converges_as_theory_says(name):
     if "line" in data:
         u = exact.kinked(waves, data["line"], data["coefficient"], data["east"].coefficient)
     example = exact.made(u, kinds, **data)
-    domain = example.mesh(0.2)
+    domain = example.mesh(0.25)
     forms = Forms(example.problem, domain.mesh, "CR", domain.parts, domain.materials)
     assert doubts(forms, domain) == []
-    solutions = list(solve_levels(example.problem, domain, 4))
+    solutions = list(solve_levels(example.problem, domain, 3))
     h, h1, l2 = np.array([(s.h, *s.errors) for s in solutions]).T
     assert norms.rates(h, h1)[-1] == pytest.approx(1.0, abs=0.03)
     assert norms.rates(h, l2)[-1] == pytest.approx(2.0, abs=0.1)
@@ -258,7 +258,7 @@ def test_refining_gives_the_next_structured_mesh():
 
 
 def test_the_mapped_mesh_has_the_critical_point_inside_a_facet():
-    for n in (4, 8, 16, 32):
+    for n in (4, 8, 15):
         x = vertices(exact.S1.structured(n, shift=0.31))
         on_contact = np.sort(x[x[:, 1] == 0.0, 0])
         assert len(on_contact) == 2 * n + 1

@@ -51,7 +51,7 @@ def test_errors_with_another_quadrature():
 
 def test_distance_of_levels():
     """The triangle inequality, and for P1 the energy's."""
-    coarse, fine = solve_levels(exact.D.problem, exact.D.structured(8), 2)
+    coarse, fine = solve_levels(exact.D.problem, exact.D.structured(4), 2)
     distance = norms.distance(coarse, fine)
     assert distance < coarse.errors[0] + fine.errors[0]
     assert distance > coarse.errors[0] - fine.errors[0]
@@ -181,7 +181,7 @@ def test_facet_sets_with_one_critical_point(name):
 
 def test_facet_sets_with_infinitely_many_critical_points():
     """Contact begins and ends at 1/k: bound are the facets in [1/(2k), 1/(2k − 1)] and x < 0."""
-    left, right, sets = gathered_sets(exact.I.structured(16), exact.I)
+    left, right, sets = gathered_sets(exact.I.structured(15), exact.I)
     far = left > 0.15
     left, right = np.where(far, left, 1.0), np.where(far, right, 1.0)
     piece = np.floor(1.0 / right + 1e-9), np.ceil(1.0 / left - 1e-9)
@@ -189,17 +189,17 @@ def test_facet_sets_with_infinitely_many_critical_points():
     odd = piece[0] % 2 == 1
     expected = np.where(~inside, theory.MIXED, np.where(odd, theory.BOUND, theory.FREE))
     assert np.array_equal(sets[far], expected[far])
-    assert np.all(sets[:16] == theory.BOUND)
+    assert np.all(sets[:15] == theory.BOUND)
     assert {0, 1, 2} == set(sets.astype(int))
 
 
 def test_judgement_counts_every_facet():
-    solution = solve(exact.C2.problem, exact.C2.structured(16, shift=0.31))
+    solution = solve(exact.C2.problem, exact.C2.structured(12, shift=0.31))
     found = theory.judge(solution, exact.C2)
-    assert found.bound + found.mixed + found.free == 32
+    assert found.bound + found.mixed + found.free == 24
     assert found.active == solution.contact.number_active
     assert found.misjudged == found.missed + found.extra
     # λ ~ |x|^{9/2}: next to the critical point the discrete solution can't tell
     assert 1 <= found.misjudged <= 4
-    solution = solve(exact.S1.problem, exact.S1.structured(16))
+    solution = solve(exact.S1.problem, exact.S1.structured(12))
     assert theory.judge(solution, exact.S1).misjudged == 0

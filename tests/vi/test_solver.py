@@ -195,7 +195,7 @@ def test_a_function_of_one_mesh_is_not_taken_to_another(key, element):
 
 @pytest.mark.parametrize("scale", [1e-14, 1e-7, 1e9])
 @pytest.mark.parametrize("shift", [0.0, 1e5])
-@pytest.mark.parametrize("levels", [1, 4])
+@pytest.mark.parametrize("levels", [1, 3])
 def test_coefficients_of_any_magnitude(scale, shift, levels):
     """The solution does not depend on what κ and f are multiplied by, nor on a constant."""
 
@@ -206,7 +206,7 @@ def test_coefficients_of_any_magnitude(scale, shift, levels):
             dirichlet=lambda x: shift + 1.0 + x[0],
             coefficient=scale,
         )
-        *_, solution = solve_levels(problem, HELD_ABOVE.mesh(0.02 if levels == 1 else 0.2), levels)
+        *_, solution = solve_levels(problem, HELD_ABOVE.mesh(0.05 if levels == 1 else 0.25), levels)
         return solution
 
     one, scaled = last(1.0, shift), last(scale, shift)
@@ -326,7 +326,7 @@ def test_a_tolerance_that_is_none_is_the_users_mistake(options, value, said):
 
 def test_a_tolerance_of_zero_ends_in_rounding(options):
     options("snes_atol", 0)
-    *_, solution = solve_levels(PROBLEM, HELD_ABOVE.mesh(0.2), 3)
+    *_, solution = solve_levels(PROBLEM, HELD_ABOVE.mesh(0.25), 3)
     assert solution.contact.kkt.residual < 1e-12
 
 
@@ -376,13 +376,13 @@ def test_zero_data_give_zero(element):
 
 def test_levels_start_where_the_one_below_ended():
     """Each mesh has four times the cells, and energies of CR approach J from below (numerics E)."""
-    solutions = list(solve_levels(PROBLEM, HELD_ABOVE.mesh(0.25), 4))
+    solutions = list(solve_levels(PROBLEM, HELD_ABOVE.mesh(0.25), 3))
     cells = [solution.cells for solution in solutions]
-    assert cells == [cells[0] * 4**k for k in range(4)]
+    assert cells == [cells[0] * 4**k for k in range(3)]
     energies = np.array([solution.energy for solution in solutions])
     assert np.all(np.diff(energies) > 0)
-    assert energies[-1] == pytest.approx(-0.461754, rel=2e-3)
-    assert [solution.level.number for solution in solutions] == [0, 1, 2, 3]
+    assert energies[-1] == pytest.approx(-0.461754, rel=8e-3)
+    assert [solution.level.number for solution in solutions] == [0, 1, 2]
 
 
 def test_what_python_shows_is_a_line() -> None:
