@@ -41,7 +41,7 @@ PROBLEM = Problem(exact=exact)
 
 def run(comm=WORLD, levels=3):
     records = []
-    for solution in solve_levels(PROBLEM, rectangle(3, comm), levels):
+    for solution in solve_levels(PROBLEM, rectangle(4, comm), levels):
         records.append(output.level_record(solution, records[-1] if records else None))
     return solution, output.make_report("A", "CR", comm, records)
 
@@ -78,7 +78,7 @@ def test_the_report_has_the_keys_that_others_rely_on(folder):
 def test_the_report_says_what_the_solution_says(finished, folder):
     solution, _ = finished
     record = json.loads((folder / "report.json").read_text())["levels"][-1]
-    assert (record["cells"], record["contact"]["facets"]) == (576, 24)
+    assert (record["cells"], record["contact"]["facets"]) == (1024, 32)
     assert record["energy"] == solution.energy
     assert record["contact"]["force"] == solution.contact.force
     # ∫ |x|³ over (−1, 0), and the end of contact, at the origin
