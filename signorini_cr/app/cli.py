@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import sys
 import time
@@ -122,6 +123,10 @@ def _begin(args: argparse.Namespace, screen: Screen, asked: list[int]) -> Any:
         return _refuse(screen, f"{args.file}: {complaint}", NOT_CONVERGED)
     if sys.flags.optimize > 1:
         words = "Python runs without docstrings (-OO, PYTHONOPTIMIZE=2), which compiling takes"
+        return _refuse(screen, words, BAD_INPUT)
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "0")
+    if not re.fullmatch(r"\s*[+-]?\d+\s*", epoch):  # SciPy begins by reading it
+        words = f"SOURCE_DATE_EPOCH is {epoch!r}; the environment is to have a whole number there"
         return _refuse(screen, words, BAD_INPUT)
     try:
         os.getcwd()

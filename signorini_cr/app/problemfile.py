@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from ..arrays import FloatArray
 from ..data.admissible import check_boundary, check_data, check_operator
 from ..data.consistency import doubts
 from ..diffusion import Diffusion
-from ..errors import InputError, naming, on_root
+from ..errors import InputError, NotConverged, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
 from ..levels import check_pieces, solve_levels
@@ -105,8 +106,18 @@ class Time:
     capacity: float
     clock: Clock
 
-    def check(self, forms: Forms, domain: Domain) -> None:
-        """Try out at all times what depends on them of a_h, u_D and bounds; collective."""
+    def check(self, forms: Forms, domain: Domain, deadline: float | None = None) -> None:
+        """Try out at all times what depends on them of a_h, u_D and bounds; collective.
+
+        Args:
+            forms: The problem on the mesh.
+            domain: The mesh.
+            deadline: When there is no time left, by `time.perf_counter`; None if there is any.
+
+        Raises:
+            InputError: The data of a step make no sense.
+            NotConverged: There is no time left.
+        """
         losses = [c.loss for c in forms.conditions if c.loss is not None]
         checks = [
             check
@@ -121,6 +132,14 @@ class Time:
         start = self.clock.value
         for step in range(1, self.steps + 1):
             self.clock.value = self.end * step / self.steps
+            if deadline is not None:
+                over = domain.mesh.comm.allreduce(perf_counter() > deadline, op=MPI.LOR)
+                if over:
+                    self.clock.value = start
+                    raise NotConverged(
+                        f"the time limit is over, and the data are looked at up to step {step - 1}"
+                        f" of {self.steps}"
+                    )
             try:
                 for check in checks:
                     check(forms, domain)
@@ -148,6 +167,7 @@ class ProblemFile:
         time: What [time] says; None for a problem without time.
         units: What [units] and [names] say.
         said: All that levels depend on, by key, as it was written.
+        source: The text of the file.
     """
 
     title: str
@@ -164,6 +184,7 @@ class ProblemFile:
     time: Time | None
     units: Units
     said: Mapping[str, Any]
+    source: str
 
     def mesh(self, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Make or read the coarsest mesh; collective."""
@@ -174,11 +195,12 @@ class ProblemFile:
             assert self.size is not None
             return self.domain.mesh(self.size, comm)
 
-    def check(self, domain: Domain) -> list[str]:
+    def check(self, domain: Domain, deadline: float | None = None) -> list[str]:
         """Try the data out on the coarsest mesh; collective.
 
         Args:
             domain: From :meth:`mesh`.
+            deadline: As for `Time.check`.
 
         Returns:
             What contradicts itself in data that can be solved with, a sentence each.
@@ -188,6 +210,7 @@ class ProblemFile:
                 positive, u_D jumps, the obstacle lies above u_D where Γ0 meets Γ1, nothing holds a
                 piece of the domain, a quantity's part has no facet, or the last mesh of the
                 sequence would be absurdly large.
+            NotConverged: There is no time left.
         """
         topology = domain.mesh.topology
         cells = topology.index_map(topology.dim).size_global
@@ -204,7 +227,7 @@ class ProblemFile:
         if not domain.mesh.comm.allreduce(there):
             raise InputError("domain: no part of the boundary is contact; at least one is needed")
         if self.time is not None:
-            self.time.check(forms, domain)
+            self.time.check(forms, domain, deadline)
         check_data(forms, domain)
         if self.time is None:
             check_pieces(forms, domain)  # capacity would hold all
@@ -293,7 +316,8 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
         InputError: The file cannot be read or says something that is not allowed.
     """
     path = Path(path)
-    table = parse_toml(on_root(comm, read_text, path))
+    source = on_root(comm, read_text, path)
+    table = parse_toml(source)
     insist_known(table, "", (*allowed(""), *SECTIONS), KEYS_IN)
     heading = get(table, "", "title", title, path.stem)
     parts, materials = _parts(table), _materials(table)
@@ -341,6 +365,7 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm = MPI.COMM_WORLD) -> Probl
             for key, value in section.items()
             if f"{name}.{key}" not in ENDS and name not in TELLING
         },
+        source=source,
     )
 
 

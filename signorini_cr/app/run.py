@@ -160,8 +160,7 @@ class Run:
         """Write the run as one page; collective."""
 
         def make() -> str:
-            source = self.args.file.read_text(encoding="utf-8")
-            return run_page(self.folder, source, report, self.args.words, self.problem)
+            return run_page(self.folder, self.case.source, report, self.args.words, self.problem)
 
         def draw(path: Path) -> None:
             on_root(self.comm, write_text, path, make)

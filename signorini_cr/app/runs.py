@@ -70,7 +70,8 @@ def read_case(args: argparse.Namespace, screen: Screen, comm: Any) -> tuple[Prob
             raise InputError("--element: meshes are adapted by bounds, which only cr has")
     screen.progress("making the mesh")
     domain = case.mesh(comm)
-    for doubt in case.check(domain):
+    limit = getattr(args, "max_time", None)  # `check` has none
+    for doubt in case.check(domain, None if limit is None else args.began + limit):
         screen.warn(f"{args.file}: {doubt}")
     return case, domain
 

@@ -75,6 +75,7 @@ def write_files(
     writers: Mapping[str, Writer],
     removed: Iterable[str] = (),
     comm: MPI.Comm = MPI.COMM_WORLD,
+    begins: bool = False,
 ) -> list[str]:
     """Put files into a folder: all of them or, if a writer raises, none.
 
@@ -89,6 +90,8 @@ def write_files(
             its file out.
         removed: Names that shall not be there afterwards unless they were written.
         comm: The ranks that take part; all must call.
+        begins: Whether these are the first of a run: all that is there is another one's then, and
+            the file that vouches goes before any is replaced.
 
     Returns:
         The names of what was written.
@@ -108,7 +111,7 @@ def write_files(
         first, *others = written = [name for name in writers if (stage / name).exists()]
         obsolete = [path / name for name in set(removed) - set(written)]
         with disk_errors(path):
-            if any(map(os.path.lexists, obsolete)):
+            if begins or any(map(os.path.lexists, obsolete)):
                 (path / first).unlink(missing_ok=True)
                 for each in obsolete:
                     each.unlink(missing_ok=True)

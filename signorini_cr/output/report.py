@@ -249,7 +249,8 @@ def write_levels(
     writers = _texts(report, solution)
     facts = {"said": said, "levels": report["levels"]}
     writers[checkpoint.NAME] = lambda path: checkpoint.write_checkpoint(path, restart, facts, comm)
-    write_files(folder, writers, removed=of_former_runs(folder, comm), comm=comm)
+    begins = len(report["levels"]) == 1
+    write_files(folder, writers, of_former_runs(folder, comm), comm, begins)
     return list(writers)
 
 

@@ -249,12 +249,13 @@ def write_search(
         InputError: The folder can't be written to.
     """
     facts = {"said": said, "levels": report["search"]}
-    removed = of_former_runs(folder, comm) if len(report["search"]) == 1 else set()
+    begins = len(report["search"]) == 1
+    removed = of_former_runs(folder, comm) if begins else set()
     writers: dict[str, Writer] = {
         REPORT: lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
     }
-    write_files(folder, writers, removed=removed, comm=comm)
+    write_files(folder, writers, removed, comm, begins)
 
 
 def write_steps(
@@ -282,7 +283,8 @@ def write_steps(
         InputError: The folder can't be written to.
     """
     comm, records = solution.domain.mesh.comm, report["times"]
-    removed = of_former_runs(folder, comm) if len(records) == 1 else set()
+    begins = len(records) == 1
+    removed = of_former_runs(folder, comm) if begins else set()
 
     def text(make: Callable[[], str]) -> Writer:
         return lambda path: on_root(comm, write_text, path, make)
@@ -299,7 +301,7 @@ def write_steps(
         writers[checkpoint.MOMENTS] = lambda path: on_root(
             comm, checkpoint.write_arrays, path, arrays
         )
-    write_files(folder, writers, removed=removed, comm=comm)
+    write_files(folder, writers, removed, comm, begins)
 
 
 def read_moments(folder: Where, comm: MPI.Comm) -> list[Moment]:

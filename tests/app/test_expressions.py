@@ -217,6 +217,21 @@ def test_a_long_sum_is_not_deep_but_may_be_too_large() -> None:
         parse("a + " + " + ".join(["x"] * 3000), names)
 
 
+def test_names_count_wherever_they_are_used() -> None:
+    """UFL differentiates and compares what is shared again and again: 2⁴⁰ times, from 40 lines."""
+    names = {"s0": parse("sin(x + y)")}
+    operations = 4  # x and y among them
+    for k in range(40):
+        text = f"0.5*s{k}*s{k} + 0.1"
+        operations = 2 * operations + 5
+        if operations > LARGEST:
+            with pytest.raises(InputError, match=f"has {operations} operations, those of a name"):
+                parse(text, names)
+            return
+        names[f"s{k + 1}"] = parse(text, names)
+    raise AssertionError("nothing was refused")
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -224,8 +224,12 @@ def test_memory_is_that_of_the_program_alone(monkeypatch: pytest.MonkeyPatch) ->
     assert memory.most_memory() > ballast.nbytes
 
 
-def test_the_report_goes_first_and_comes_last(shared_tmp_path: Path, monkeypatch) -> None:
-    """So that wherever it is found, nothing of a former run is beside it."""
+@pytest.mark.parametrize("former", [FILES, ["report.json", "levels.csv", "levels.md"]])
+def test_the_report_goes_first_and_comes_last(former, shared_tmp_path: Path, monkeypatch) -> None:
+    """So that wherever it is found, nothing of a former run is beside it; short ones are included.
+
+    A run that was ended early has left nothing but what the next one's first level writes anew.
+    """
     seen: list[set[str]] = []
     replace, unlink = os.replace, Path.unlink
 
@@ -241,7 +245,7 @@ def test_the_report_goes_first_and_comes_last(shared_tmp_path: Path, monkeypatch
         look(path.parent)
 
     if COMM.rank == 0:
-        for name in FILES:
+        for name in former:
             (shared_tmp_path / name).write_text("former")
     COMM.Barrier()
     monkeypatch.setattr(os, "replace", replaced)
@@ -252,11 +256,62 @@ def test_the_report_goes_first_and_comes_last(shared_tmp_path: Path, monkeypatch
             path.write_text("new")
 
     names = ["report.json", "levels.csv", "levels.md"]
-    files.write_files(shared_tmp_path, dict.fromkeys(names, write), removed=FILES)
+    writers = dict.fromkeys(names, write)
+    files.write_files(shared_tmp_path, writers, removed=FILES, begins=True)
     if COMM.rank == 0:
         assert [("report.json" in there) for there in seen] == [False] * (len(seen) - 1) + [True]
         assert seen[-1] == set(names)
         assert all((shared_tmp_path / name).read_text() == "new" for name in names)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("renamed", [1, 2, 3, 4, 5])
+def test_no_report_of_a_former_run_is_beside_tables_of_another(tmp_path: Path, renamed) -> None:
+    """Both are killed while they publish: the first after its first mesh, the other on the way."""
+    program = (
+        "import os, signal\n"
+        "def replace(a, b, do=os.replace, seen=[]):\n"
+        "    do(a, b)\n"
+        "    seen.append(b)\n"
+        "    if len(seen) == COUNT:\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "os.replace = replace"
+    )
+    out = tmp_path / "out"
+    first = program.replace("COUNT", "5")
+    assert helpers.altered(tmp_path, kills.CASE, first, "-q").returncode == -signal.SIGKILL
+    assert len(json.loads((out / "report.json").read_text())["levels"]) == 1
+    case, second = kills.CASE.replace("f = -3", "f = -30"), program.replace("COUNT", str(renamed))
+    assert helpers.altered(tmp_path, case, second, "-q").returncode == -signal.SIGKILL
+    assert (out / "report.json").exists() == (renamed == 5)
+
+
+@pytest.mark.serial
+def test_a_page_shows_the_file_that_was_solved(tmp_path: Path) -> None:
+    """Whatever has become of it meanwhile."""
+    program = (
+        "from pathlib import Path\nfrom signorini_cr.app import run\n"
+        "def make(*args, do=run.output.make_report, **more):\n"
+        "    Path(CASE).unlink(missing_ok=True)\n"
+        "    return do(*args, **more)\n"
+        "run.output.make_report = make"
+    ).replace("CASE", repr(str(tmp_path / "case.toml")))
+    case = kills.CASE.replace("levels = 9", "levels = 1")
+    done = helpers.altered(tmp_path, case, program, "-q", "--html")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "0.1*x - 0.2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_an_epoch_that_is_no_number_is_told(ranks: int, tmp_path: Path) -> None:
+    """SciPy, which reads it, would end in a traceback."""
+    (tmp_path / "case.toml").write_text(kills.CASE)
+    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
+    done = helpers.command(*argv, ranks=ranks, SOURCE_DATE_EPOCH="abc")
+    assert done.returncode == cli.BAD_INPUT, done.stderr
+    assert done.stderr.count("SOURCE_DATE_EPOCH is 'abc'; the environment is to have a whole") == 1
+    assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
 
 
 @pytest.mark.serial

@@ -614,3 +614,14 @@ def test_the_clock_moves_what_holds_it():
     assert constant is clock.on(ufl.SpatialCoordinate(mesh)) and float(constant) == 2.0
     clock.value = 3.0
     assert float(constant) == 3.0 and clock.on(np.zeros((2, 4))) == 3.0
+
+
+def test_the_limit_of_time_counts_while_data_are_looked_at(case, shared_tmp_path, capfd):
+    """A hundred thousand steps are tried out before the first one is solved."""
+    text = CASE.replace("steps = 6", "steps = 100000").replace("[data]", '[data]\nreaction = "t"')
+    out = shared_tmp_path / "out"
+    assert solved(case(text), out, "--max-time", 1e-3) == 3
+    if COMM.rank == 0:
+        error = " ".join(capfd.readouterr().err.split())
+        assert "the time limit is over, and the data are looked at up to step 0 of 100000" in error
+        assert not out.exists()
