@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     from ..fem.problem import Problem
     from ..solution import Solution
 
+_USUAL = {DIRICHLET: "dirichlet", NEUMANN: "neumann", CONTACT: "contact"}
+"""Kinds of conditions on these parts, unless a problem says otherwise."""
 STYLES: dict[int, dict[str, Any]] = {
     DIRICHLET: {"color": BLUE, "linewidth": 2.5, "label": r"$\Gamma_0$: Dirichlet"},
     NEUMANN: {"color": YELLOW, "linewidth": 3.5, "label": r"$\Gamma_g$: Neumann"},
@@ -92,9 +94,13 @@ def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]
     kinds = {}
     for key, condition in getattr(problem, "conditions", {}).items():
         kinds[named(domain.parts, key)] = condition.kind
-    own = [(name, part) for name, part in domain.parts.items() if part not in STYLES]
+    styles = {
+        part: STYLES[part]
+        for name, part in domain.parts.items()
+        if part in STYLES and kinds.get(name, _USUAL[part]).lower() == _USUAL[part]
+    }
+    own = [(name, part) for name, part in domain.parts.items() if part not in styles]
     colors = itertools.cycle(OTHERS)
-    styles = dict(STYLES)
     for (name, part), color in zip(own, colors, strict=False):
         label = f"{name}: {kinds[name]}" if name in kinds else name
         styles[part] = {"color": color, "linewidth": 3.5, "label": label.replace("$", r"\$")}

@@ -21,6 +21,7 @@ from signorini_cr.app.commandline import UsageError, _parser, read_arguments
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, ADAPTIVE, KEYS, MATERIAL, PART, QUANTITY, TYPES
 from signorini_cr.fem.problem import Material, Problem
+from signorini_cr.output.units import Units
 
 BASE = {
     "domain": {
@@ -255,6 +256,12 @@ def test_a_key_that_is_taken_for_an_option_is_told(key) -> None:
     assert (told and told[1] == key.name and told[2] in sections) or (
         told is None and not key.section
     )
+
+
+@pytest.mark.serial
+def test_units_are_told_by_the_keys_of_their_section() -> None:
+    keys = {key.name for key in KEYS if key.section == "units"}
+    assert keys == {each.name for each in fields(Units)} - {"names"}
 
 
 @pytest.mark.serial

@@ -91,6 +91,26 @@ def test_the_mesh_tells_what_holds_on_parts_of_other_names():
         assert told == [name.replace("$", r"\$") for name in sides]
 
 
+def test_the_mesh_tells_what_holds_on_parts_of_usual_names():
+    """By their conditions, not by their names."""
+    sides = ["contact", "neumann", "dirichlet", "neumann"]
+    domain = Polygon(SQUARE.vertices, sides).mesh(0.5, WORLD)
+    usual = [r"$\Gamma_1$: contact", r"$\Gamma_g$: Neumann", r"$\Gamma_0$: Dirichlet"]
+    for held, words in (
+        ({}, usual),
+        ({"contact": Contact(0.0), "neumann": Neumann(1.0)}, usual),
+        ({"neumann": Robin(1.0)}, [usual[0], "neumann: Robin", usual[2]]),
+        (
+            {"contact": Robin(1.0), "dirichlet": Contact(0.0)},
+            ["contact: Robin", usual[1], "dirichlet: contact"],
+        ),
+    ):
+        figure = plots.plot_mesh(domain, problem=Problem(conditions=held))
+        if WORLD.rank == 0:
+            told = [text.get_text() for text in figure.legends[0].get_texts()]
+            assert sorted(told) == sorted(words)
+
+
 def test_a_mesh_of_too_many_edges_is_drawn_without(shared_tmp_path, monkeypatch):
     path = shared_tmp_path / "mesh.png"
     plots.plot_mesh(rectangle(16), path)
