@@ -125,7 +125,7 @@ def _begin(args: argparse.Namespace, screen: Screen, asked: list[int]) -> Any:
         words = "Python runs without docstrings (-OO, PYTHONOPTIMIZE=2), which compiling takes"
         return _refuse(screen, words, BAD_INPUT)
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "0")
-    if not re.fullmatch(r"\s*[+-]?\d+\s*", epoch):  # SciPy begins by reading it
+    if not re.fullmatch(r"\s*\d{1,11}\s*", epoch):  # SciPy begins by reading it, as a year
         words = f"SOURCE_DATE_EPOCH is {epoch!r}; the environment is to have a whole number there"
         return _refuse(screen, words, BAD_INPUT)
     try:

@@ -94,10 +94,11 @@ def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]
     kinds = {}
     for key, condition in getattr(problem, "conditions", {}).items():
         kinds[named(domain.parts, key)] = condition.kind
+    called = {part: name for name, part in domain.parts.items()}
     styles = {
-        part: STYLES[part]
-        for name, part in domain.parts.items()
-        if part in STYLES and kinds.get(name, _USUAL[part]).lower() == _USUAL[part]
+        part: style
+        for part, style in STYLES.items()
+        if kinds.get(called.get(part, ""), _USUAL[part]).lower() == _USUAL[part]
     }
     own = [(name, part) for name, part in domain.parts.items() if part not in styles]
     colors = itertools.cycle(OTHERS)
