@@ -163,7 +163,9 @@ class System:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi())
         self._take_balance()
-        same = like if not self.drifts and like is not None and self.u_D is like.u_D else None
+        same = None
+        if like is not None and self.u_D is like.u_D and self.offset == like.offset:
+            same = None if self.drifts else like
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b)
@@ -227,7 +229,8 @@ class System:
     def _take_balance(self) -> None:
         """Make the constant u with a_h(u, 1) = χ(1) the offset where u is near it; collective.
 
-        With c ≪ κ, u is f/c but for a part of f/κ. Rounding of A u would hide the loads.
+        With c ≪ κ, u is f/c but for a part of f/κ. Rounding of A u would hide the loads. It would,
+        too, beside c α or b α for an α that is far away, which is no offset then.
         """
         comm = self._data.V.mesh.comm
         held = comm.allreduce(len(self.dirichlet) > 0, op=MPI.LOR)
@@ -240,16 +243,18 @@ class System:
         softest = comm.allreduce(float(diagonal.min(initial=np.inf)), op=MPI.MIN)
         with np.errstate(all="ignore"):
             constant, bend = net / lost, loads / softest
-        if not DRIFT * bend < abs(constant) < np.inf:
+        drifts = DRIFT * bend < abs(constant) < np.inf
+        if not drifts and not abs(constant) < abs(constant - self.offset):
             return
         lowest, highest = self.lower + self.offset, self.upper + self.offset
         inside = bool((lowest <= constant).all() and (constant <= highest).all())
         if not comm.allreduce(inside, op=MPI.LAND):
             return  # a bound holds u
-        self.drifts, before, self.offset = True, self.offset, constant
+        before = self.offset
+        self.drifts, self.offset = drifts, constant if drifts else 0.0
         self.lower, self.upper = self.lower.copy(), self.upper.copy()  # they may be another's
         for bounds in (self.lower, self.upper):
-            bounds[np.abs(bounds) < PETSc.INFINITY] -= constant - before
+            bounds[np.abs(bounds) < PETSc.INFINITY] -= self.offset - before
         self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
 
     def _take_boundary(self, like: System) -> None:

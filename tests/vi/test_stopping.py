@@ -714,3 +714,27 @@ def test_what_little_holds_u_against_the_loads_is_in_balance_with_them(held_by, 
             assert errors[-1] <= bound
             assert weak < 1e-9 or bound <= 4.0 * errors[-1]  # u itself has few digits of its slope
     assert len(errors) == 0 or errors[-2] / errors[-1] == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("far", [-1e3, -1e9, -1e16, 1e12])
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+def test_an_obstacle_that_is_far_away_changes_nothing(far, size):
+    """u has the mean of f where c is 1 and nothing flows; so it is wherever nothing is in touch."""
+    names = ["contact", "neumann"]
+
+    def last(bound):
+        domain = Polygon(SQUARE.vertices, ["contact", *3 * ["neumann"]], names=names).mesh(0.25)
+        held = Contact(bound) if bound < 0.0 else Contact(None, upper=bound)
+        conditions = {"contact": held, "neumann": Neumann()}
+        problem = Problem(lambda x: size * x[0], reaction=1.0, conditions=conditions)
+        *_, solution = solve_levels(problem, domain, 2)
+        return solution
+
+    near, distant = last(-1.0 * size), last(far)
+    assert distant.contact.number_active == 0
+    assert distant.energy == pytest.approx(near.energy, rel=1e-10)
+    mean = distant.mean("domain")
+    exact = size * float(np.mean(SQUARE.vertices[:, 0]))
+    assert mean.value == pytest.approx(exact, rel=1e-9, abs=1e-10 * size)
+    assert mean.lower <= exact + 1e-15 * size and exact - 1e-15 * size <= mean.upper
+    assert distant.certificate.bound_h1 == pytest.approx(near.certificate.bound_h1, rel=1e-6)
