@@ -290,18 +290,19 @@ def _cannot_be_value(word: str) -> bool:
 def _unknown(word: str, command: _Parser) -> NoReturn:
     if not word.startswith("-"):
         command.error(f"{word!r} is one argument too many; one FILE.toml is allowed")
-    if word.split("=")[0] in command._option_string_actions:
+    option = word.split("=")[0]
+    if option in command._option_string_actions:
         command.error(f"{word} is behind --, where there are no options; put it before that")
     options = [name for name in command._option_string_actions if name.startswith("--")]
-    near = difflib.get_close_matches(word.split("=")[0], options, n=1)
+    near = difflib.get_close_matches(option, options, n=1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(options)}"
-    key = word.split("=")[0].lstrip("-").replace("-", "_")
+    key = option.lstrip("-").replace("-", "_")
     with suppress(ImportError):  # DOLFINx may be missing, which is not what this is about
         from .reference import section_of
 
         if (section := section_of(key)) is not None:
             hint = f"{key} is a key of {section} in the problem file"
-    command.error(f"there is no option {word.split('=')[0]}; {hint}")
+    command.error(f"there is no option {option}; {hint}")
 
 
 def start_petsc(options: list[str]) -> None:

@@ -23,7 +23,7 @@ from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root
 from ..fem.space import closure_dofs, facet_measures
-from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain, named
+from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, named
 from ..multigrid.parents import Layout
 from .canvas import (
     BLUE,
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from ..fem.problem import Problem
     from ..solution import Solution
 
-_USUAL = {DIRICHLET: "dirichlet", NEUMANN: "neumann", CONTACT: "contact"}
+_USUAL = {part: name for name, part in PARTS.items()}
 """Kinds of conditions on these parts, unless a problem says otherwise."""
 STYLES: dict[int, dict[str, Any]] = {
     DIRICHLET: {"color": BLUE, "linewidth": 2.5, "label": r"$\Gamma_0$: Dirichlet"},

@@ -163,9 +163,8 @@ class System:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi())
         self._take_balance()
-        same = None
-        if like is not None and self.u_D is like.u_D and self.offset == like.offset:
-            same = None if self.drifts else like
+        shares = like is not None and self.u_D is like.u_D and self.offset == like.offset
+        same = like if shares else None
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         _require_finite(comm, "f, g or coefficient", self.b)

@@ -126,13 +126,27 @@ def test_where_few_files_may_be_open_one_message_tells(most: int, tmp_path: Path
 
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_without_docstrings_one_message_tells(ranks: int, tmp_path: Path) -> None:
-    """`python3 -OO`, in which the parser that compiling takes has no grammar."""
+@pytest.mark.parametrize(
+    "surroundings, words",
+    [
+        # `python3 -OO`, in which the parser that compiling takes has no grammar
+        ({"PYTHONOPTIMIZE": "2"}, "Python runs without docstrings"),
+        # SciPy, which reads it, would end in a traceback
+        (
+            {"SOURCE_DATE_EPOCH": "abc"},
+            "SOURCE_DATE_EPOCH is 'abc'; the environment is to have a whole",
+        ),
+    ],
+    ids=["docstrings", "epoch"],
+)
+def test_surroundings_that_will_not_do_are_told_once(
+    ranks: int, surroundings: dict[str, str], words: str, tmp_path: Path
+) -> None:
     (tmp_path / "case.toml").write_text(kills.CASE)
     argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.command(*argv, ranks=ranks, PYTHONOPTIMIZE="2")
+    done = helpers.command(*argv, ranks=ranks, **surroundings)
     assert done.returncode == cli.BAD_INPUT, done.stderr
-    assert done.stderr.count("Python runs without docstrings") == 1
+    assert done.stderr.count(words) == 1
     assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
 
 
@@ -300,18 +314,6 @@ def test_a_page_shows_the_file_that_was_solved(tmp_path: Path) -> None:
     done = helpers.altered(tmp_path, case, program, "-q", "--html")
     assert (done.returncode, done.stderr) == (0, "")
     assert "0.1*x - 0.2" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_an_epoch_that_is_no_number_is_told(ranks: int, tmp_path: Path) -> None:
-    """SciPy, which reads it, would end in a traceback."""
-    (tmp_path / "case.toml").write_text(kills.CASE)
-    argv = ["solve", tmp_path / "case.toml", "--out", tmp_path / "out"]
-    done = helpers.command(*argv, ranks=ranks, SOURCE_DATE_EPOCH="abc")
-    assert done.returncode == cli.BAD_INPUT, done.stderr
-    assert done.stderr.count("SOURCE_DATE_EPOCH is 'abc'; the environment is to have a whole") == 1
-    assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
 
 
 @pytest.mark.serial
