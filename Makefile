@@ -28,7 +28,7 @@ verify:
 
 # What the tests draw a few of, in numbers; every seed that fails is to become a test.
 fuzz:
-	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --files 20000 --problems 3000
+	$(run) python3 tests/test_fuzz.py --expressions 100000 --ufl 20000 --towers 2000 --files 20000 --problems 3000
 	$(run) python3 tests/mesh_mutations.py --count 5000
 
 # A thousand solves, refinements, certificates and pictures in one process: does memory grow?

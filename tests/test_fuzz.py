@@ -35,7 +35,9 @@ from mpi4py import MPI
 
 from signorini_cr.app import cli, problemfile
 from signorini_cr.app.expressions import parse
+from signorini_cr.data.pointwise import evaluate
 from signorini_cr.errors import InputError, NotConverged
+from signorini_cr.fem.simplified import simplified
 
 pytestmark = pytest.mark.serial
 few = settings(
@@ -245,6 +247,47 @@ def check_ufl(text: str) -> None:
 @given(expressions)
 def test_ufl_agrees_with_numpy(text: str) -> None:
     check_ufl(text)
+
+
+TOWERS = (
+    "max({}, {}*x)", "min(y/{1}, {0})", "abs({} - {})", "sqrt(1 + ({})**2/{})", "sin({1}*({0}))",
+    "(1 + ({})**2/9)**(y + 0.{})", "atan2({}, {} + x)", "where(x < 0.{1}, {0}, y)",
+)  # fmt: skip
+"""Functions of what comes in the place of the first braces, and of a digit."""
+
+
+@st.composite
+def towers(draw: st.DrawFn) -> str:
+    """Draw functions of functions, up to the depth that is allowed: all is used all the way up."""
+    found = draw(st.sampled_from(["x", "y", "x*y"]))
+    kinds = draw(st.lists(st.sampled_from(TOWERS), min_size=1, max_size=3))
+    for i in range(draw(st.integers(1, 40))):
+        found = kinds[i % len(kinds)].format(found, 1 + i % 9)
+    return found
+
+
+def check_tower(text: str) -> None:
+    """Its derivatives are found as long as it may be, and are the same in a normal form."""
+    began = time.perf_counter()
+    u = parse(text).ufl(X)
+    load = -ufl.div(ufl.grad(u))
+    points = np.pad(POINTS, ((0, 0), (0, 1)))
+    with cli.room_for_recursion():
+        found, known = evaluate(simplified(load), points), evaluate(load, points)
+    assert time.perf_counter() - began < SECONDS
+    if found is None or known is None:  # the derivative of a modulus is a sign
+        assert "abs" in text
+        ENDS["towers with a kink"] += 1
+        return
+    sure = np.isfinite(known[0] + found[0]) & (known[1] + found[1] < 1e-6 * (1 + abs(known[0])))
+    assert np.allclose(found[0][sure], known[0][sure], rtol=1e-5, atol=1e-5)
+    ENDS["towers"] += 1
+
+
+@settings(few, max_examples=20)
+@given(towers())
+def test_functions_of_functions_are_differentiated(text: str) -> None:
+    check_tower(text)
 
 
 # Problem files
@@ -600,6 +643,7 @@ def test_random_problems_are_solved_or_refused(text: str) -> None:
 LONG: dict[str, tuple[Callable[[str], None], tuple[st.SearchStrategy[str], ...]]] = {
     "expressions": (check_expression, (expressions, damaged(expressions))),
     "ufl": (check_ufl, (expressions,)),
+    "towers": (check_tower, (towers(),)),
     "files": (check_file, (damaged(st.sampled_from(SOURCES), WORDS), tables())),
     "problems": (check_problem, (problems(),)),
 }

@@ -19,12 +19,10 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from ufl import classes
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.algorithms.apply_derivatives import apply_derivatives
-from ufl.algorithms.expand_indices import expand_indices
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
+from ..fem.lowering import by_components
 from ..mesh.domain import Domain
 from .balls import EPS, LOOSE, NONE, ORDER, Balls, Factor, Rows, indices, middle, union
 from .pointwise import Unknown, by_operators, is_affine
@@ -152,7 +150,7 @@ def lowered(expression: Any) -> Any:
     nodes = ufl.corealg.traversal.unique_pre_traversal(expression)
     if all(isinstance(e, _KNOWN) for e in nodes):
         return expression
-    return expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
+    return by_components(expression)
 
 
 def is_local(expression: Any) -> bool:

@@ -16,13 +16,11 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from ufl import classes
-from ufl.algorithms import expand_indices
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.corealg.traversal import unique_post_traversal
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes
+from ..fem.lowering import by_components
 from ..fem.space import facet_corners, facet_normals
 from ..mesh.domain import Domain
 
@@ -186,8 +184,7 @@ def evaluate(
                 try:
                     found = reader.read(component)
                 except Unknown:
-                    plain = apply_derivatives(apply_algebra_lowering(component))
-                    found = reader.read(expand_indices(plain))
+                    found = reader.read(by_components(component))
             except Unknown:
                 return None
             values[at], bounds[at] = found

@@ -18,14 +18,13 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.algorithms.expand_indices import expand_indices
 from ufl.core.expr import Expr
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..fem.cells import BoundaryFacets, Cells, points_of
 from ..fem.conditions import Condition, as_number, may_change
+from ..fem.lowering import by_components
 from ..fem.physics import Imposed
 from ..fem.problem import Forms
 from ..fem.simplified import simplified
@@ -157,8 +156,8 @@ class Tensor:
     def __init__(self, expression: Expr, mesh: Mesh, rule: Rule):
         """Take its entries apart."""
         self._d, self._mesh, self.rule = mesh.geometry.dim, mesh, rule
-        pairs, lowered = product(range(self._d), repeat=2), apply_algebra_lowering(expression)
-        self.entries = [expand_indices(lowered[i, j]) for i, j in pairs]
+        pairs = product(range(self._d), repeat=2)
+        self.entries = [by_components(expression[i, j]) for i, j in pairs]
         self.skew = [
             self.entries[i * self._d + j] - self.entries[j * self._d + i]
             for i, j in combinations(range(self._d), 2)

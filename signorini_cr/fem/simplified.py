@@ -18,10 +18,9 @@ from typing import Any, TypeAlias
 
 import ufl
 from ufl import classes
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.algorithms.apply_derivatives import apply_derivatives
-from ufl.algorithms.expand_indices import expand_indices
 from ufl.corealg.traversal import unique_pre_traversal
+
+from .lowering import by_components
 
 Monomial: TypeAlias = tuple[tuple[int, Fraction], ...]
 """Atoms by number, in order, with their exponents."""
@@ -29,6 +28,8 @@ Polynomial: TypeAlias = dict[Monomial, Fraction]
 
 MOST_TERMS = 200
 """Terms; with more of them a formula is left as it is."""
+MOST_PRODUCTS = 100_000
+"""Products of two terms, a second's work; with more of them a formula is left as it is."""
 WHOLE = 8
 """Up to this power sums are multiplied out."""
 SIMPLE = 64
@@ -68,7 +69,7 @@ def _coordinates(element: Any) -> Any:
 
 def _shorter(expression: Any) -> Any:
     """Do what `simplified` does; None where the formula does not get shorter."""
-    plain = expand_indices(apply_derivatives(apply_algebra_lowering(expression)))
+    plain = by_components(expression)
     found, shortest = None, _size(plain)
     elsewhere = _origin(plain)
     for origin in ({}, elsewhere) if elsewhere else ({},):
@@ -134,6 +135,7 @@ class _Reader:
         self._squares: dict[int, Polynomial] = {}  # by atom
         self._positive: set[int] = set()
         self._coordinates: set[int] = set()
+        self._products = 0
 
     def read(self, e: Any) -> Polynomial:
         """Return the normal form."""
@@ -228,7 +230,8 @@ class _Reader:
 
     def _product(self, a: Polynomial, b: Polynomial) -> Polynomial:
         found: Polynomial = {}
-        if len(a) * len(b) > MOST_TERMS**2:
+        self._products += len(a) * len(b)
+        if self._products > MOST_PRODUCTS:
             raise _TooLong
         for (m, x), (n, y) in ((s, t) for s in a.items() for t in b.items()):
             exponents = dict(m)
@@ -240,16 +243,17 @@ class _Reader:
 
     def _reduced(self, terms: Polynomial) -> Polynomial:
         """Take out the squares that a sum replaces."""
-        for monomial in terms:
+        found: Polynomial = {}
+        for monomial, factor in terms.items():
             for i, k in monomial:
                 if i in self._squares and k >= 2 and k.denominator == 1:
                     left = tuple((j, e - 2 * (j == i)) for j, e in monomial)
                     left = tuple((j, e) for j, e in left if e)
-                    more = self._product({left: terms[monomial]}, self._squares[i])
-                    return self._reduced(
-                        _sum({m: c for m, c in terms.items() if m != monomial}, more)
-                    )
-        return terms
+                    _add(found, self._product({left: factor}, self._squares[i]))
+                    break
+            else:
+                _add(found, {monomial: factor})
+        return found
 
     def formula(self, terms: Polynomial) -> Any:
         """Write a normal form as an expression."""
@@ -269,8 +273,13 @@ class _Reader:
 
 def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
     found = dict(a)
-    for monomial, factor in b.items():
-        found[monomial] = found.get(monomial, Fraction(0)) + factor
-        if not found[monomial]:
-            del found[monomial]
+    _add(found, b)
     return found
+
+
+def _add(total: Polynomial, more: Polynomial) -> None:
+    """Add to a sum, in place."""
+    for monomial, factor in more.items():
+        total[monomial] = total.get(monomial, Fraction(0)) + factor
+        if not total[monomial]:
+            del total[monomial]

@@ -617,6 +617,19 @@ def test_an_error_above_the_bound_is_told(u: str, wrong: bool, write) -> None:
         assert " ".join(err.split()).count(words) == wrong
 
 
+@pytest.mark.parametrize("kind", ["max", "product"])
+def test_what_is_short_but_would_be_long_written_out(kind: str, write) -> None:
+    """Each step uses the one before it twice, and derivatives more often: 2⁴⁰ terms and more."""
+    steps = ["1/2 + x*y/3"]
+    for i in range(40):
+        steps.append(f"max(s{i}, x - {i}*y)" if kind == "max" else f"s{i}*(1 - s{i})")
+    names = "".join(f's{i} = "{step}"\n' for i, step in enumerate(steps))
+    data = '[data]\ncoefficient = "3 + sin(s40)"\nobstacle = "s40 - 9 + s40"\n[exact]\nu = "s40"\n'
+    case = CASE[: CASE.index("[data]")] + names + data
+    done = run("check", write(case), "--out", "out")
+    assert done[0] == cli.DONE, done
+
+
 def test_curves_with_names_of_ones_own(write) -> None:
     """What holds the mesh is known by its sections: here a loss, or nothing."""
     write(msh(LINES + _TRIANGLES, "bed").replace("dirichlet", "air"), "own.msh")

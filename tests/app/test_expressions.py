@@ -102,14 +102,14 @@ def test_names_stand_for_what_was_defined() -> None:
     assert np.allclose(expression.numpy(points), [0.5, 0.0])
 
 
-def test_doubling_definitions_are_made_once() -> None:
-    """a = x + x, b = a + a, …: 2¹⁰ terms when written out, and some 50 operations."""
+def test_doubling_definitions_cost_no_more_than_their_length() -> None:
+    """a = x + x, b = a + a, …: 2¹⁰⁰ terms when written out, and some 300 operations."""
     expression = parse("x")
-    for _ in range(10):
+    for _ in range(100):
         expression = parse("a*0.5 + a*0.5", {"a": expression})
     assert expression.numpy([[0.7, 0.0]]) == pytest.approx(0.7)
     made = set(unique_post_traversal(expression.ufl(ufl.SpatialCoordinate(little_mesh()))))
-    assert len(made) < 60
+    assert len(made) < 600
     assert in_cells(expression.ufl(ufl.SpatialCoordinate(little_mesh())), little_mesh()).size
 
 
@@ -218,21 +218,6 @@ def test_a_long_sum_is_not_deep_but_may_be_too_large() -> None:
     assert names["a"].numpy([[2.0, 0.0]]) == 8000.0
     with pytest.raises(InputError, match=f"at most {LARGEST}"):
         parse("a + " + " + ".join(["x"] * 3000), names)
-
-
-def test_names_count_wherever_they_are_used() -> None:
-    """UFL differentiates and compares what is shared again and again: 2⁴⁰ times, from 40 lines."""
-    names = {"s0": parse("sin(x + y)")}
-    operations = 4  # x and y among them
-    for k in range(40):
-        text = f"0.5*s{k}*s{k} + 0.1"
-        operations = 2 * operations + 5
-        if operations > LARGEST:
-            with pytest.raises(InputError, match=f"has {operations} operations, those of a name"):
-                parse(text, names)
-            return
-        names[f"s{k + 1}"] = parse(text, names)
-    raise AssertionError("nothing was refused")
 
 
 @pytest.mark.parametrize(
