@@ -124,6 +124,9 @@ class _ByShortName(Loader):
         spec.loader_state = module.__spec__
         return module
 
+    def get_code(self, name: str) -> None:
+        """Say to `python3 -m` that this is no program."""
+
     def exec_module(self, module: ModuleType) -> None:
         """Has run already; what importing wrote into it is put back."""
         assert module.__spec__

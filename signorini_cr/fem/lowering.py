@@ -22,7 +22,7 @@ def by_components(expression: Any) -> Any:
     return _Expander().visit(apply_derivatives(apply_algebra_lowering(expression)))
 
 
-class _Expander(IndexExpander):  # type: ignore[misc]
+class _Expander(IndexExpander):
     """UFL's, with a memory for what an operand became with these values of its indices."""
 
     def __init__(self) -> None:

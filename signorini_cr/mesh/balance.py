@@ -37,7 +37,8 @@ def balance(domain: Domain, parent: Int32Array) -> Refined:
         domain of the same cells on other ranks; for every cell the row of its parent, among those
         that an exchange fetches from the ranks of the coarse cells; and this exchange.
     """
-    comm, cells = domain.mesh.comm, domain.mesh.topology.index_map(2)
+    topology = domain.mesh.topology
+    comm, cells = domain.mesh.comm, topology.index_map(topology.dim)
     most = comm.allreduce(cells.size_local, op=MPI.MAX)
     if most * comm.size <= LIMIT * cells.size_global:
         return domain, parent, None
