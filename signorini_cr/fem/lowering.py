@@ -33,5 +33,7 @@ class _Expander(IndexExpander):
         values = {index.count(): value for index, value in self._index2value.items()}
         key = o, self.component(), tuple(values.get(i) for i in o.ufl_free_indices)
         if key not in self._known:
-            self._known[key] = super().visit(o)
+            function, operands_first = self._handlers[o._ufl_typecode_]
+            operands = map(self.visit, o.ufl_operands) if operands_first else ()
+            self._known[key] = function(o, *operands)
         return self._known[key]
