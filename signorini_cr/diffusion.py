@@ -1,4 +1,4 @@
-"""The physics of the paper: −∇·(κ∇u) = f, a scalar with contact from below."""
+"""The scalar physics: −∇·(κ∇u) + c u = f, or a form of one's own, between obstacles on Γ1."""
 
 from __future__ import annotations
 

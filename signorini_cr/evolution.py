@@ -111,11 +111,11 @@ class Solver:
             self._hierarchy.add(*refined)
         self._carry_down()
         self._level = Level(self._hierarchy.meshes)
-        self._has_dirichlet = self._level.floating is None
+        self._held = self._level.floating is None
         system = self._level.system
         self._stack.callback(self._hierarchy.free)
         # what has served a single solve will not stay for many
-        again = self._has_dirichlet and self._solved != 1
+        again = self._held and self._solved != 1
         lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, again)
         self._cycle = self._stack.enter_context(lent)
         self._assembled, self._solved = self.physics.a.snapshot(), 0
@@ -197,7 +197,7 @@ class Solver:
         meshes, last = self._hierarchy.meshes, self._hierarchy.meshes[-1]
         data = diffusion(self._level.data).renewed(own, rates)
         renewed = NestedMesh(last.physics, last.domain, last.parents, data)
-        level = Level((*meshes[:-1], renewed), self._has_dirichlet, self._level.system)
+        level = Level((*meshes[:-1], renewed), self._held, self._level.system)
         self._solving += 1
         try:
             lend = nullcontext(self._cycle)

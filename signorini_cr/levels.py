@@ -168,7 +168,7 @@ def solve_physics(
         for refined in restart.meshes(domain):
             level.tidy()
             hierarchy.add(*refined)
-            level = Level(hierarchy.meshes, has_dirichlet=held)
+            level = Level(hierarchy.meshes, held=held)
         start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:
@@ -180,7 +180,7 @@ def solve_physics(
             break
         level.tidy()
         hierarchy.add(*following)
-        level = Level(hierarchy.meshes, has_dirichlet=level.floating is None)
+        level = Level(hierarchy.meshes, held=level.floating is None)
         start = Start()
         if nested:
             start, before = Start(solution, before), solution.u

@@ -22,7 +22,7 @@ from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.diffusion import DiffusionOnMesh, diffusion
 from ..data.loads import NOTHING, Certain, Segments, VolumeMoments, mean_to_norm, reacts
-from ..data.quadrature import Coefficient, OnParts
+from ..data.quadrature import STEADY, Coefficient, OnParts
 from ..fem.cells import BoundaryFacets, Cells, blocks, measures, pick, sum_rows, vertex_rows
 from ..jit import compiled
 from ..rounding import at_most, interval
@@ -227,9 +227,6 @@ class Made:
         own = cells.apply(self.w, slice(0, cells.number))
         return self.excess - cells.tdim * self.kappa * own
 
-
-STEADY = 1e-12
-"""Part of κ by which its bounds on a cell may differ where it is constant there."""
 
 DEAR = 1.0
 """Most that may be left of the equation, in parts of the bound, before contact has to take it."""

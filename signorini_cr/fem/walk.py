@@ -225,7 +225,7 @@ def _doublings(before: Int64Array) -> int:
 def _transitions(
     before: Int64Array, ends: FloatArray, gaps: FloatArray, rows: dict[str, npt.NDArray]
 ) -> tuple[FloatArray, Int64Array]:
-    """Find where just one of two neighbours is active, and the facet behind each such place.
+    """Find where just one of two neighbours is active, and the facet before each such place.
 
     The transition lies inside the free facet if its trace changes sign there, else at the vertex
     between the two.

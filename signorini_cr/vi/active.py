@@ -1,11 +1,13 @@
 """The dofs that the obstacle holds, for everyone who asks: all rules are here.
 
-It is one criterion, that of the primal-dual method: active is what force − A_ii gap > 0. While it
-solves SNES decides, and `ActiveSet.without` takes that over; `ActiveSet.of` is the same for an
-iterate as it is, and `ActiveSet.indicator` for the solution of a reduced system, where forces are
-on active dofs and gaps on others alone. Who knows a solution only by its gaps and forces goes by
-`touching`. One rule is another: `ActiveSet.on_bounds`, where the primal-dual method goes round in
-circles. From dofs to facets leads `contact_facts`.
+Of a solution all of them say the same, as gap · force = 0 with neither below 0: active is what a
+force holds. Of what is none yet they differ, each for a reason. `ActiveSet.of` takes an iterate as
+the reduced-space method does, on its bound and pushed, also where the gap is below 0; SNES decides
+by it while it solves, and `ActiveSet.without` takes that over. The solution of a reduced system has
+forces on active dofs and gaps on others alone: `ActiveSet.indicator` exchanges them as the
+primal-dual method does, by force − A_ii gap > 0, and `ActiveSet.on_bounds` where that goes round in
+circles. `touching` is for other fields' gaps and forces, where a gap may be all but 0. From dofs to
+facets leads `contact_facts`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pieces that the domain falls into, and what holds those that have no Dirichlet facet.
+"""Pieces that the domain falls into, and what holds those that Γ0, b and c do not.
 
 Only an obstacle can hold such a piece, and only where the net force ∫ f + ∫ g over it is below 0,
 which presses it on; or above 0 with an obstacle above it, which is the same upside down. Then the
@@ -34,11 +34,11 @@ DOUBT = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Floating:
-    """Pieces without a Dirichlet facet.
+    """Pieces that nothing but an obstacle can hold.
 
     Attributes:
         count: How many there are, over all ranks.
-        piece: Piece of each local dof, from 1; 0 where a Dirichlet facet holds it, shape (dofs,).
+        piece: Piece of each local dof, from 1; 0 where it is held, shape (dofs,).
     """
 
     count: int

@@ -25,13 +25,13 @@ class Level:
 
     Attributes:
         meshes: The meshes up to this one, coarsest first.
-        has_dirichlet: Whether every piece of the domain is known to have a Dirichlet facet, which
-            refinement keeps.
+        held: True if each piece of the domain is known to be held by Γ0, or by b or c; refinement
+            keeps that.
         like: A system with the same matrix, if there is one.
     """
 
     meshes: tuple[NestedMesh, ...]
-    has_dirichlet: bool = False
+    held: bool = False
     like: System | None = None
 
     def __post_init__(self) -> None:
@@ -75,9 +75,9 @@ class Level:
         return self.meshes[-1].data
 
     def tidy(self) -> None:
-        """Drop what only assembly and certificate needed; for the level's owner.
+        """Drop what only assembly and certificate needed; who asks for that again makes it anew.
 
-        That is the solution, once it has its certificate, and the driver that makes the next mesh.
+        Solutions do so once they have their certificate, and drivers before the next mesh.
         """
         self.data.tidy()
 
@@ -88,8 +88,8 @@ class Level:
 
     @cached_property
     def floating(self) -> Floating | None:
-        """Pieces without a Dirichlet facet, None if there are none."""
-        if self.has_dirichlet:
+        """Pieces that nothing but an obstacle can hold, None if there are none."""
+        if self.held:
             return None
         found = Floating.of(self.V, self.system.dirichlet)
         if found.count:  # what else may hold them takes a form of its own to be known

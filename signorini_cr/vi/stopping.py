@@ -4,7 +4,8 @@ The residual as a whole says little where the coefficient varies by orders of ma
 small against the stiff part's flows may be all there is in the soft part. So three things are
 asked for:
 
-1. ‖r‖₂ ≤ τ · load for the equations as a whole, τ = 1e-8 unless set otherwise.
+1. ‖r‖₂ is at most τ times the residual scale for the equations as a whole, τ = 1e-8 unless set
+   otherwise.
 2. The contact forces are known: the sum of the errors that the solver left in them is at most
    1e-7 of their sum.
 3. Each part is converged for itself. Dofs whose diagonal entries are of the same magnitude, up to a
