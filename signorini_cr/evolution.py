@@ -360,23 +360,7 @@ def solve_in_time(
         NotConverged: A step was not solved, or would not fit into ``max_time``; or the mesh would
             not fit into the memory there is.
     """
-    insist_on_kind("end", end, Real, "a number")
-    if not 0.0 < end < np.inf:
-        raise InputError(f"end is {end}; it must be a time after 0")
-    insist_on_count("steps", steps)
-    insist_on_kind("done", done, Integral, "a whole number")
-    if not 0 <= done <= steps:
-        raise InputError(f"done is {done}; it must be the number of a step, or 0")
-    if steps > MOST_STEPS or not np.isfinite(steps / end):
-        raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
-    if end > sys.float_info.max / steps:
-        raise InputError(f"end is {end}; {steps} times that is too much for a number")
-    if not isinstance(scheme, str) or scheme not in SCHEMES:
-        raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
-    if time is not None and not _is_clock(time):
-        raise InputError(
-            f"time is {time!r}; it must be a dolfinx Constant, a float64, which data hold"
-        )
+    _check_steps(end, steps, done, scheme, time)
     check_arguments(problem, domain)
     problem = problem.called_once()  # though a scheme may take a second solver
     own = _capacities(problem, capacity)
@@ -427,6 +411,27 @@ def solve_in_time(
     finally:
         if solver is not None:
             solver.close()
+
+
+def _check_steps(end: float, steps: int, done: int, scheme: str, time: object) -> None:
+    """Insist on times and on a scheme that there can be."""
+    insist_on_kind("end", end, Real, "a number")
+    if not 0.0 < end < np.inf:
+        raise InputError(f"end is {end}; it must be a time after 0")
+    insist_on_count("steps", steps)
+    insist_on_kind("done", done, Integral, "a whole number")
+    if not 0 <= done <= steps:
+        raise InputError(f"done is {done}; it must be the number of a step, or 0")
+    if steps > MOST_STEPS or not np.isfinite(steps / end):
+        raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
+    if end > sys.float_info.max / steps:
+        raise InputError(f"end is {end}; {steps} times that is too much for a number")
+    if not isinstance(scheme, str) or scheme not in SCHEMES:
+        raise InputError(f"scheme is {scheme!r}; it must be one of {', '.join(SCHEMES)}")
+    if time is not None and not _is_clock(time):
+        raise InputError(
+            f"time is {time!r}; it must be a dolfinx Constant, a float64, which data hold"
+        )
 
 
 def _is_clock(time: object) -> bool:
