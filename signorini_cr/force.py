@@ -63,11 +63,14 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
             others; None for 1.
 
     Raises:
-        InputError: There is no such part, or there is no bound; the message says why.
+        InputError: No part is named, there is no such part, or there is no bound; the message says
+            why.
     """
     level = made_of(solution).level
     forms = diffusion(level.data).forms
     known = {c.part: c for c in (*forms.fixed, *forms.bounded)}
+    if not parts:
+        raise InputError(f"parts: there is none; {meant('', known)}")
     names = [named(level.domain.parts, part) for part in parts]
     for part, name in zip(parts, names, strict=True):
         if name not in known:

@@ -339,9 +339,11 @@ def check_name(name: str) -> str:
         plain = False
     if not plain:
         raise InputError("this cannot be a name; letters, digits and _ are allowed, a letter first")
-    if name in RESERVED:
-        raise InputError(f"{name!r} has a meaning already; another name is needed")
-    return unicodedata.normalize("NFKC", name)
+    seen = unicodedata.normalize("NFKC", name)
+    if seen in RESERVED:
+        letters = "" if seen == name else f", which is {seen!r} in other letters,"
+        raise InputError(f"{name!r}{letters} has a meaning already; another name is needed")
+    return seen
 
 
 def _by_pairs(parts: list[T], both: Callable[[T, T], T]) -> T:

@@ -637,15 +637,19 @@ def _expressions(
     """Read [define] and what may be an expression in other sections."""
     names: dict[str, Expression] = {}
     define = sections["define"]
-    if clock is not None:
-        if "t" in define:
-            raise InputError("define.t: t is the time, as there is a section [time]")
-        names["t"] = Expression("t", Node("clock", (clock,)))
-    for name, value in define.items():
+    written: dict[str, str] = {}  # by what the parser sees
+    for name in define:
         with naming(f"define.{name}"):
-            checked = check_name(name)
-        later = [other for other in define if other not in names]
-        names[checked] = _expression(f"define.{name}", value, names, later)
+            if (seen := check_name(name)) in written:
+                raise InputError(f"this is the name {written[seen]!r} once more, in other letters")
+            if clock is not None and seen == "t":
+                raise InputError("t is the time, as there is a section [time]")
+        written[seen] = name
+    if clock is not None:
+        names["t"] = Expression("t", Node("clock", (clock,)))
+    for seen, name in written.items():
+        later = [other for other in written if other not in names]
+        names[seen] = _expression(f"define.{name}", define[name], names, later)
     tables: list[tuple[str, str | None, Mapping[str, Any]]] = [
         *((name, None, sections[name]) for name in ("data", "exact")),
         *(("boundary", name, table) for name, table in parts.items()),

@@ -406,6 +406,14 @@ BAD: dict[str, tuple[str, list[str]]] = {
         ["define.q:", "'r' is defined only further down"],
     ),
     "definition of a taken name": (with_("[define]", "[define]\nx = 1"), ["define.x:", "already"]),
+    "definition of a taken name in other letters": (
+        with_("[define]", '[define]\n"𝑥" = "-5"'),
+        ["define.𝑥: '𝑥', which is 'x' in other letters, has a meaning already"],
+    ),
+    "one name twice in other letters": (
+        with_("[define]", '[define]\n"ﬁ" = "5"\nfi = "7"'),
+        ["define.fi: this is the name 'ﬁ' once more, in other letters"],
+    ),
     "definition of no name": (with_("[define]", '[define]\n"a-b" = 1'), ["define.a-b:"]),
     "f not finite": (with_("1 + r", "1/r"), ["data.f: the value at (0, 0) is inf"]),
     "obstacle not finite": (

@@ -278,7 +278,9 @@ def test_operations_by_pairs_keep_their_order() -> None:
         assert found == pytest.approx(float(wanted), rel=1e-12, abs=1e-10), text
 
 
-@pytest.mark.parametrize("name", ["2r", "a b", "", "and", "x", "pi", "sin", "True", "a-b", "a()"])
+@pytest.mark.parametrize(
+    "name", ["2r", "a b", "", "and", "x", "pi", "sin", "True", "a-b", "a()", "𝑥", "ｐｉ"]
+)
 def test_names_that_cannot_be_used(name: str) -> None:
     with pytest.raises(InputError):
         check_name(name)
@@ -287,3 +289,4 @@ def test_names_that_cannot_be_used(name: str) -> None:
 def test_names_that_can() -> None:
     assert check_name("r_1") == "r_1"
     assert check_name("α") == "α"
+    assert check_name("ﬁ") == "fi"  # as Python reads it where it is used

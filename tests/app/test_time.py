@@ -218,6 +218,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
             "only -0.15; the obstacle must not be above it, at the time 0.75",
         ),
         ("wave =", "t = 1\nwave =", "define.t: t is the time"),
+        ("wave =", '"ｔ" = 1\nwave =', "define.ｔ: t is the time"),
         ("[time]", '[exact]\nu = "x"\n[time]', "exact.u: a problem in time has none"),
     ],
 )
