@@ -684,6 +684,8 @@ def test_forces_of_two_parts_add_up_and_have_their_signs():
 
 def test_what_has_no_flux_is_said():
     (*_, solution) = strip([Contact(-1.0), Neumann(), Dirichlet(0.0), Dirichlet(0.0)], 4)
+    with pytest.raises(InputError, match="parts: there is none; there are"):
+        solution.flux()
     with pytest.raises(InputError, match="'right' is no Dirichlet or contact part"):
         flux(solution, "right")
     with pytest.raises(InputError, match=r"did you mean floor\? There are "):
