@@ -30,6 +30,11 @@ MOST_TERMS = 200
 """Terms; with more of them a formula is left as it is."""
 MOST_PRODUCTS = 100_000
 """Products of two terms, a second's work; with more of them a formula is left as it is."""
+MOST_BITS = 2_000
+"""Bits of a factor; with more of them a formula is left as it is."""
+FAR = 2.0**300
+"""Factors that are larger, or smaller than its inverse, are left where they stand: multiplied out,
+as in (x/3)^{800}, they and what they belong to would be beyond the range of numbers."""
 WHOLE = 8
 """Up to this power sums are multiplied out."""
 SIMPLE = 64
@@ -37,7 +42,7 @@ SIMPLE = 64
 
 
 class _TooLong(Exception):
-    """A sum of too many terms."""
+    """A sum of too many terms, or factors with too many digits."""
 
 
 def simplified(expression: Any) -> Any:
@@ -94,8 +99,8 @@ def _origin(expression: Any) -> dict[Any, Fraction]:
     for e in unique_pre_traversal(expression):
         if isinstance(e, classes.Sum):
             a, b = e.ufl_operands
-            a, b = (b, a) if isinstance(a, classes.ScalarValue) else (a, b)
-            if _is_coordinate(a) and isinstance(b, classes.ScalarValue):
+            a, b = (b, a) if isinstance(a, classes.RealValue) else (a, b)
+            if _is_coordinate(a) and isinstance(b, classes.RealValue):
                 found.setdefault(a, Counter())[-float(b)] += 1
     return {a: _fraction(counts.most_common(1)[0][0]) for a, counts in found.items()}
 
@@ -106,6 +111,16 @@ def _is_coordinate(e: Any) -> bool:
     )
 
 
+def _bits(factor: Fraction) -> int:
+    """Count what it takes to write it down; 0 for 1."""
+    return factor.numerator.bit_length() + factor.denominator.bit_length() - 2
+
+
+def _handy(factor: Fraction) -> bool:
+    """Tell whether a factor has few digits and is no very large or small number."""
+    return _bits(factor) <= MOST_BITS and 1 / FAR <= abs(factor) <= FAR
+
+
 def _size(expression: Any) -> int:
     return sum(1 for _ in unique_pre_traversal(expression))
 
@@ -114,7 +129,7 @@ def _fraction(value: float) -> Fraction:
     """Return the number, or the simple fraction of which it is the rounded value."""
     exact = Fraction(value)
     simple = exact.limit_denominator(SIMPLE)
-    return simple if abs(simple - exact) <= 3e-16 * max(1.0, abs(value)) else exact
+    return simple if abs(simple - exact) <= 3e-16 * abs(exact) else exact
 
 
 class _Reader:
@@ -141,14 +156,14 @@ class _Reader:
         """Return the normal form."""
         if e not in self.known:
             self.known[e] = self._read(e)
-            if len(self.known[e]) > MOST_TERMS:
+            if len(self.known[e]) > MOST_TERMS or not all(map(_handy, self.known[e].values())):
                 raise _TooLong
         return self.known[e]
 
     def _read(self, e: Any) -> Polynomial:
         if isinstance(e, classes.Zero):
             return {}
-        if isinstance(e, classes.ScalarValue):
+        if isinstance(e, classes.RealValue):
             return {(): _fraction(float(e))}
         if _is_coordinate(e):
             return self._coordinate(e)
@@ -161,7 +176,7 @@ class _Reader:
             return self._product(self.read(operands[0]), self._power(operands[1], Fraction(-1)))
         if isinstance(e, classes.Sqrt):
             return self._power(operands[0], Fraction(1, 2))
-        if isinstance(e, classes.Power) and isinstance(operands[1], classes.ScalarValue):
+        if isinstance(e, classes.Power) and isinstance(operands[1], classes.RealValue):
             return self._power(operands[0], _fraction(float(operands[1])))
         return self._atom(self._key(e, operands), e)
 
@@ -197,6 +212,8 @@ class _Reader:
         if len(terms) == 1:
             ((monomial, factor),) = terms.items()
             if p.denominator == 1:
+                if abs(p) * _bits(factor) > MOST_BITS:
+                    raise _TooLong
                 return {tuple((i, k * p) for i, k in monomial): factor ** int(p)}
             # a root of P is there only where P ≥ 0, and so is a root of it
             roots = all(i in self._positive or k.denominator > 1 for i, k in monomial)

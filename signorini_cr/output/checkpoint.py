@@ -87,7 +87,9 @@ def read_arrays(path: Path) -> dict[str, Any] | None:
         return None
     try:
         insist_on_end(path)
-        if not zipfile.is_zipfile(path):
+        with path.open("rb") as file:
+            begins = file.read(2) == b"PK"
+        if not (begins and zipfile.is_zipfile(path)):  # or NumPy talks of pickles
             raise ValueError("it is no archive")
         with np.load(path) as file:
             arrays = dict(file)

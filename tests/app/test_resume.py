@@ -176,9 +176,15 @@ def test_another_problem_is_refused(old, new, words, told, case, capfd) -> None:
     assert Path("out", "report.json").read_bytes() == before
 
 
+def _behind(path: Path) -> None:
+    np.savez(path, sum=np.zeros(1))
+    path.write_bytes(b"\0" * 8 + path.read_bytes())
+
+
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "nothing": (lambda path: path.write_bytes(b""), "it is no archive"),
     "a beginning": (lambda path: path.write_bytes(b"PK"), "it is no archive"),
+    "an archive behind something": (_behind, "it is no archive"),
     "text": (lambda path: path.write_text("no archive"), "it is no archive"),
     "a pipe": (os.mkfifo, "this is a device or a pipe; a file is needed"),
     "zeros": (lambda path: path.symlink_to("/dev/zero"), "this is a device or a pipe"),

@@ -84,6 +84,45 @@ def test_numbers_for_which_squares_come_back_again_and_again():
     assert np.all(np.abs(one[0] - other[0]) <= 100 * (one[1] + other[1]) + 1e-14)
 
 
+@pytest.mark.parametrize("scale", [1e-150, 1e-80, 1e-20, 3e-16, 1e20, 1e150])
+def test_no_number_is_too_small_to_count(scale):
+    """Fractions take the place of numbers that are one but for rounding, which is relative."""
+    load = minus_laplace(scale * (x**3 + x * y**2) * (1 + x * y - y * x))
+    found, known = evaluate(simplified(load), POINTS)[0], -8.0 * scale * POINTS[:, 0]
+    assert np.allclose(found / scale, known / scale, rtol=1e-12, atol=1e-14)
+
+
+def test_a_solution_of_any_size_has_its_load():
+    def solved(scale):
+        problem = Problem(exact=lambda x: scale * (1 - x[0] ** 2) * (1 - x[1] ** 2) ** 2)
+        return np.array(solve(problem, exact.S1.structured(8)).errors) / scale
+
+    assert np.allclose(solved(1e-20), solved(1.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("p", [60, 800, 1000])
+def test_powers_beyond_the_range_of_numbers(p):
+    """3⁻⁸⁰⁰ is 0 among floats, and (x/3)⁸⁰⁰ is 1 at x = 3."""
+    points = np.array([[3.0, 0.2, 0.0], [2.99, -1.0, 0.0], [-3.0, 0.5, 0.0]])
+    known = -p * (p - 1) / 9 * (points[:, 0] / 3) ** (p - 2)
+    for u in ((x / 3) ** p, (x / 3) ** (p // 2) * (x / 3) ** (p // 2) * (1 + x * y - y * x)):
+        assert np.allclose(evaluate(simplified(minus_laplace(u)), points)[0], known, rtol=1e-10)
+
+
+@pytest.mark.parametrize("p", [1e9, 1e300])
+def test_powers_that_no_memory_holds(p):
+    """0.3 to such a power, as a fraction, would have as many digits."""
+    simplified(minus_laplace((0.3 * x) ** p + y**2))
+
+
+def test_squares_of_squares():
+    """Forty times: x to the power of 2⁴⁰, divided by a number of so many digits."""
+    u = x / 3
+    for _ in range(40):
+        u = u * u
+    simplified(minus_laplace(u))
+
+
 def test_what_gets_longer_is_left_alone():
     for f in (minus_laplace((x**2 + y + 3 * x * y) ** 8 * ufl.sin(x)), exact.I.problem.exact(X)):
         assert simplified(f) is f
