@@ -11,6 +11,7 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import NoReturn, TypeAlias, TypeVar
 
 from ..errors import InputError
@@ -183,7 +184,9 @@ class _Reader:
             case ast.Constant(value=bool() | str() | bytes() | complex() | None):
                 self.reject(tree, "this is not a number")
             case ast.Constant(value=int() | float() as value):
-                return self.finite(tree, constant(_as_float(value)))
+                written = ast.get_source_segment(self.line, tree) or ""
+                lost = value == 0 and re.search("[1-9]", written.lower().split("e")[0])
+                return self.finite(tree, replace(constant(_as_float(value)), lost=bool(lost)))
             case ast.Name():
                 return self.name(tree)
             case ast.UnaryOp(op=ast.UAdd()):
@@ -220,6 +223,8 @@ class _Reader:
         return node
 
     def finite(self, tree: ast.expr, node: Node) -> Node:
+        if node.lost:
+            self.reject(tree, "the value of this constant is below all numbers, but not 0")
         if node.op == "const" and not math.isfinite(node.args[0]):
             value = node.args[0]
             what = "not a real number" if math.isnan(value) else "too large, or infinite"

@@ -10,7 +10,7 @@ huge powers cost nothing and a constant that is not finite can be rejected at on
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,11 +24,15 @@ CONSTANTS = {"pi": math.pi}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Node:
-    """One operation; ``args`` holds nodes, or the value of a ``const`` or the index of an ``x``."""
+    """One operation; ``args`` holds nodes, or the value of a ``const`` or the index of an ``x``.
+
+    ``lost`` tells of a constant that is 0 as it is below all numbers, and not because it is 0.
+    """
 
     op: str
     args: tuple[Any, ...]
     condition: bool = False
+    lost: bool = False
 
 
 class Clock:
@@ -119,6 +123,8 @@ _OPERATORS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "or": (np.logical_or, ufl.Or),
     "not": (np.logical_not, ufl.Not),
 }
+_NEVER_ZERO = ("*", "/", "**", "exp")
+"""Of numbers other than 0; 0 times a number is folded before."""
 _NUMPY = {name: row[0] for name, row in _OPERATORS.items()}
 _NUMPY |= {name: row[1] for name, row in FUNCTIONS.items()}
 _UFL = {name: row[1] for name, row in _OPERATORS.items()}
@@ -240,5 +246,7 @@ def operation(op: str, *args: Node) -> Node:
     if all(arg.op == "const" for arg in args):
         with np.errstate(all="ignore"):
             value = _NUMPY[op](*(arg.args[0] for arg in args))
-        return constant(bool(value) if condition else float(value))
+        lost = value == 0.0 and op in _NEVER_ZERO and args[0].args[0] != 0.0
+        made = constant(bool(value) if condition else float(value))
+        return replace(made, lost=True) if lost else made
     return Node(op, args, condition)

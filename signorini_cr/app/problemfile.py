@@ -648,8 +648,7 @@ def _expressions(
     if clock is not None:
         names["t"] = Expression("t", Node("clock", (clock,)))
     for seen, name in written.items():
-        later = [other for other in written if other not in names]
-        names[seen] = _expression(f"define.{name}", define[name], names, later)
+        names[seen] = _expression(f"define.{name}", define[name], names, written)
     tables: list[tuple[str, str | None, Mapping[str, Any]]] = [
         *((name, None, sections[name]) for name in ("data", "exact")),
         *(("boundary", name, table) for name, table in parts.items()),

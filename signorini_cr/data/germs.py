@@ -21,6 +21,7 @@ from ufl import classes
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import at_points
+from ..fem.simplified import bits
 from .jets import SERIES, Boxes, Enclosure, Range, mul, out, power_series, square_of
 from .pointwise import Unknown
 
@@ -28,6 +29,8 @@ SECTORS = 16
 """Sectors that the directions from a point into a triangle are divided into."""
 NARROW = 1e-12
 """Directions are known up to this angle, and vertices up to it in parts of their distance."""
+MOST_BITS = 100_000
+"""Bits of constants, which are exact; of those with more nothing is known."""
 CLOSE = 1e-3
 """Distance from a vertex at which singular points matter, in parts of the simplex's size."""
 
@@ -66,7 +69,7 @@ def bound(
     with np.errstate(all="ignore"):
         try:
             germ = _Germs(point, directions, reach)(expression)
-        except (Unknown, OverflowError):
+        except (Unknown, OverflowError, ValueError):  # nan is no fraction
             return None
     if germ.power == np.inf:
         return 0.0, np.full(len(reach), abs(float(germ.constant)))
@@ -127,8 +130,10 @@ class _Germs:
         raise Unknown(type(e).__name__)
 
     def _number(self, value: float | Fraction) -> Germ:
-        nothing = np.zeros((1, 1))
-        return Germ(Fraction(value), np.inf, nothing, nothing)
+        nothing, exact = np.zeros((1, 1)), Fraction(value)
+        if bits(exact) > MOST_BITS:
+            raise Unknown("a number with so many digits")
+        return Germ(exact, np.inf, nothing, nothing)
 
     def _ranged(self, x: Range) -> Germ:
         return Germ(Fraction(0), 0.0, *x)
@@ -191,6 +196,8 @@ class _Germs:
     def _to_the(self, g: Germ, p: float) -> Germ:
         whole = p == int(p)
         if g.power == np.inf and whole and (g.constant or p > 0):
+            if abs(p) * bits(g.constant) > MOST_BITS:
+                raise Unknown("a number with so many digits")
             return self._number(g.constant ** int(p))
         if whole and 0 < p <= 4:  # keeps constants exact
             total = g

@@ -1035,7 +1035,7 @@ def _agree(condition: Any, first: Any, second: Any) -> bool:
         one, other = (ufl.replace(branch, {a: b}) for branch in (first, second))
     except (ValueError, ArithmeticError):
         return False
-    if isinstance(one, classes.ConstantValue) and isinstance(other, classes.ConstantValue):
+    if all(isinstance(each, classes.RealValue | classes.Zero) for each in (one, other)):
         return float(one) == float(other)
     return bool(one == other)
 

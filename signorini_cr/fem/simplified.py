@@ -30,11 +30,13 @@ MOST_TERMS = 200
 """Terms; with more of them a formula is left as it is."""
 MOST_PRODUCTS = 100_000
 """Products of two terms, a second's work; with more of them a formula is left as it is."""
-MOST_BITS = 2_000
+MOST_BITS = 5_000
 """Bits of a factor; with more of them a formula is left as it is."""
 FAR = 2.0**300
 """Factors that are larger, or smaller than its inverse, are left where they stand: multiplied out,
 as in (x/3)^{800}, they and what they belong to would be beyond the range of numbers."""
+LARGEST_WHOLE = 64
+"""Exponents up to this are integers; in C large ones are none."""
 WHOLE = 8
 """Up to this power sums are multiplied out."""
 SIMPLE = 64
@@ -76,14 +78,17 @@ def _shorter(expression: Any) -> Any:
     """Do what `simplified` does; None where the formula does not get shorter."""
     plain = by_components(expression)
     found, shortest = None, _size(plain)
-    elsewhere = _origin(plain)
+    try:
+        elsewhere = _origin(plain)
+    except (ArithmeticError, ValueError):  # what is not finite is no fraction
+        return None
     for origin in ({}, elsewhere) if elsewhere else ({},):
         reader = _Reader(origin)
         try:
             reader.read(plain)  # finds the sums that are atoms
             reader.known.clear()
             other = reader.formula(reader.read(plain))
-        except (_TooLong, OverflowError, RecursionError):
+        except (_TooLong, ArithmeticError, ValueError, RecursionError):
             continue
         if _size(other) < shortest:
             found, shortest = other, _size(other)
@@ -111,14 +116,14 @@ def _is_coordinate(e: Any) -> bool:
     )
 
 
-def _bits(factor: Fraction) -> int:
-    """Count what it takes to write it down; 0 for 1."""
-    return factor.numerator.bit_length() + factor.denominator.bit_length() - 2
+def bits(number: Fraction) -> int:
+    """Count what it takes to write a number down exactly; 0 for 1."""
+    return number.numerator.bit_length() + number.denominator.bit_length() - 2
 
 
 def _handy(factor: Fraction) -> bool:
     """Tell whether a factor has few digits and is no very large or small number."""
-    return _bits(factor) <= MOST_BITS and 1 / FAR <= abs(factor) <= FAR
+    return bits(factor) <= MOST_BITS and 1 / FAR <= abs(factor) <= FAR
 
 
 def _size(expression: Any) -> int:
@@ -212,7 +217,7 @@ class _Reader:
         if len(terms) == 1:
             ((monomial, factor),) = terms.items()
             if p.denominator == 1:
-                if abs(p) * _bits(factor) > MOST_BITS:
+                if abs(p) * bits(factor) > MOST_BITS:
                     raise _TooLong
                 return {tuple((i, k * p) for i, k in monomial): factor ** int(p)}
             # a root of P is there only where P ≥ 0, and so is a root of it
@@ -256,7 +261,10 @@ class _Reader:
                 exponents[i] = exponents.get(i, Fraction(0)) + k
             monomial = tuple(sorted((i, k) for i, k in exponents.items() if k))
             found[monomial] = found.get(monomial, Fraction(0)) + x * y
-        return self._reduced({m: c for m, c in found.items() if c})
+        found = {m: c for m, c in found.items() if c}
+        if not all(map(_handy, found.values())):
+            raise _TooLong
+        return self._reduced(found)
 
     def _reduced(self, terms: Polynomial) -> Polynomial:
         """Take out the squares that a sum replaces."""
@@ -282,7 +290,8 @@ class _Reader:
                 if k == Fraction(1, 2):
                     atom = ufl.sqrt(atom)
                 elif k != 1:
-                    atom = atom ** (int(k) if k.denominator == 1 else float(k))
+                    whole = k.denominator == 1 and abs(k) <= LARGEST_WHOLE
+                    atom = atom ** (int(k) if whole else float(k))
                 term = term * atom
             total = total + term
         return total

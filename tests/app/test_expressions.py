@@ -203,6 +203,21 @@ def test_bad_expressions_say_what_is_wrong(text: str) -> None:
         assert line.startswith("    ") and len(line) <= 80
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["exp(-800)*exp(800*x)", "1e-200*1e-200*x", "0.5**2000 + x", "1e-300/1e300", "x + 1e-400"],
+)
+def test_a_constant_below_all_numbers_is_no_zero(text: str) -> None:
+    """With 0 for it a boundary layer would be gone, and nothing said."""
+    with pytest.raises(InputError, match="this constant is below all numbers, but not 0"):
+        parse(text)
+
+
+@pytest.mark.parametrize("text", ["0*1e-200", "0.00e5", "0/3 + 0**2", "sin(0)", "log(1)", "-0.0"])
+def test_what_is_0_is_0(text: str) -> None:
+    assert parse(text).constant == 0.0
+
+
 def test_the_picture_points_at_the_part() -> None:
     with pytest.raises(InputError) as caught:
         parse("1 + sine(x)")

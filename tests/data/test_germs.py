@@ -93,6 +93,21 @@ def test_what_has_no_integral_has_no_bound():
     assert np.isfinite(allowance(lowered(r2**-0.45), corners, hats)[0][0])
 
 
+@pytest.mark.parametrize("kind", ["squares", "power"])
+def test_numbers_with_too_many_digits_are_given_up(kind):
+    """Constants are exact, and would have 2⁴⁰ digits; nothing known is an answer."""
+    x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
+    r2 = (x[0] - POINT[0]) ** 2 + (x[1] - POINT[1]) ** 2
+    factor = x[0] + 0.3
+    for _ in range(40 if kind == "squares" else 0):
+        factor = factor * factor
+    if kind == "power":
+        factor = factor**1e12
+    corners = np.array([POINT, (0.8, 0.1), (0.2, 0.7)])[:, :, None]
+    found = allowance(lowered(factor * r2**-0.25), corners, np.full((3, 1), 1 / 3))
+    assert not np.isnan(found).any()
+
+
 def test_points_inside_are_found():
     x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
     expression = lowered(((x[0] - POINT[0]) ** 2 + (x[1] - POINT[1]) ** 2) ** -0.4)

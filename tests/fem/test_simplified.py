@@ -4,6 +4,7 @@ import basix.ufl
 import numpy as np
 import pytest
 import ufl
+from ufl.corealg.traversal import unique_pre_traversal
 
 from signorini_cr import exact, solve
 from signorini_cr.data.pointwise import evaluate
@@ -113,6 +114,23 @@ def test_powers_beyond_the_range_of_numbers(p):
 def test_powers_that_no_memory_holds(p):
     """0.3 to such a power, as a fraction, would have as many digits."""
     simplified(minus_laplace((0.3 * x) ** p + y**2))
+
+
+@pytest.mark.parametrize("number", [np.inf, np.nan])
+def test_what_is_not_finite_is_left_alone(number):
+    f = minus_laplace(x**2 * y) + (x + number)
+    assert simplified(f) is f
+
+
+def test_large_exponents_are_no_integers():
+    """C has none of 10³⁶, and would take them modulo 2⁶⁴."""
+    f = simplified(minus_laplace(x**1e36 * (1 + x * y - y * x)))
+    powers = [e for e in unique_pre_traversal(f) if isinstance(e, ufl.classes.Power)]
+    assert powers
+    for e in powers:
+        assert abs(float(e.ufl_operands[1])) <= 64 or isinstance(
+            e.ufl_operands[1], ufl.classes.FloatValue
+        )
 
 
 def test_squares_of_squares():

@@ -9,7 +9,7 @@ import dolfinx.mesh
 import numpy as np
 import pytest
 import ufl
-from helpers import MESHES, integral, smallest_angle, stay, tagged
+from helpers import MESHES, areas, integral, smallest_angle, stay, tagged
 from mpi4py import MPI
 
 from signorini_cr import Problem, Solver, solve, solve_adaptive, solve_in_time, solve_levels
@@ -750,3 +750,15 @@ def test_a_polygon_far_from_the_origin_has_the_mesh_of_one_at_it(away: float):
     assert np.allclose(points[1] - [away, -3.0 * away], points[0], rtol=0, atol=1e-15 * away)
     assert counts(far) == counts(near)
     assert np.array_equal(far.materials.where("stone"), near.materials.where("stone"))
+
+
+@pytest.mark.parametrize("away", [0.0, 5e6])
+def test_a_material_that_reaches_out_is_cut_at_the_outline(away: float):
+    """Where lines cross, far from the origin too, where a crossing is off both by rounding."""
+    corners = 100.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) + away
+    stone = np.array([[30.3, 50.7], [400.1, 20.9], [400.1, 80.3]]) + away
+    domain = Polygon(corners, LABELS, materials={"stone": stone}).mesh(10.0)
+    own = domain.materials.where("stone")[: len(areas(domain.mesh))]
+    area = domain.mesh.comm.allreduce(float(areas(domain.mesh)[own].sum()))
+    part = (100.0 - 30.3) / (400.1 - 30.3)
+    assert area == pytest.approx(0.5 * 369.8 * 59.4 * part**2, rel=1e-7)
