@@ -184,9 +184,8 @@ class _Reader:
             case ast.Constant(value=bool() | str() | bytes() | complex() | None):
                 self.reject(tree, "this is not a number")
             case ast.Constant(value=int() | float() as value):
-                written = ast.get_source_segment(self.line, tree) or ""
-                lost = value == 0 and re.search("[1-9]", written.lower().split("e")[0])
-                return self.finite(tree, replace(constant(_as_float(value)), lost=bool(lost)))
+                lost = value == 0.0 and self.is_written_otherwise(tree)
+                return self.finite(tree, replace(constant(_as_float(value)), lost=lost))
             case ast.Name():
                 return self.name(tree)
             case ast.UnaryOp(op=ast.UAdd()):
@@ -230,6 +229,11 @@ class _Reader:
             what = "not a real number" if math.isnan(value) else "too large, or infinite"
             self.reject(tree, f"the value of this constant is {what}")
         return node
+
+    def is_written_otherwise(self, tree: ast.expr) -> bool:
+        """Tell whether a number that is read as 0 has another digit, as 1e-400 has."""
+        written = ast.get_source_segment(self.line, tree) or ""
+        return re.search("[1-9]", written.lower().split("e")[0]) is not None
 
     def join(self, op: str, parts: list[Node]) -> Node:
         return _by_pairs(parts, lambda one, two: operation(op, one, two))
