@@ -11,7 +11,6 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
 from typing import NoReturn, TypeAlias, TypeVar
 
 from ..errors import InputError
@@ -185,7 +184,7 @@ class _Reader:
                 self.reject(tree, "this is not a number")
             case ast.Constant(value=int() | float() as value):
                 lost = value == 0.0 and self.is_written_otherwise(tree)
-                return self.finite(tree, replace(constant(_as_float(value)), lost=lost))
+                return self.finite(tree, constant(_as_float(value), lost))
             case ast.Name():
                 return self.name(tree)
             case ast.UnaryOp(op=ast.UAdd()):

@@ -10,7 +10,7 @@ huge powers cost nothing and a constant that is not finite can be rejected at on
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -216,9 +216,9 @@ def operands_first(root: Node) -> Iterator[Node]:
             stack.extend((arg, False) for arg in node.args if isinstance(arg, Node))
 
 
-def constant(value: float | bool) -> Node:
+def constant(value: float | bool, lost: bool = False) -> Node:
     """Make the node of a number, or of true or false."""
-    return Node("const", (value,), isinstance(value, bool))
+    return Node("const", (value,), isinstance(value, bool), lost)
 
 
 def is_constant(node: Node, value: float | bool) -> bool:
@@ -247,6 +247,5 @@ def operation(op: str, *args: Node) -> Node:
         with np.errstate(all="ignore"):
             value = _NUMPY[op](*(arg.args[0] for arg in args))
         lost = value == 0.0 and op in _NEVER_ZERO and args[0].args[0] != 0.0
-        made = constant(bool(value) if condition else float(value))
-        return replace(made, lost=True) if lost else made
+        return constant(bool(value) if condition else float(value), bool(lost))
     return Node(op, args, condition)

@@ -128,9 +128,10 @@ def triangulate(
         polygons: Vertices of each material's polygon, whose edges become lines of the mesh.
         numbers: The materials' numbers.
     """
-    loops, labels, inner = arranged(loops, labels, list(polygons.values()))
     away = _away(loops[0])
-    outline = _outline([loop - away for loop in loops], inner - away, size)
+    moved = [polygon - away for polygon in polygons.values()]
+    loops, labels, inner = arranged([loop - away for loop in loops], labels, moved)
+    outline = _outline(loops, inner, size)
     with _session() as gmsh:
         curves = _draw(gmsh, outline, [len(loop) for loop in loops], size)
         try:
@@ -173,8 +174,9 @@ def _is_bounded_by(triangles: Int64Array, facets: Int64Array) -> bool:
 def _away(outline: FloatArray) -> FloatArray:
     """Compute how far a polygon is to be moved towards the origin, shape (2,).
 
-    gmsh compares coordinates with their distances, and loses points far out. Its vertices come back
-    to the digit, as differences of numbers of like size are exact.
+    gmsh compares coordinates with their distances, and loses points far out, where those in which
+    lines cross are off the lines by rounding, too. Vertices come back to the digit, as differences
+    of numbers of like size are exact.
     """
     extent = np.ptp(outline, axis=0).max()
     return np.where(np.abs(outline[0]) > _FAR * extent, outline[0], 0.0)

@@ -15,10 +15,6 @@ NEAR = 1e-12
 """Distance at which points are the same, or on a line, in parts of the extent."""
 
 
-ROUNDING = 16 * float(np.finfo(np.float64).eps)
-"""The same in parts of the coordinates."""
-
-
 class Outline(NamedTuple):
     """An outline, and lines inside it that meet it and one another in their ends only.
 
@@ -46,8 +42,7 @@ def arranged(
     """
     if not polygons:
         return Outline(loops, labels, np.empty((0, 2, 2)))
-    # far from the origin points on a line are off it by rounding
-    near = max(NEAR * np.ptp(loops[0], axis=0).max(), ROUNDING * np.abs(loops[0]).max())
+    near = NEAR * np.ptp(loops[0], axis=0).max()
     rings = [*loops, *polygons]
     points: list[FloatArray] = []
 
