@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise, product
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from ..arrays import FloatArray
 
 Rows = tuple[int, ...]
 """Places of coefficients in `indices`, in ascending order."""
+_Term: TypeAlias = tuple[slice, slice, slice, bool]
+"""Rows of two factors, the row of their product, and whether it is the first one there."""
 
 ORDER = 3
 """The highest order."""
@@ -23,6 +26,8 @@ EPS = 4e-16
 """Relative error of +, −, ·, / and √, with room."""
 LOOSE = 4e-15
 """The same of other functions, and of sums of a few products."""
+TINY = 1e-300
+"""Absolute error of numbers that are not 0 but below the normal ones, or on the way there."""
 
 
 @cache
@@ -70,8 +75,13 @@ class Balls:
 
     def scaled(self, factor: float) -> Balls:
         """Multiply by a number."""
-        mid = factor * self.mid
-        return Balls(self.rows, mid, (abs(factor) * self.rad + EPS * np.abs(mid)) * (1 + 1e-15))
+        lost = 0.0
+        try:
+            with np.errstate(under="raise"):
+                mid, rad = factor * self.mid, abs(factor) * self.rad
+        except FloatingPointError:
+            mid, rad, lost = factor * self.mid, abs(factor) * self.rad, TINY
+        return Balls(self.rows, mid, (rad + EPS * np.abs(mid)) * (1 + 1e-15) + lost)
 
 
 NONE = Balls((), np.zeros((0, 1)), np.zeros((0, 1)))
@@ -124,8 +134,19 @@ class Factor:
         terms, rows = _terms(variables, order, self.rows, other.rows)
         if not rows:
             return NONE
+        try:
+            with np.errstate(under="raise"):
+                return Balls(rows, *self._times(other, terms, len(rows)))
+        except FloatingPointError:
+            mid, rad = self._times(other, terms, len(rows))
+            return Balls(rows, mid, rad + TINY)
+
+    def _times(
+        self, other: Factor, terms: tuple[_Term, ...], rows: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Compute middles and radii of a product's coefficients, but for numbers below all."""
         shape = np.broadcast_shapes(self.planes.shape[2:], other.planes.shape[2:])
-        total = np.empty((3, len(rows), *shape))
+        total = np.empty((3, rows, *shape))
         bounded = self.bounded and other.bounded
         for i, j, k, first in terms:
             sums = total[:, k]
@@ -137,13 +158,11 @@ class Factor:
         mid, least, rad = total
         least -= LOOSE * rad
         rad -= least
-        return Balls(rows, mid, rad)
+        return mid, rad
 
 
 @cache
-def _terms(
-    variables: int, order: int, left: Rows, right: Rows
-) -> tuple[tuple[tuple[slice, slice, slice, bool], ...], Rows]:
+def _terms(variables: int, order: int, left: Rows, right: Rows) -> tuple[tuple[_Term, ...], Rows]:
     """List the products in the coefficients of a product, from the first order on.
 
     Returns:

@@ -15,9 +15,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import ufl
 from dolfinx import fem
 from ufl import classes
+from ufl.corealg import traversal
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import at_points
@@ -31,6 +31,10 @@ NARROW = 1e-12
 """Directions are known up to this angle, and vertices up to it in parts of their distance."""
 MOST_BITS = 100_000
 """Bits of constants, which are exact; of those with more nothing is known."""
+MOST_LOOKS = 5_000_000
+"""Points times operators at which something singular is looked for."""
+AT_ONCE = 4096
+"""Points that are looked at together."""
 CLOSE = 1e-3
 """Distance from a vertex at which singular points matter, in parts of the simplex's size."""
 
@@ -302,7 +306,7 @@ def allowance(
     if d > 2 or not n:
         return found[0], found[1]
     size = np.linalg.norm(corners[1:] - corners[:1], axis=1).max(axis=0)
-    for point in _candidates(expression, corners):
+    for point in singular_points(expression, corners):
         away = np.linalg.norm(corners - point[:, None], axis=1)
         which = np.flatnonzero(away.min(axis=0) <= CLOSE * size)
         if not len(which):
@@ -339,7 +343,7 @@ def may_be_singular(expression: Any) -> bool:
     return any(
         isinstance(e, classes.Division | classes.Ln)
         or (isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1]))
-        for e in ufl.corealg.traversal.unique_pre_traversal(expression)
+        for e in traversal.unique_pre_traversal(expression)
     )
 
 
@@ -348,33 +352,26 @@ def _is_positive(e: Any) -> bool:
     return isinstance(e, classes.ScalarValue) and float(e) > 0
 
 
-def first_inside(
-    expression: Any, corners: FloatArray
-) -> tuple[FloatArray, IndexArray, FloatArray] | None:
-    """Find a point at which the expression may be singular and that is no vertex.
+def holders(point: FloatArray, corners: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """Find the simplices in which a point is, but for those it is a vertex of.
 
     Args:
-        expression: Lowered.
+        point: Where, shape (gdim,).
         corners: Vertices of triangles or segments, shape (d + 1, gdim, n).
 
     Returns:
-        The point, the simplices that hold it, and its barycentric coordinates there, shape
-        (d + 1, simplices); None where there is none.
+        The simplices, and the point's barycentric coordinates there, shape (d + 1, simplices).
     """
     size = np.linalg.norm(corners[1:] - corners[:1], axis=1).max(axis=0)
-    for point in _candidates(expression, corners):
-        hats = _barycentric(corners, point)
-        x = np.einsum("cn,cgn->gn", hats, corners)
-        room = NARROW * (size + np.linalg.norm(point))
-        near = np.linalg.norm(x - point[:, None], axis=0) <= room
-        corner = np.linalg.norm(corners - point[:, None], axis=1).min(axis=0) <= room
-        # on a side of it, whichever way that was rounded
-        within = near & ~corner & (hats.min(axis=0) >= -NARROW)
-        which = np.flatnonzero(within)
-        if len(which):
-            inside = np.maximum(hats[:, which], 0.0)
-            return point, which, inside / inside.sum(axis=0)
-    return None
+    hats = _barycentric(corners, point)
+    x = np.einsum("cn,cgn->gn", hats, corners)
+    room = NARROW * (size + np.linalg.norm(point))
+    near = np.linalg.norm(x - point[:, None], axis=0) <= room
+    corner = np.linalg.norm(corners - point[:, None], axis=1).min(axis=0) <= room
+    # on a side of it, whichever way that was rounded
+    which = np.flatnonzero(near & ~corner & (hats.min(axis=0) >= -NARROW))
+    inside = np.maximum(hats[:, which], 0.0)
+    return which, inside / inside.sum(axis=0)
 
 
 def _measures(corners: FloatArray) -> FloatArray:
@@ -394,28 +391,85 @@ def _barycentric(corners: FloatArray, point: FloatArray) -> FloatArray:
     return np.vstack([1.0 - others.sum(axis=0), others])
 
 
-def _candidates(expression: Any, corners: FloatArray) -> list[FloatArray]:
-    """Find points near simplices at which an expression has no value: of 0 and numbers in it."""
+def singular_points(expression: Any, corners: FloatArray) -> list[FloatArray]:
+    """Find points near simplices at which an expression has no value: of 0 and numbers in it.
+
+    Args:
+        expression: Lowered.
+        corners: Vertices of triangles or segments, shape (d + 1, gdim, n).
+
+    Returns:
+        The points, each of shape (gdim,), in an order of their own.
+    """
+    found: dict[tuple[float, ...], None] = {}
+    for e in _divisors(expression):
+        points = _of_numbers(e, corners)
+        if len(points) * len(list(traversal.unique_pre_traversal(e))) <= MOST_LOOKS:
+            found |= dict.fromkeys(map(tuple, points[_unbounded(1.0 / e, points, corners)]))
+    every = np.array(sorted(found)).reshape(-1, corners.shape[1])
+    return list(every[_unbounded(expression, every, corners)])
+
+
+def _divisors(expression: Any) -> list[Any]:
+    """List what an expression is singular at the roots of: no products, and no powers."""
+    left = []
+    for e in traversal.unique_pre_traversal(expression):
+        if isinstance(e, classes.Division):
+            left.append(e.ufl_operands[1])
+        elif isinstance(e, classes.Ln) or (
+            isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1])
+        ):
+            left.append(e.ufl_operands[0])
+    found: dict[Any, bool] = {}  # and whether it has roots of its own
+    while left:
+        e = left.pop()
+        if e in found:
+            continue
+        roots: tuple[Any, ...] = ()
+        if isinstance(e, classes.Product):
+            roots = e.ufl_operands
+        elif isinstance(e, classes.Division | classes.Sqrt | classes.Abs) or (
+            isinstance(e, classes.Power) and _is_positive(e.ufl_operands[1])
+        ):
+            roots = e.ufl_operands[:1]
+        found[e] = not roots and not isinstance(e, classes.ScalarValue)
+        left += roots
+    return [e for e, own in found.items() if own]
+
+
+def _of_numbers(expression: Any, corners: FloatArray) -> FloatArray:
+    """Find the points of 0 and numbers in an expression that are near simplices, (k, gdim)."""
     numbers = {0.0}
-    for e in ufl.corealg.traversal.unique_pre_traversal(expression):
+    for e in traversal.unique_pre_traversal(expression):
         if isinstance(e, classes.ScalarValue) or (isinstance(e, fem.Constant) and not e.ufl_shape):
             value = float(e) if isinstance(e, classes.ScalarValue) else float(e.value)
             numbers |= {value, -value}
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = CLOSE * np.linalg.norm(high - low, axis=0)
-    axes = []
+    axes, levels = [], []
     for a, b in zip(low, high, strict=True):
-        flat = set(np.unique(a[a == b]).tolist())  # facets that are aligned with an axis
         axes.append([x for x in sorted(numbers) if np.any((a - room <= x) & (x <= b + room))])
-        axes[-1] += sorted(flat - numbers)
-    points = np.array(list(product(*axes))).reshape(-1, len(axes))
-    try:
-        room = 1e-9 * (1.0 + np.abs(points.T))  # 0 times what has no bound would be 0
-        jet = Enclosure(Boxes(points.T - room, points.T + room), order=0)(expression)
-    except Unknown:
-        return []
-    finite = np.isfinite(jet.low) & np.isfinite(jet.high)
-    return list(points[~np.broadcast_to(finite, len(points))])
+        levels.append(sorted(set(np.unique(a[a == b]).tolist()) - numbers))
+    points = [*product(*axes)]
+    for i, flat in enumerate(levels):  # facets that are aligned with an axis
+        points += product(*axes[:i], flat, *axes[i + 1 :])
+    return np.array(points).reshape(-1, len(axes))
+
+
+def _unbounded(expression: Any, points: FloatArray, corners: FloatArray) -> BoolArray:
+    """Tell at which points an expression is not seen to have a value, shape (k,)."""
+    found = np.zeros(len(points), dtype=bool)
+    # 0 times what has no bound would be 0
+    room = 1e-9 * np.ptp(corners, axis=(0, 2)).max() + 1e-15 * np.abs(points)
+    for at in range(0, len(points), AT_ONCE):
+        some = slice(at, at + AT_ONCE)
+        low, high = (points[some] - room[some]).T, (points[some] + room[some]).T
+        try:
+            jet = Enclosure(Boxes(low, high), order=0)(expression)
+        except Unknown:
+            break
+        found[some] = ~(np.isfinite(jet.low) & np.isfinite(jet.high))
+    return found
 
 
 def _sectors(

@@ -24,7 +24,7 @@ from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.lowering import by_components
 from ..mesh.domain import Domain
-from .balls import EPS, LOOSE, NONE, ORDER, Balls, Factor, Rows, indices, middle, union
+from .balls import EPS, LOOSE, NONE, ORDER, TINY, Balls, Factor, Rows, indices, middle, union
 from .pointwise import Unknown, by_operators, is_affine
 
 Range = tuple[FloatArray, FloatArray]
@@ -754,13 +754,37 @@ def _part_below(ends: FloatArray) -> FloatArray:
 
 
 def out(x: Range, room: float = EPS) -> Range:
-    """Make room for rounding."""
-    low, high = x[0] - room * np.abs(x[0]), x[1] + room * np.abs(x[1])
+    """Make room for rounding; what is 0 stays so, and other numbers keep their signs."""
+    try:
+        with np.errstate(under="raise"):
+            low, high = x[0] - room * np.abs(x[0]), x[1] + room * np.abs(x[1])
+    except FloatingPointError:
+        less, more = (np.where(end == 0, 0.0, room * np.abs(end) + TINY) for end in x)
+        low, high = x[0] - less, x[1] + more
+        low, high = (
+            np.where(x[0] > 0, np.maximum(low, 0.0), low),
+            np.where(x[1] < 0, np.minimum(high, 0.0), high),
+        )
     return np.fmax(low, -np.inf), np.fmin(high, np.inf)  # of a number and NaN it is the number
 
 
 def mul(x: Range, y: Range) -> Range:
     """Enclose a product."""
+    try:
+        with np.errstate(under="raise"):
+            return _mul(x, y)
+    except FloatingPointError:
+        low, high = _mul(x, y)
+    above = ((x[0] >= 0) & (y[0] >= 0)) | ((x[1] <= 0) & (y[1] <= 0))
+    below = ((x[0] >= 0) & (y[1] <= 0)) | ((x[1] <= 0) & (y[0] >= 0))
+    return (
+        np.where(above, np.maximum(low - TINY, 0.0), low - TINY),
+        np.where(below, np.minimum(high + TINY, 0.0), high + TINY),
+    )
+
+
+def _mul(x: Range, y: Range) -> Range:
+    """Enclose a product, but for numbers below all."""
     a, b, c, d = x[0] * y[0], x[0] * y[1], x[1] * y[0], x[1] * y[1]
     low, high = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
     zero = np.isnan(low)  # 0 times what has no bound
@@ -769,13 +793,24 @@ def mul(x: Range, y: Range) -> Range:
 
 def square_of(low: FloatArray, high: FloatArray) -> Range:
     """Enclose a square."""
-    a, b = low * low, high * high
+    try:
+        with np.errstate(under="raise"):
+            a, b = low * low, high * high
+    except FloatingPointError:
+        size = np.minimum(np.abs(low), np.abs(high)), np.maximum(np.abs(low), np.abs(high))
+        least, most = mul(size, size)
+        return np.where((low < 0) & (high > 0), 0.0, least), most
     return out((np.where((low < 0) & (high > 0), 0.0, np.minimum(a, b)), np.maximum(a, b)))
 
 
 def _scaled(factor: float, x: Range) -> Range:
     low, high = x if factor >= 0 else (x[1], x[0])
-    return out((factor * low, factor * high))
+    try:
+        with np.errstate(under="raise"):
+            return out((factor * low, factor * high))
+    except FloatingPointError:
+        number = np.array(factor)
+        return mul((number, number), x)
 
 
 def _plus(x: Range, shift: float) -> Range:
@@ -799,12 +834,20 @@ def _raised(x: Range, p: float) -> Range:
     whole = p == round(p)
     low, high = x if whole else (np.maximum(x[0], 0.0), np.maximum(x[1], 0.0))
     a, b = (np.sqrt(low), np.sqrt(high)) if p == 0.5 else (low**p, high**p)
-    if not whole:
-        return out((a, b) if p > 0 else (b, a), LOOSE)
-    least = np.minimum(a, b)
-    if p % 2 == 0:
+    least, most = np.minimum(a, b), np.maximum(a, b)
+    odd = whole and p % 2 != 0
+    if whole and not odd:
         least = np.where((low < 0) & (high > 0), 0.0, least)
-    return out((least, np.maximum(a, b)), LOOSE)
+    bottom, top = out((least, most), LOOSE)
+    # not by the flag for underflow, which vectorized powers may leave alone
+    lost = ((np.abs(a) < TINY) & (low != 0)) | ((np.abs(b) < TINY) & (high != 0))
+    if lost.any():
+        room = np.where(lost, TINY, 0.0)
+        bottom, top = (
+            np.where((low >= 0) | (not odd), np.maximum(bottom - room, 0.0), bottom - room),
+            np.where((high <= 0) & odd, np.minimum(top + room, 0.0), top + room),
+        )
+    return bottom, top
 
 
 def _rising(function: Callable[[FloatArray], FloatArray], x: Range) -> Range:
@@ -843,7 +886,8 @@ def power_series(p: float) -> Callable[[Range], Sequence[Range]]:
 
 
 def _exp(x: Range) -> Sequence[Range]:
-    e = _rising(np.exp, x)
+    low, high = _rising(np.exp, x)
+    e = np.where(low < TINY, 0.0, low), np.maximum(high, TINY)
     return e, e, _scaled(0.5, e), _scaled(1 / 6, e)
 
 

@@ -15,7 +15,7 @@ import ufl
 from ..arrays import BoolArray, FloatArray
 from ..fem.cells import Cells, blocks
 from .balls import indices
-from .germs import allowance, first_inside, may_be_singular
+from .germs import allowance, holders, may_be_singular, singular_points
 from .jets import (
     STRIP,
     Boxes,
@@ -174,10 +174,13 @@ class Deviation:
 
     def apart(self, pieces: Pieces) -> Pieces:
         """Cut pieces so that no point at which the data may be singular is inside of one."""
-        while self.singular and (found := first_inside(self.expression, pieces.corners)):
-            point, which, hats = found
-            rest = np.setdiff1d(np.arange(len(pieces.share)), which)
-            pieces = pieces[rest] + pieces[which].around(point, hats)
+        if not self.singular:
+            return pieces
+        for point in singular_points(self.expression, pieces.corners):
+            which, hats = holders(point, pieces.corners)
+            if len(which):
+                rest = np.setdiff1d(np.arange(len(pieces.share)), which)
+                pieces = pieces[rest] + pieces[which].around(point, hats)
         return pieces
 
     def levels(self, cells: Cells) -> Levels | None:

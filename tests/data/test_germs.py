@@ -1,5 +1,8 @@
 """Bounds near points at which data have none."""
 
+import operator
+import tracemalloc
+
 import numpy as np
 import pytest
 import ufl
@@ -7,7 +10,7 @@ from mpi4py import MPI
 
 from signorini_cr import exact
 from signorini_cr.data.cutting import refine
-from signorini_cr.data.germs import allowance, first_inside
+from signorini_cr.data.germs import allowance, holders, singular_points
 from signorini_cr.data.jets import Enclosure, lowered
 from signorini_cr.data.pieces import Pieces
 from signorini_cr.data.ranges import Deviation, errors_on
@@ -108,6 +111,15 @@ def test_numbers_with_too_many_digits_are_given_up(kind):
     assert not np.isnan(found).any()
 
 
+def first_inside(expression, corners):
+    """A singular point, who holds it, and where it is there; None where there is none."""
+    for point in singular_points(expression, corners):
+        which, hats = holders(point, corners)
+        if len(which):
+            return point, which, hats
+    return None
+
+
 def test_points_inside_are_found():
     x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
     expression = lowered(((x[0] - POINT[0]) ** 2 + (x[1] - POINT[1]) ** 2) ** -0.4)
@@ -117,6 +129,30 @@ def test_points_inside_are_found():
     assert np.allclose(hats[:, 0] @ corners[:, :, 0], POINT)
     apart = np.array([POINT, (0.9, -0.4), (0.2, 0.7)])[:, :, None]
     assert first_inside(expression, apart) is None
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
+def test_points_of_many_peaks_are_found_one_by_one(scale):
+    """As many as there are peaks, not as many as there are pairs of their numbers."""
+    x = ufl.SpatialCoordinate(MESH.mesh(MESH.diameter, MPI.COMM_SELF).mesh)
+    places = scale * np.random.default_rng(0).uniform(0.05, 0.45, (120, 2))
+    distances = [ufl.sqrt((x[0] - float(a)) ** 2 + (x[1] - float(b)) ** 2) for a, b in places]
+    corners = scale * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])[:, :, None]
+
+    def joined(parts, join):
+        middle = len(parts) // 2
+        halves = [joined(half, join) for half in (parts[:middle], parts[middle:]) if middle]
+        return join(*halves) if halves else parts[0]
+
+    tracemalloc.start()
+    product = joined(distances, operator.mul)
+    for peaks in (joined([r**-0.5 for r in distances], operator.add), 1 / ufl.sqrt(product)):
+        found = singular_points(lowered(peaks), corners)
+        assert np.array_equal(sorted(map(tuple, found)), sorted(map(tuple, places)))
+    # a denominator with all of the numbers would take 240² looks at it, and is given up
+    assert singular_points(lowered(1 / (1 + joined(distances, operator.add))), corners) == []
+    assert tracemalloc.get_traced_memory()[1] < 2e8
+    tracemalloc.stop()
 
 
 def test_slivers_at_a_singular_point_are_not_cut_into_slabs():
