@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import InputError
-from .polygon import inside
+from .polygon import MOST_EDGES, inside
 
 NEAR = 1e-12
 """Distance at which points are the same, or on a line, in parts of the extent."""
@@ -39,31 +43,30 @@ def arranged(
         loops: Vertices of the polygon and of each hole, shapes (n, 2).
         labels: Label of every edge, one loop after the other.
         polygons: May reach beyond the outline, and share edges, or parts of edges.
+
+    Raises:
+        InputError: There are too many edges, or too many points in which they cross.
     """
     if not polygons:
         return Outline(loops, labels, np.empty((0, 2, 2)))
-    near = NEAR * np.ptp(loops[0], axis=0).max()
-    rings = [*loops, *polygons]
-    points: list[FloatArray] = []
-
-    def number(x: FloatArray) -> int:
-        """Return the point's number; a new one, unless there is one already."""
-        if points:
-            distance = np.abs(np.array(points) - x).max(axis=1)
-            if distance.min() <= near:
-                return int(distance.argmin())
-        points.append(x)
-        return len(points) - 1
-
-    of_rings = [np.array([number(x) for x in ring]) for ring in rings]
-    edges = np.concatenate([np.column_stack([ring, np.roll(ring, -1)]) for ring in of_rings])
+    extent = np.ptp(loops[0], axis=0).max()
+    near = NEAR * extent
+    low, high = loops[0].min(axis=0) - extent, loops[0].max(axis=0) + extent
+    rings = [*loops, *(_clipped(polygon, low, high) for polygon in polygons)]
+    sizes = np.array([len(ring) for ring in rings])
+    if sizes.sum() > MOST_EDGES:
+        raise InputError(
+            f"the outline and the materials' polygons have {sizes.sum()} edges; {MOST_EDGES} are"
+            " allowed"
+        )
+    corners = np.concatenate(rings)
+    after = np.arange(len(corners)) + 1
+    after[np.cumsum(sizes) - 1] = np.cumsum(sizes) - sizes
     of_outline = sum(map(len, loops))
-    corners = np.array(points)
-    for i in range(of_outline, len(edges)):
-        for x in _crossings(corners[edges[i]], corners[edges[:i]]):
-            number(x)
-    x = np.array(points)
-    pieces = [_through(edge, x, near) for edge in edges]
+    points = np.concatenate([corners, _crossings(corners, corners[after], of_outline, near)])
+    number, x = _each_once(points, near)
+    edges = np.column_stack([number[: len(corners)], number[after]])
+    pieces = _pieces(edges, x, near)
 
     new_loops, new_labels, at = [], [], 0
     for loop in loops:
@@ -85,25 +88,85 @@ def arranged(
     return Outline(new_loops, np.concatenate(new_labels), ends[within])
 
 
-def _crossings(edge: FloatArray, others: FloatArray) -> FloatArray:
-    """Find where an edge, shape (2, 2), crosses others, shape (n, 2, 2)."""
-    u, v, w = edge[1] - edge[0], others[:, 1] - others[:, 0], others[:, 0] - edge[0]
-    with np.errstate(all="ignore"):  # parallel ones have none
-        det = u[0] * v[:, 1] - u[1] * v[:, 0]
-        t = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / det
-        s = (w[:, 0] * u[1] - w[:, 1] * u[0]) / det
-        meet = (t > 0) & (t < 1) & (s > 0) & (s < 1)
-    return np.asarray(edge[0] + t[meet, None] * u)
+def _clipped(polygon: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Clip a polygon to a box (Sutherland and Hodgman); what runs outside follows the box.
+
+    Where an edge ends far away its crossings would be off all lines by the rounding of its end.
+    """
+    for axis, (sign, bound) in product((0, 1), ((-1.0, low), (1.0, high))):
+        beyond = sign * (polygon[:, axis] - bound[axis])
+        after, beyond_after = np.roll(polygon, -1, axis=0), np.roll(beyond, -1)
+        begins, ends = beyond <= 0, beyond_after <= 0  # within
+        first, last = np.minimum(beyond, beyond_after), np.maximum(beyond, beyond_after)
+        # from the end that is within, so that little is lost
+        start, end = (np.where(begins[:, None], *x) for x in ((polygon, after), (after, polygon)))
+        with np.errstate(all="ignore"):
+            between = start + (first / (first - last))[:, None] * (end - start)
+        between[:, axis] = bound[axis]
+        kept = np.stack([begins, begins != ends], axis=1)
+        polygon = np.stack([polygon, between], axis=1)[kept]
+    return polygon
 
 
-def _through(edge: IndexArray, x: FloatArray, near: float) -> IndexArray:
-    """Find the points on an edge, from one end to the other."""
-    start, u = x[edge[0]], x[edge[1]] - x[edge[0]]
-    t = (x - start) @ u / (u @ u)
-    on = np.linalg.norm(x - start - t[:, None] * u, axis=1) <= near
-    found = np.flatnonzero(on & (t > 0) & (t < 1))
-    found = found[(found != edge[0]) & (found != edge[1])]
-    return np.concatenate([edge[:1], found[np.argsort(t[found])], edge[1:]])
+def _crossings(a: FloatArray, b: FloatArray, of_outline: int, near: float) -> FloatArray:
+    """Find where edges of polygons cross others, shape (n, 2).
+
+    Args:
+        a: Where edges begin, the outline's first, shape (edges, 2).
+        b: Where they end.
+        of_outline: How many are the outline's, which do not cross one another.
+        near: Edges farther apart than that do not meet.
+
+    Raises:
+        InputError: There are too many.
+    """
+    low, high = np.minimum(a, b) - near, np.maximum(a, b) + near
+    found, total = [np.empty((0, 2))], 0
+    for i in range(of_outline, len(a)):
+        at = np.flatnonzero((low[:i] <= high[i]).all(axis=1) & (high[:i] >= low[i]).all(axis=1))
+        u, v, w = b[i] - a[i], b[at] - a[at], a[at] - a[i]
+        with np.errstate(all="ignore"):  # parallel ones have none
+            det = u[0] * v[:, 1] - u[1] * v[:, 0]
+            t = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / det
+            s = (w[:, 0] * u[1] - w[:, 1] * u[0]) / det
+            meet = (t > 0) & (t < 1) & (s > 0) & (s < 1)
+        found.append(a[i] + t[meet, None] * u)
+        total += len(found[-1])
+        if total > MOST_EDGES:
+            raise InputError(
+                "the materials' polygons cross the outline and one another more than"
+                f" {MOST_EDGES} times"
+            )
+    return np.concatenate(found)
+
+
+def _each_once(points: FloatArray, near: float) -> tuple[IndexArray, FloatArray]:
+    """Take points that are no farther apart than that for one; number of each, and those left."""
+    # Of those in one square of a fine grid only the first is compared with its neighbours
+    squares = np.floor(points / (0.5 * near))
+    _, begins, square = np.unique(squares, axis=0, return_index=True, return_inverse=True)
+    pairs = cKDTree(points[begins]).query_pairs(near, p=np.inf, output_type="ndarray")
+    graph = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(begins), len(begins)))
+    groups, group = connected_components(graph, directed=False)
+    first = np.full(groups, len(points))
+    np.minimum.at(first, group, begins)
+    kept, number = np.unique(first[group[square.reshape(-1)]], return_inverse=True)
+    return number, points[kept]
+
+
+def _pieces(edges: IndexArray, x: FloatArray, near: float) -> list[IndexArray]:
+    """Find the points on each edge, shape (edges, 2), from one end to the other."""
+    found = []
+    for first, last in edges:
+        start, u = x[first], x[last] - x[first]
+        low, high = np.minimum(start, x[last]) - near, np.maximum(start, x[last]) + near
+        at = np.flatnonzero((x >= low).all(axis=1) & (x <= high).all(axis=1))
+        at = at[(at != first) & (at != last)]
+        t = (x[at] - start) @ u / (u @ u)
+        on = np.linalg.norm(x[at] - start - t[:, None] * u, axis=1) <= near
+        on &= (t > 0) & (t < 1)
+        found.append(np.array([first, *at[on][np.argsort(t[on])], last]))
+    return found
 
 
 def sorted_out(

@@ -752,6 +752,50 @@ def test_a_polygon_far_from_the_origin_has_the_mesh_of_one_at_it(away: float):
     assert np.array_equal(far.materials.where("stone"), near.materials.where("stone"))
 
 
+@pytest.mark.parametrize("reach", [3.0, 1e9, 1e10])
+@pytest.mark.parametrize("turned", [False, True])
+def test_materials_that_reach_far_out_are_cut_at_the_outline(reach: float, turned: bool):
+    """A strip, and all that is above a slanted line, of known areas."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    strip = np.array([[-reach, 0.2], [reach, 0.2], [reach, 0.3], [-reach, 0.3]])
+    above = np.array([[-0.5, 0.3], [1.5, 0.8], [1.5, reach], [-0.5, reach]])
+    polygons = {"strip": strip, "above": above}
+    if turned:
+        polygons = {name: x[::-1, ::-1] for name, x in polygons.items()}
+    domain = Polygon(corners, LABELS, materials=polygons).mesh(0.2)
+    size = areas(domain.mesh)
+    for name, area in (("strip", 0.1), ("above", 1 - 0.55)):
+        own = size[domain.materials.where(name)[: len(size)]].sum()
+        assert domain.mesh.comm.allreduce(float(own)) == pytest.approx(area, rel=1e-12)
+
+
+def test_wedges_whose_edges_meet_in_one_point():
+    """Every other wedge around it: half of a disk, whatever rounding makes of their points."""
+    center, angles = np.array([0.37, 0.41]), 2 * np.pi * np.arange(25) / 24 + 0.1
+    rim = center + 0.3 * np.column_stack([np.cos(angles), np.sin(angles)])
+    wedges = {
+        f"w{i}": np.array([center + 1e-14 * np.sin(i), rim[i], rim[i + 1]]) for i in range(0, 24, 2)
+    }
+    domain = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], LABELS, materials=wedges).mesh(0.2)
+    size = areas(domain.mesh)
+    own = sum(size[domain.materials.where(name)[: len(size)]].sum() for name in wedges)
+    area = domain.mesh.comm.allreduce(float(own))
+    assert area == pytest.approx(12 * 0.5 * 0.3**2 * np.sin(2 * np.pi / 24), rel=1e-9)
+
+
+def test_materials_that_cross_too_often_are_refused():
+    """Two combs of 400 teeth, laid across one another."""
+
+    def comb(transposed: bool) -> list[list[float]]:
+        teeth = [(0.05 + 0.9 * i / 800, 0.02 if i // 2 % 2 else 0.98) for i in range(800)]
+        points = [(0.01, 0.99), *teeth, (0.99, 0.99)]
+        return [[y, x] if transposed else [x, y] for x, y in points]
+
+    corners = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    with pytest.raises(InputError, match="more than 100000 times"):
+        Polygon(corners, LABELS, materials={"a": comb(False), "b": comb(True)}).mesh(0.5)
+
+
 @pytest.mark.parametrize("away", [0.0, 5e6])
 def test_a_material_that_reaches_out_is_cut_at_the_outline(away: float):
     """Where lines cross, far from the origin too, where a crossing is off both by rounding."""
