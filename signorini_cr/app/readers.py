@@ -23,8 +23,13 @@ MOST_IN_TITLE = 200
 """Characters."""
 MOST_BYTES = 16_000_000
 """In a problem file."""
+MOST_PARTS = 100
+"""Of a key with points in it; the parser takes the square of their number in memory."""
 HUGE = 10**15
 """From here on whole numbers are not shown, and no count is as large."""
+
+_PART = r"""(?:(?<![\w-])[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*"""
+_LONG_KEY = re.compile(rf"(?:{_PART}\.[ \t]*){{{MOST_PARTS}}}{_PART}")
 
 
 def read_text(path: Path) -> str:
@@ -46,6 +51,9 @@ def read_text(path: Path) -> str:
 
 def parse_toml(text: str) -> dict[str, Any]:
     """Read the table that a TOML text stands for."""
+    if long := _LONG_KEY.search(text):
+        line = text.count("\n", 0, long.start()) + 1
+        raise InputError(f"the key in line {line} has more than {MOST_PARTS} parts")
     try:
         return tomllib.loads(text)
     except RecursionError:

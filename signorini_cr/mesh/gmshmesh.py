@@ -147,7 +147,7 @@ def triangulate(
             np.concatenate(found),
             np.repeat(labels, [len(ends) for ends in found]),
         )
-    if (narrow := too_thin(raw.points[raw.triangles])) is not None:
+    if (narrow := too_thin(raw.points[raw.triangles], away)) is not None:
         raise InputError(f"the polygon is too narrow, too small or too uneven: {narrow}")
     if not _is_bounded_by(raw.triangles, raw.facets):
         across, shortest = np.ptp(loops[0], axis=0).max(), outline.facets.min()

@@ -42,23 +42,26 @@ def thinness(corners: FloatArray) -> FloatArray:
     return np.where(np.isnan(found), np.inf, found)
 
 
-def too_thin(corners: FloatArray) -> str | None:
+def too_thin(corners: FloatArray, origin: FloatArray | None = None) -> str | None:
     """Say which cell is thinner than `THINNEST`, or shorter than `SMALLEST`, if any is.
 
     Args:
         corners: Of triangles or tetrahedra, shape (n, d + 1, d).
+        origin: From where they are given, shape (d,); else from 0.
     """
+    origin = np.zeros(corners.shape[2]) if origin is None else origin
     found = thinness(corners)
     length = np.abs(corners[:, 1:] - corners[:, :1]).max(axis=(1, 2))
     if len(small := np.flatnonzero(length < SMALLEST)) and length[small[0]] > 0.0:
+        place = _place(origin + corners[small[0], 0])
         return (
-            f"the cell at {_place(corners[small[0], 0])} is {length[small[0]]:.2g} long: lengths"
+            f"the cell at {place} is {length[small[0]]:.2g} long: lengths"
             f" from {SMALLEST:g} on are possible, in other units perhaps"
         )
     bad = np.flatnonzero(~(found <= THINNEST))
     if not len(bad):
         return None
-    ratio, place = found[bad[0]], _place(corners[bad[0], 0])
+    ratio, place = found[bad[0]], _place(origin + corners[bad[0], 0])
     kind = "triangle" if corners.shape[2] == 2 else "tetrahedron"
     # rounding may leave a little where there is nothing
     if ratio > 1e13:

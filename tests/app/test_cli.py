@@ -492,6 +492,11 @@ BAD: dict[str, tuple[str, list[str]]] = {
     ),
     "syntax at the end": (CASE + "[other", ["TOML syntax at the end of the file (line 15)"]),
     "section twice": (CASE + "[data]\n", ["TOML syntax in line 15", "Cannot declare [data] twice"]),
+    "keys of many parts": (
+        CASE + "[define]\n" + "a . 'b'." * 15_000 + "c = 1\n",
+        ["the key in line 16 has more than 100 parts"],
+    ),
+    "sections of many parts": (CASE + "[" + "a." * 30_000 + "b]\n", ["line 15 has more than 100"]),
     "key twice": (with_("size = 0.5", "size = 0.5\nsize = 1"), ["TOML syntax in line 6"]),
     "not text": ("\udcff", ["UTF-8"]),
     "mesh missing": (mesh_case("none.msh"), ["domain.mesh:", "none.msh", "No such file"]),

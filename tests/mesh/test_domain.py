@@ -728,6 +728,8 @@ def test_a_polygon_that_is_too_narrow() -> None:
     polygon = Polygon([(0, 0), (1, 0), (0.5, 1e-8)], ["contact", "dirichlet", "neumann"])
     said = fails_alike(polygon.mesh, 1.0)
     assert said.startswith("the polygon is too narrow") and "1e+08 times as long" in said
+    far = Polygon([(4e5, 0), (4e5 + 1, 0), (4e5 + 0.5, 1e-8)], polygon.boundary)
+    assert "the triangle at (400000, 0) is" in fails_alike(far.mesh, 1.0)
 
 
 def test_no_gmsh(monkeypatch) -> None:
