@@ -91,9 +91,7 @@ def check_values(
     Raises:
         InputError: The message names the key and the first such point from the left.
     """
-    x = domain.mesh.geometry.x
-    size = max(domain.mesh.comm.allgather(float(np.abs(x).max(initial=0.0))))
-    digits = 11 - math.ceil(math.log10(size))
+    digits = _digits(domain)
     bad: tuple[Any, ...] = (math.inf,)
     for number, (datum, expression) in enumerate(expressions.items()):
         part = _used_on(datum, domain, weights)
@@ -130,6 +128,18 @@ def check_values(
         f"{message}; it must be finite everywhere {where}"
         f" (where(condition, a, b) can set a value apart){when}"
     )
+
+
+def _digits(domain: Domain) -> int:
+    """Find how many digits after the point a mesh generator gets right; collective.
+
+    Those of the domain's extent, but for what far from the origin is rounding.
+    """
+    x, far = domain.mesh.geometry.x, np.inf
+    ends = domain.mesh.comm.allgather((x.min(axis=0, initial=far), x.max(axis=0, initial=-far)))
+    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+    extent, farthest = float((high - low).max()), float(np.maximum(-low, high).max())
+    return min(11 - math.ceil(math.log10(extent)), 14 - math.ceil(math.log10(farthest)))
 
 
 def _points(domain: Domain, dim: int, which: BoolArray | Int32Array, digits: int) -> FloatArray:

@@ -959,6 +959,19 @@ def test_a_folder_whose_name_is_too_long(word: str, write) -> None:
     assert status == 2 and (told if COMM.rank == 0 else not err)
 
 
+@pytest.mark.parametrize("away", [1234567.123456, 3e9 + 0.123])
+def test_data_with_an_end_at_a_side_far_from_the_origin(write, away: float) -> None:
+    """Points are looked at where they are, not 11 digits of them, which would be beyond."""
+    sides = [[away, 0], [away + 1, 0], [away + 1, 1], [away, 1]]
+    text = with_("[[-1, 0], [1, 0], [1, 1], [-1, 1]]", str(sides))
+    root = f"sqrt(x - {away!r}) + sqrt({away + 1!r} - x)"
+    status, _, err = run("check", write(text.replace("1 + r", root)))
+    assert (status, err) == (0, "")
+    status, _, err = run("check", write(text.replace("1 + r", f"1/(x - {away!r})")))
+    told = "is inf; it must be finite" in " ".join(err.split())
+    assert status == 2 and (told if COMM.rank == 0 else not err)
+
+
 def test_a_check_leaves_the_results_of_a_run_alone(write) -> None:
     """What lies beside a report is of its run; the picture goes with the next one."""
     path, out = write(CASE), Path("out")
