@@ -35,8 +35,8 @@ from mpi4py import MPI
 
 from signorini_cr.app import cli, problemfile
 from signorini_cr.app.expressions import parse
-from signorini_cr.data.pointwise import evaluate
 from signorini_cr.errors import InputError, NotConverged
+from signorini_cr.fem.pointwise import evaluate
 from signorini_cr.fem.simplified import simplified
 
 pytestmark = pytest.mark.serial

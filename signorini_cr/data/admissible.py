@@ -27,11 +27,11 @@ from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
 from ..fem.conditions import as_number, facets_of, is_by_cells, negative
+from ..fem.pointwise import EPS, evaluate
 from ..fem.problem import Forms
 from ..fem.space import facet_entities, function_space, ghosted_vector
 from ..garbage import release
 from ..mesh.domain import Domain
-from .pointwise import EPS, evaluate
 
 if TYPE_CHECKING:
     from .quadrature import Tensor, Trace

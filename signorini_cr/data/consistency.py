@@ -13,11 +13,11 @@ from mpi4py import MPI
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..compat import cell_nodes
 from ..fem.conditions import Condition, as_number
+from ..fem.pointwise import evaluate
 from ..fem.problem import Forms
 from ..fem.space import facet_entities, facet_measures, facet_normals
 from ..mesh.domain import Domain
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
-from .pointwise import evaluate
 
 Values = tuple[FloatArray, FloatArray]
 """Values at points, and what rounding may have done to them."""

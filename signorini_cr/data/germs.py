@@ -21,9 +21,9 @@ from ufl.corealg import traversal
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import at_points
+from ..fem.pointwise import Unknown
 from ..fem.simplified import bits
 from .jets import SERIES, Boxes, Enclosure, Range, mul, out, power_series, square_of
-from .pointwise import Unknown
 
 SECTORS = 16
 """Sectors that the directions from a point into a triangle are divided into."""

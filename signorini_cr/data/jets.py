@@ -23,9 +23,9 @@ from ufl import classes
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.lowering import by_components
+from ..fem.pointwise import Unknown, by_operators, is_affine
 from ..mesh.domain import Domain
 from .balls import EPS, LOOSE, NONE, ORDER, TINY, Balls, Factor, Rows, indices, middle, union
-from .pointwise import Unknown, by_operators, is_affine
 
 Range = tuple[FloatArray, FloatArray]
 """Lower and upper bounds."""

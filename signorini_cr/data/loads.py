@@ -22,11 +22,11 @@ from ..fem.cells import (
     poincare,
     sum_rows,
 )
+from ..fem.pointwise import Unknown
 from ..fem.space import facet_quadrature
 from .cutting import Cut, cut, refine
 from .jets import Boxes, Enclosure
 from .pieces import Pieces
-from .pointwise import Unknown
 from .quadrature import LOAD_DEGREE, OnFacets, Volume
 from .ranges import errors_on, range_on
 from .triangles import Triangles, trace_constant

@@ -26,6 +26,7 @@ from ..fem.cells import BoundaryFacets, Cells, points_of
 from ..fem.conditions import Condition, as_number, may_change
 from ..fem.lowering import by_components
 from ..fem.physics import Imposed
+from ..fem.pointwise import Samples, Unknown
 from ..fem.problem import Forms
 from ..fem.simplified import simplified
 from ..fem.space import facet_entities, facet_quadrature
@@ -33,7 +34,6 @@ from ..mesh.domain import Domain
 from .cutting import Cut, cut
 from .jets import Boxes, Enclosure, Range, lowered, values
 from .pieces import Pieces
-from .pointwise import Samples, Unknown
 from .ranges import Deviation, errors_on, range_of
 
 NO_RANGE = "the coefficient has no computable upper and lower bound"

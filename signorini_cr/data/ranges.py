@@ -14,6 +14,7 @@ import ufl
 
 from ..arrays import BoolArray, FloatArray
 from ..fem.cells import Cells, blocks
+from ..fem.pointwise import Unknown
 from .balls import indices
 from .germs import allowance, holders, may_be_singular, singular_points
 from .jets import (
@@ -29,7 +30,6 @@ from .jets import (
     values,
 )
 from .pieces import EDGES, Levels, Pieces
-from .pointwise import Unknown
 
 Errors = Callable[[Boxes, FloatArray], FloatArray]
 """Function for errors of data on boxes and simplices of given half extents; shape (rows, n)."""

@@ -20,10 +20,10 @@ from ..data.balls import indices, middle
 from ..data.cutting import refine
 from ..data.jets import Enclosure, Jet, choices_first
 from ..data.pieces import Pieces
-from ..data.pointwise import Unknown
 from ..data.quadrature import OnParts, Trace
 from ..data.triangles import Triangles
 from ..fem.cells import BoundaryFacets, Cells
+from ..fem.pointwise import Unknown
 
 ROUGH = "{} jumps on a boundary facet, or its derivative is not known to be bounded there"
 NO_RANGE = "{} holds an operator that has no enclosure: {}"

@@ -30,7 +30,7 @@ from ufl.domain import extract_unique_domain
 from ufl.geometry import GeometricFacetQuantity
 from ufl.restriction import Restricted
 
-from ..arrays import Int32Array
+from ..arrays import FloatArray, Int32Array
 from ..errors import InputError, insist_on_kind, meant, together
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
@@ -348,6 +348,21 @@ def carry(data: Iterable[Expr], domain: Domain) -> None:
         domain.carried(function)
 
 
+def _lattice(mesh: Mesh) -> FloatArray:
+    """Take points of the box around a mesh, the same on all ranks; collective.
+
+    Returns:
+        Shape (5^d, 3).
+    """
+    x, far = mesh.geometry.x, np.inf
+    ends = mesh.comm.allgather((x.min(axis=0, initial=far), x.max(axis=0, initial=-far)))
+    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+    # where no symmetry of the data is likely to be
+    parts = np.array([0.01, 0.27, 0.52, 0.74, 0.98])
+    axes = [parts if b > a else parts[:1] for a, b in zip(low, high, strict=True)]
+    return low + np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) * (high - low)
+
+
 class Forms:
     """The forms of the paper for one problem and element, compiled when first asked for.
 
@@ -408,12 +423,13 @@ class Forms:
         flux = None if constant else self.kappa * ufl.grad(self.exact)
 
         outward = None if flux is None else ufl.dot(flux, ufl.FacetNormal(cell))
-        self.asked = None if flux is None else simplified(-ufl.div(flux))
+        near = None if flux is None else _lattice(mesh)
+        self.asked = None if flux is None else simplified(-ufl.div(flux), near)
         self.reaction = self._by_material("reaction", problem.reaction, materials)
         derivable = self.exact is not None and problem.form is None
         if derivable and as_number(self.reaction) != 0.0:
             gain = self.reaction * self.exact
-            self.asked = gain if self.asked is None else simplified(self.asked + gain)
+            self.asked = gain if self.asked is None else simplified(self.asked + gain, near)
         derived = 0.0 if self.asked is None else self.asked
         self.f = self._by_material("f", derived if problem.f is None else problem.f, materials)
         given = Given(partial(_expression, x=self.x), self.exact, outward)

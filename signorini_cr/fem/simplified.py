@@ -12,15 +12,19 @@ as r² = (x − 2)² + y², coordinates are counted from there.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import cache, lru_cache
 from typing import Any, TypeAlias
 
+import numpy as np
 import ufl
 from ufl import classes
 from ufl.corealg.traversal import unique_pre_traversal
 
+from ..arrays import FloatArray
 from .lowering import by_components
+from .pointwise import evaluate
 
 Monomial: TypeAlias = tuple[tuple[int, Fraction], ...]
 """Atoms by number, in order, with their exponents."""
@@ -35,6 +39,9 @@ MOST_BITS = 5_000
 FAR = 2.0**300
 """Factors that are larger, or smaller than its inverse, are left where they stand: multiplied out,
 as in (x/3)^{800}, they and what they belong to would be beyond the range of numbers."""
+LOST, WELL = 16.0, 1e-13
+"""Rounding may be so many times what it is in the formula as it was, or that part of the largest
+value, before another is taken in its place."""
 LARGEST_WHOLE = 64
 """Exponents up to this are integers; in C large ones are none."""
 WHOLE = 8
@@ -47,13 +54,15 @@ class _TooLong(Exception):
     """A sum of too many terms, or factors with too many digits."""
 
 
-def simplified(expression: Any) -> Any:
+def simplified(expression: Any, points: FloatArray | None = None) -> Any:
     """Carry out derivatives, and let terms cancel where this makes the formula shorter.
 
     A formula of coordinates and numbers alone is worked on once, on whatever meshes it comes.
 
     Args:
         expression: A scalar.
+        points: Where it is to be evaluated, or about there, shape (n, 3). What is multiplied out
+            far from there, so that rounding would be more of it, is left as it is.
     """
     others = [
         e
@@ -61,11 +70,27 @@ def simplified(expression: Any) -> Any:
         if isinstance(e, classes.Coefficient | classes.Constant | classes.GeometricQuantity)
     ]
     if len(others) != 1 or not isinstance(x := others[0], classes.SpatialCoordinate):
-        shorter = _shorter(expression)
-        return expression if shorter is None else shorter
+        return _best(expression, _shorter(expression), points)
     general = _coordinates(ufl.domain.extract_unique_domain(x).ufl_coordinate_element())
-    shorter = _known(ufl.replace(expression, {x: general}))
-    return expression if shorter is None else ufl.replace(shorter, {general: x})
+    shorter = [ufl.replace(e, {general: x}) for e in _known(ufl.replace(expression, {x: general}))]
+    return _best(expression, shorter, points)
+
+
+def _best(expression: Any, shorter: Sequence[Any], points: FloatArray | None) -> Any:
+    """Choose the first of shorter formulas in which rounding is not much more than it has to be."""
+    if points is None or not shorter:
+        return shorter[0] if shorter else expression
+    known = evaluate(expression, points)
+    if known is None:
+        return shorter[0]
+    values, least = known
+    there = np.isfinite(values) & np.isfinite(least)
+    least = LOST * least + WELL * np.abs(values[there]).max(initial=0.0)
+    for each in shorter:
+        found = evaluate(each, points)
+        if found is None or np.all((found[1] <= least)[there & np.isfinite(found[0])]):
+            return each
+    return expression
 
 
 @cache
@@ -74,14 +99,14 @@ def _coordinates(element: Any) -> Any:
     return ufl.SpatialCoordinate(ufl.Mesh(element))
 
 
-def _shorter(expression: Any) -> Any:
-    """Do what `simplified` does; None where the formula does not get shorter."""
+def _shorter(expression: Any) -> list[Any]:
+    """List what `simplified` chooses from, the shortest first; only what is shorter."""
     plain = by_components(expression)
-    found, shortest = None, _size(plain)
+    found = []
     try:
         elsewhere = _origin(plain)
     except (ArithmeticError, ValueError):  # what is not finite is no fraction
-        return None
+        return []
     for origin in ({}, elsewhere) if elsewhere else ({},):
         reader = _Reader(origin)
         try:
@@ -90,9 +115,9 @@ def _shorter(expression: Any) -> Any:
             other = reader.formula(reader.read(plain))
         except (_TooLong, ArithmeticError, ValueError, RecursionError):
             continue
-        if _size(other) < shortest:
-            found, shortest = other, _size(other)
-    return found
+        if _size(other) < _size(plain):
+            found.append(other)
+    return sorted(found, key=_size)
 
 
 _known = lru_cache(maxsize=64)(_shorter)

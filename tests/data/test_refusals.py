@@ -17,9 +17,9 @@ from signorini_cr.app import cli
 from signorini_cr.app.expressions import parse
 from signorini_cr.data.admissible import check_data
 from signorini_cr.data.consistency import doubts
-from signorini_cr.data.pointwise import evaluate
 from signorini_cr.errors import InputError, on_root
 from signorini_cr.fem.conditions import Robin
+from signorini_cr.fem.pointwise import evaluate
 from signorini_cr.fem.problem import Forms, Material, Problem
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import Domain, Polygon, read_gmsh

@@ -10,9 +10,9 @@ from mpi4py import MPI
 
 from signorini_cr import compat
 from signorini_cr.data import quadrature
-from signorini_cr.data.pointwise import Samples
 from signorini_cr.data.quadrature import Rule, Trace, Volume
 from signorini_cr.fem.cells import Cells
+from signorini_cr.fem.pointwise import Samples
 from signorini_cr.fem.space import facet_entities, function_space
 
 FORMULAS = {

@@ -13,8 +13,8 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.algorithms.expand_indices import expand_indices
 from ufl.corealg.traversal import unique_pre_traversal
 
-from signorini_cr.data.pointwise import evaluate
 from signorini_cr.fem.lowering import by_components
+from signorini_cr.fem.pointwise import evaluate
 from signorini_cr.fem.simplified import simplified
 
 MESH = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))

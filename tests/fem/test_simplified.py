@@ -1,5 +1,7 @@
 """Loads derived from a solution: simpler, and the same numbers."""
 
+from fractions import Fraction
+
 import basix.ufl
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import ufl
 from ufl.corealg.traversal import unique_pre_traversal
 
 from signorini_cr import exact, solve
-from signorini_cr.data.pointwise import evaluate
+from signorini_cr.fem.pointwise import evaluate
 from signorini_cr.fem.problem import Forms, Problem, as_number
 from signorini_cr.fem.simplified import simplified
 
@@ -139,6 +141,28 @@ def test_squares_of_squares():
     for _ in range(40):
         u = u * u
     simplified(minus_laplace(u))
+
+
+def _product_about(x, at, roots):
+    """A polynomial and its second derivative, in whatever kind of number x is."""
+    p, first, second = 1 + 0 * x, 0 * x, 0 * x
+    for root in roots:
+        factor = x - (at + root)
+        p, first, second = p * factor, first * factor + p, second * factor + 2 * first
+    return p, second
+
+
+@pytest.mark.parametrize("near", [0, 1])
+@pytest.mark.parametrize("at", [0, 1000, 2**20])
+@pytest.mark.parametrize("roots", [(0, 0, 1, 1, 2, 2), (0, 0, 0, 1, 1, 1, 1), (-1, 3, 3, 5)])
+def test_powers_about_a_far_point_keep_their_digits(at, near, roots):
+    """By rational numbers; multiplied out about 0 they would be lost, near or far from there."""
+    expression = _product_about(x, at, roots)[0] + (x - at - roots[-1]) ** 2 + x * y
+    points = POINTS + np.array([at * near, 0, 0])
+    f = simplified(minus_laplace(expression), points)
+    exact = [-2 - _product_about(Fraction(value), at, roots)[1] for value in points[:, 0]]
+    known = np.array([float(each) for each in exact])
+    assert np.abs(evaluate(f, points)[0] - known).max() <= 1e-12 * np.abs(known).max()
 
 
 def test_what_gets_longer_is_left_alone():

@@ -20,9 +20,9 @@ from ufl.corealg.traversal import unique_post_traversal
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes
-from ..fem.lowering import by_components
-from ..fem.space import facet_corners, facet_normals
 from ..mesh.domain import Domain
+from .lowering import by_components
+from .space import facet_corners, facet_normals
 
 Value: TypeAlias = tuple[Any, Any]
 """A number and the bound of its error; of a condition, the truth and 0."""
