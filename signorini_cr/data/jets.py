@@ -33,6 +33,10 @@ Truth = tuple[BoolArray, BoolArray]
 """Masks of the boxes in which a condition can hold, and of those in which it can fail."""
 
 
+STRIP = 1e-13
+"""Rounding of a coordinate, in parts of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Boxes:
     """Boxes to enclose data in: points low ≤ x ≤ high, as they depend on some variables.
@@ -42,13 +46,13 @@ class Boxes:
         high: Largest coordinates, shape (gdim, n).
         along: ∂x/∂(variables), shape (variables, gdim, n); None where x itself are the variables.
         corners: Vertices of the simplices that are meant, shape (d + 1, gdim, n); conditions on
-            affine functions are then decided up to a strip along the simplex's boundary which is
-            `STRIP` wide.
+            affine functions are then decided up to a strip along the simplex's boundary.
         cells: A cell that holds each box, shape (n,), for data that are given by cells.
         normal: Outward normals, shape (gdim, n).
         domain: Of the cells.
         slanted: Boxes that are much larger than their simplices, shape (k,).
         edges: Two edges of each of these, from one vertex, shape (variables, gdim, k).
+        rounding: Width of the strips, in parts of the coordinates.
     """
 
     low: FloatArray
@@ -60,6 +64,7 @@ class Boxes:
     domain: Domain | None = None
     slanted: IndexArray | None = None
     edges: FloatArray | None = None
+    rounding: float = STRIP
 
     @property
     def own(self) -> Boxes:
@@ -86,7 +91,7 @@ class Boxes:
     @cached_property
     def strip(self) -> FloatArray:
         """Width of what may be left out along the boundary, shape (n,): coordinates' rounding."""
-        return STRIP * np.maximum(np.abs(self.low), np.abs(self.high)).max(axis=0)
+        return self.rounding * np.maximum(np.abs(self.low), np.abs(self.high)).max(axis=0)
 
     @cached_property
     def strip_part(self) -> FloatArray:
@@ -108,9 +113,6 @@ class Boxes:
 
 CHOICES = 5
 """Most conditions in an expression that is written as choices first: 2⁵ expressions."""
-
-STRIP = 1e-13
-"""Rounding of a coordinate, in parts of it."""
 
 STEPS = 6
 """Steps to where a condition changes, by a fixed slope: on small pieces a step leaves little."""
@@ -664,7 +666,7 @@ class Enclosure:
         corners = self.boxes.corners
         if corners is None or self.order < 2 or max(rest.rows, default=0) > n:
             return low, high, thin
-        self._strips += unclear
+        self._strips += (low < 0) & (high > 0)
         return *self._at_corners(low, high, rest.on(tuple(range(1, n + 1)))[0], corners), thin
 
     def _by_slopes(self, low: FloatArray, high: FloatArray, left: Any, right: Any) -> Range:

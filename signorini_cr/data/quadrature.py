@@ -34,7 +34,7 @@ from ..mesh.domain import Domain
 from .cutting import Cut, cut
 from .jets import Boxes, Enclosure, Range, lowered, values
 from .pieces import Pieces
-from .ranges import Deviation, errors_on, range_of
+from .ranges import Deviation, errors_on, range_of, ranges_on
 
 NO_RANGE = "the coefficient has no computable upper and lower bound"
 
@@ -211,10 +211,16 @@ class Coefficient:
 
     Attributes:
         mean: κ_T, shape (cells,), or () where κ is a number.
-        low: Lower bound of κ, same shape.
+        low: What stands for κ's lower bound where fields are weighed by 1/κ, same shape; less than
+            in `core` where there are strips with another κ, and more than in these.
         high: Upper bound of κ, same shape.
-        least: Lower bound of κ's eigenvalues with lengths as they are, same shape.
+        least: The same as low for κ's eigenvalues with lengths as they are.
         most: Upper bound of these.
+        lowest: Lower bound of κ, strips included.
+        floor: The same of the eigenvalues.
+        core: Bounds of κ but for strips along the cells' sides.
+        inner: Lower bound of the eigenvalues but for these strips.
+        strips: Their part of each cell, shape (cells,); None where there are none on any rank.
         tensor: The same where it is a tensor that varies within cells; else None.
         spread: θ, (1 − θ) κ_T ≤ κ ≤ (1 + θ) κ_T, for that tensor, shape (cells,).
         rough: ϱ, where that tensor is within ϱ κ_T of a quadratic polynomial, shape (cells,).
@@ -233,6 +239,11 @@ class Coefficient:
     tensor: Tensor | None = None
     spread: FloatArray
     rough: FloatArray
+    lowest: FloatArray
+    floor: FloatArray
+    core: Range
+    inner: FloatArray
+    strips: FloatArray | None = None
 
     def __init__(self, kappa: Volume | Tensor, cells: Cells):
         """Evaluate κ; collective."""
@@ -243,9 +254,12 @@ class Coefficient:
         else:
             self._of_scalar(kappa, cells)
             self.least, self.most = self.low, self.high
+            self.floor, self.inner = self.lowest, self.core[0]
+        if self.strips is not None:
+            own = bool((self.strips > 0.0).any())
+            self.strips = self.strips if cells.comm.allreduce(own, op=MPI.LOR) else None
         # The same way on all ranks
-        smallest = float(self.least.min(initial=np.inf)) if self.least.ndim else float(self.least)
-        self.smallest = min(cells.comm.allgather(smallest))
+        self.smallest = min(cells.comm.allgather(float(np.min(self.floor, initial=np.inf))))
         reasons = [reason for reason in cells.comm.allgather(self.reason) if reason]
         self.reason = reasons[0] if reasons else None
         if self.reason is None and not self.smallest > 0:
@@ -260,24 +274,31 @@ class Coefficient:
         means = kappa.means(cells.domain)
         eigenvalues = np.linalg.eigvalsh(means)
         self.mean = self.low = self.high = np.exp(np.log(eigenvalues).mean(axis=1))
+        self.lowest, self.core = self.mean, (self.mean, self.mean)
         self.least, self.most = eigenvalues[:, 0], eigenvalues[:, -1]
+        self.floor = self.inner = self.least
         off = np.zeros((means[0].size if len(means) else cells.tdim**2, len(means)))
-        for row, entry, mean in zip(off, kappa.entries, means.reshape(-1, len(off)).T, strict=True):
-            found = range_of(entry, cells)
+        self.strips, low, high = np.zeros(len(means)), off.copy(), off.copy()
+        for i, (entry, mean) in enumerate(
+            zip(kappa.entries, means.reshape(-1, len(off)).T, strict=True)
+        ):
+            found = ranges_on(entry, Pieces.of_cells(cells), cells)
             if found is None:
                 self.reason = NO_RANGE
                 break
-            row[:] = np.maximum(found[1] - mean, mean - found[0])
+            (inner, outer), (part, low[i], high[i]) = found
+            off[i] = np.maximum(outer - mean, mean - inner)
+            self.strips += part
         least = STEADY * np.abs(means).max(axis=(1, 2), initial=0.0)
         for difference in kappa.skew:
-            found = range_of(difference, cells)
-            if found is None or (np.maximum(-found[0], found[1]) > least).any():
+            between = range_of(difference, cells)
+            if between is None or (np.maximum(-between[0], between[1]) > least).any():
                 self.reason = "the coefficient is a tensor that could not be shown to be symmetric"
                 break
         if any(cells.comm.allgather(self.reason)):
             return
         theta = self._by_mean(np.maximum(off, 0.0), cells)
-        varies = bool((off > least).any())
+        varies = bool((off > least).any() or (self.strips > 0.0).any())
         if cells.comm.allreduce(varies, op=MPI.LOR):
             self.tensor, self.rule, self.spread = kappa, kappa.fine, theta
             kappa.prepare(kappa.fine)  # here, as a rank without cells never asks for values
@@ -296,8 +317,18 @@ class Coefficient:
             theta = np.zeros_like(theta)
         if (theta >= 1.0).any():
             self.reason = "the coefficient is a tensor that varies too much within a cell"
-        self.low, self.high = (1.0 - theta) * self.mean, (1.0 + theta) * self.mean
-        self.least, self.most = (1.0 - theta) * self.least, (1.0 + theta) * self.most
+        self.core = (1.0 - theta) * self.mean, (1.0 + theta) * self.mean
+        self.inner, outer = (1.0 - theta) * self.least, (1.0 + theta) * self.most
+        first, last = _eigenvalues_between(low, high)
+        there = self.strips > 0.0
+        self.floor = np.where(there, np.minimum(first, self.inner), self.inner)
+        most = np.where(there, np.maximum(last, outer), outer)
+        # with lengths stretched, where it is all the same κ_T
+        self.lowest = np.where(there, np.minimum(self.floor / self.most, 1.0 - theta), 1.0 - theta)
+        self.high = np.where(there, np.maximum(most / self.least, 1.0 + theta), 1.0 + theta)
+        self.lowest, self.high = self.lowest * self.mean, self.high * self.mean
+        self.low = _with_strips(self.core[0], self.strips, self.lowest)
+        self.least, self.most = _with_strips(self.inner, self.strips, self.floor), most
 
     def _by_mean(self, sizes: FloatArray, cells: Cells) -> FloatArray:
         """Bound |κ_T^{-1/2} E κ_T^{-1/2}|, E with entries of such sizes, shape (cells,)."""
@@ -317,18 +348,21 @@ class Coefficient:
         fine = kappa.exact_for(KAPPA_DEGREE)
         self.rule = fine.rule
         if kappa.number is not None:
-            self.mean = self.low = self.high = np.array(kappa.number)
+            self.mean = self.low = self.high = self.lowest = np.array(kappa.number)
+            self.core = self.mean, self.mean
         else:
             self.deviation = kappa.deviation
-            found: Range | None = range_of(kappa.expression, cells)
+            found = ranges_on(kappa.expression, Pieces.of_cells(cells), cells)
             values = kappa.at(cells)
             self.mean = values @ kappa.rule.weights
             if found is None:
                 self.reason = NO_RANGE
-                self.low = self.high = self.mean
+                self.core, self.lowest, self.high = (self.mean, self.mean), self.mean, self.mean
+                self.low = self.mean
             else:
-                self.low, self.high = (np.broadcast_to(x, self.mean.shape) for x in found)
-            varies = bool((self.high - self.low > STEADY * np.abs(self.mean)).any())
+                self.core, (self.strips, self.lowest, self.high) = found
+                self.low = _with_strips(self.core[0], self.strips, self.lowest)
+            varies = bool((self.high - self.lowest > STEADY * np.abs(self.mean)).any())
             if cells.comm.allreduce(varies, op=MPI.LOR):  # or the bound would depend on the ranks
                 values = values if fine is kappa else fine.at(cells)
                 self.values = np.ascontiguousarray(values.T)
@@ -411,6 +445,31 @@ class Coefficient:
             top = np.abs(of_four @ (1.0 - values * q)) + r * (np.abs(of_four) @ np.abs(q))
             tau = (top.max(axis=0) + r * np.abs(coefficients).max(axis=0)) * (1 + 1e-10)
             return np.where(tau < 1.0, 2.0 * tau / (1.0 - tau), np.inf)
+
+
+def _with_strips(core: FloatArray, part: FloatArray, lowest: FloatArray) -> FloatArray:
+    """Find k with ‖κ^{-1/2} y‖ ≤ ‖k^{-1/2} y‖ for fields y that are nowhere much above their mean.
+
+    A strip's part π adds κ_S^{-1/2} times the root of 36 π at most, which of fields of degree 2 is
+    the part they have in it, and with Poincaré's inequality 2.1 times as much.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = (core**-0.5 + 12.6 * np.sqrt(part / lowest)) ** -2.0
+    return np.where((part > 0.0) & (lowest < core), np.maximum(found, lowest), core)
+
+
+def _eigenvalues_between(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Bound eigenvalues of symmetric matrices whose entries lie in between, shapes (n,).
+
+    Args:
+        low: Their entries, row by row, shape (d², n).
+        high: The same.
+    """
+    d = round(len(low) ** 0.5)
+    middle, reach = (x.T.reshape(-1, d, d) for x in (0.5 * (low + high), 0.5 * (high - low)))
+    eigenvalues = np.linalg.eigvalsh(0.5 * (middle + middle.swapaxes(1, 2)))
+    room = np.linalg.norm(reach, ord=2, axis=(1, 2)) * (1 + 1e-12)
+    return eigenvalues[:, 0] - room, eigenvalues[:, -1] + room
 
 
 def bernstein(hats: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:

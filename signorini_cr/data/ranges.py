@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import ufl
@@ -56,18 +57,55 @@ def range_of(expression: ufl.core.expr.Expr, cells: Cells) -> Range | None:
 
 def range_on(expression: ufl.core.expr.Expr, whole: Pieces, cells: Cells) -> Range | None:
     """Bound an expression below and above on pieces, shapes (n,); see `range_of`."""
+    found = ranges_on(expression, whole, cells)
+    return None if found is None else found[0]
+
+
+class Strips(NamedTuple):
+    """Strips along pieces' sides that ranges leave out; see `Boxes.corners`.
+
+    Attributes:
+        part: Upper bound of the strips' part of a piece, 0 where there is none, shape (n,).
+        low: Lower bound on all of the piece.
+        high: Upper bound.
+    """
+
+    part: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def ranges_on(
+    expression: ufl.core.expr.Expr, whole: Pieces, cells: Cells
+) -> tuple[Range, Strips] | None:
+    """Bound an expression on pieces but for strips along their sides, and tell of these.
+
+    A jump along a side, whose vertices are rounded, is one within such a strip.
+
+    Returns:
+        None as in `range_of`.
+    """
     data, n = lowered(expression), len(whole.share)
     try:
         jet = Enclosure(whole.boxes(cells), order=0)(data)
         low, high = (np.array(np.broadcast_to(x, n)) for x in (jet.low, jet.high))
+        part, every = np.zeros(n), (low, high)
         if has_conditions(data):
-            # a jump along a cell's side does not concern the cell
             wide = np.flatnonzero(high > low)
-            jet = Enclosure(whole[wide].boxes(cells, decide=True))(data)
-            low[wide], high[wide] = jet.low, jet.high
+            boxes = whole[wide].boxes(cells, decide=True)
+            at = Enclosure(boxes)
+            jet = at(data)
+            low[wide], high[wide], part[wide] = jet.low, jet.high, at.left_out
+            every = low.copy(), high.copy()
+            if part.any():
+                jet = Enclosure(replace(boxes, rounding=0.0))(data)
+                every[0][wide], every[1][wide] = jet.low, jet.high
+        strips = Strips(part, *every)
     except Unknown:
         return None
-    return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    return (low, high), strips
 
 
 def remainders(

@@ -31,7 +31,7 @@ from .companion import Companion, Lifted, companion, on_facet
 from .cubic import cubed, with_cubics
 from .curl import improve, promising
 from .cusps import Cusps
-from .duality import DualityGap, Within, integrate
+from .duality import DualityGap, Within, integrate, of_gradients
 from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
 from .functional import Functional, Masses
 from .lifting import below
@@ -526,7 +526,7 @@ def _complete(known: _Known, v: Companion, sums: Sums) -> None:
         totals.energy -= 0.5 * float(cells.volume @ means)
         totals.energy_slack += 0.5 * float(np.sum(own))
     totals.contact = float(np.sum(v.contact))
-    totals.of_gradients = float(np.sum(np.maximum(sums.middle, 0.0) / kappa.least))
+    totals.of_gradients = float(np.sum(of_gradients(kappa, sums)))
     totals.steepness = float(np.sum(np.maximum(sums.steepness, 0.0)))
 
 
@@ -859,7 +859,8 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     high = kappa.most[which] if kappa.most.ndim else kappa.most
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
-    change = before * steep + np.sqrt(cells.volume[which]) * _mean_square(known, which) * area
+    with np.errstate(invalid="ignore"):  # infinite where v has a reason for no bound
+        change = before * steep + np.sqrt(cells.volume[which]) * _mean_square(known, which) * area
     if sums.apart is not None:
         c = pick(known.c.high, which)
         steep = np.hypot(steep, np.sqrt(c) * area)

@@ -50,11 +50,18 @@ def integrate(
         most: An upper bound of c, if that is another one: then ½∫ c u_h² is left to the caller.
     """
     sums = Sums.empty(cells.number, reacts(reaction))
+    if kappa.strips is not None:
+        sums.fields = np.empty((3, cells.number))
     most = reaction if most is None else most
     duality_gap = DualityGap(cells, kappa, w, load, flux, v, reaction, most, sums)
     for block in blocks(cells.number):
         duality_gap.add(block)
     return sums
+
+
+_QUADRATIC = {2: 36.0, 3: 16.0}
+"""Most that a squared field of degree 2 is on a triangle, in parts of its mean; on a tetrahedron
+one of degree 1."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +144,9 @@ class DualityGap:
         sums, totals = self.sums, self.sums.totals
         square = found.pp + found.bb
         sums.indicators[block], sums.steepness[block] = square, found.vv
+        if sums.fields is not None:
+            for row, own in enumerate((square + 2.0 * found.pb, found.near, square)):
+                sums.fields[row, block] = own
         sums.middle[block] = found.near + (square + 2.0 * found.pb)
         sums.across[block] = found.far + (square - 2.0 * found.pb)
         totals.flux += float(np.sum(found.pp))
@@ -450,6 +460,25 @@ def _swollen(squares: FloatArray, more: FloatArray) -> FloatArray:
     return 2.0 * np.sqrt(np.maximum(squares, 0.0) * more)
 
 
+def of_gradients(kappa: Coefficient, sums: Sums) -> FloatArray:
+    """Bound ∫_T |κ^{-1/2}(p + κ^{-1/2}σ + b)|², shape (cells,).
+
+    On strips along the sides of T, κ may be less than elsewhere: little of p + b and of σ is there.
+    """
+    found = np.maximum(sums.middle, 0.0) / kappa.inner
+    if sums.fields is None or kappa.strips is None:
+        return found
+    own, missed, square = np.maximum(sums.fields, 0.0)
+    rest = np.maximum(sums.indicators - square, 0.0)
+    there = 1.0 / kappa.inner + 36.0 * kappa.strips * kappa.inner / kappa.floor**2
+    inner = kappa.inner.copy()
+    if kappa.cut is not None:  # along the jump, maybe, and then integrals have what is in strips
+        cut = kappa.cut.pieces.parent
+        inner[cut] = kappa.floor[cut]
+    apart = np.sqrt(own / inner + missed / kappa.floor) + np.sqrt(rest * there)
+    return np.where(kappa.strips > 0.0, apart**2, found)
+
+
 def _twist(
     cells: Cells,
     kappa: Coefficient,
@@ -457,7 +486,7 @@ def _twist(
     P: FloatArray,
     W: FloatArray,
 ) -> FloatArray:
-    """Bound max_T |κ⁻¹ − κ_T⁻¹| ‖y‖_T.
+    """Bound max_T |κ⁻¹ − κ_T⁻¹| ‖y‖_T, but of strips along T's sides only what fields have there.
 
     Args:
         cells: The mesh.
@@ -466,8 +495,10 @@ def _twist(
         P: Fluxes of y − κ_T∇u_h out of them.
         W: u_h at their vertices.
     """
-    mean, low, high = (pick(k, where) for k in (kappa.mean, kappa.low, kappa.high))
+    mean, low, high = (pick(k, where) for k in (kappa.mean, *kappa.core))
     spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
+    if kappa.strips is not None:
+        spread = spread + 36.0 * pick(kappa.strips, where) / pick(kappa.lowest, where)
     steep = np.sqrt(np.maximum(dot_rows(W, cells.apply(W, where)), 0.0))
     return spread * (np.sqrt(np.maximum(field_squares(cells, P, where), 0.0)) + mean * steep)
 
@@ -590,12 +621,13 @@ def _of_tensor(
     own = np.einsum("in,ink->nk", w[:, block], gradients)
     off, rule = kappa.apart(cells, block), kappa.rule
     squares, steep = np.zeros((2, 2, len(volume)))
-    vv = np.zeros(len(volume))
+    vv, yy = np.zeros((2, len(volume)))
     for tensor, weight, hat in zip(off, rule.weights, rule.hats.T[:, :, None], strict=True):
         Q = hat * s - P
         if flux.beyond is not None:
             Q += flux.beyond.through(cells, block, hat)
         y = np.einsum("in,ink->nk", Q, corners) / (d * volume)[:, None] + k * own
+        yy += weight * (y**2).sum(axis=1)
         change = np.einsum("in,ink->nk", np.broadcast_to(slopes(hat), w[:, block].shape), gradients)
         for i, slope in enumerate((own + change, own - change)):
             flow = k * slope + np.einsum("nij,nj->ni", tensor, slope)
@@ -606,7 +638,14 @@ def _of_tensor(
     rough, mean = kappa.rough[block], k[:, 0]
     found = np.sqrt(volume / mean * squares) + 2.0 * rough * np.sqrt(volume * mean * steep)
     far, near = found**2 / (1.0 - theta) - np.stack(mean_squares)
-    return volume * vv, far, near, rough * mean * volume * steep[0]
+    energy = rough * mean * volume * steep[0]
+    if kappa.strips is not None:
+        part = _QUADRATIC[d] * kappa.strips[block] * volume
+        of_y = part * yy / kappa.lowest[block]
+        of_v, of_other = part * kappa.high[block] * steep
+        far, near = far + 4.0 * (of_y + of_v), near + 4.0 * (of_y + of_other)
+        energy = energy + 0.5 * of_v
+    return volume * vv, far, near, energy
 
 
 class Within(NamedTuple):
@@ -683,9 +722,12 @@ def _tensor_within(
         steep += weight * (slope**2).sum(axis=1)
         off += weight * tensor
     pull = volume * np.einsum("ink,nk->in", gradients, total)
-    missed = 2.0 * kappa.rough[block] * k
-    mean = k + missed + np.linalg.norm(off, axis=(1, 2))
-    return pull, missed * volume * np.sqrt(steep), np.fmin(mean, pick(kappa.high, block))
+    missed, strips = 2.0 * kappa.rough[block] * k, 0.0
+    if kappa.strips is not None:
+        strips = _QUADRATIC[cells.tdim] * kappa.strips[block] * kappa.high[block]
+    mean = k + missed + strips + np.linalg.norm(off, axis=(1, 2))
+    unsure = (missed + strips) * volume * np.sqrt(steep)
+    return pull, unsure, np.fmin(mean, pick(kappa.high, block))
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:

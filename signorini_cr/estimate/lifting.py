@@ -9,7 +9,7 @@ What is needed are bounds of |δ| and |δ'|, piece by piece; k is the best for t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from mpi4py import MPI
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..data.balls import indices, middle
 from ..data.cutting import refine
-from ..data.jets import Enclosure, Jet, choices_first
+from ..data.jets import STRIP, Boxes, Enclosure, Jet, choices_first, has_conditions
 from ..data.pieces import Pieces
 from ..data.quadrature import OnParts, Trace
 from ..data.triangles import Triangles
@@ -194,7 +194,8 @@ def _lifted(found: _Enclosed, seen: Triangles, n: int, rough: str) -> Lift:
         one, k, two, beyond, norm = (np.where(found.clear, 0.0, mean(row)) for row in rows)
         power = np.clip(np.nan_to_num(np.sqrt(one / two), nan=1.0), *POWERS)
         squares = one / power + k + power * two
-    fine = np.isfinite(squares).all() and not (found.jumps & ~found.clear).any()
+    squares[found.jumps & ~found.clear] = np.inf
+    fine = bool(np.isfinite(squares).all())
     return Lift(
         np.sqrt(0.5 * height * length * squares),
         np.sqrt(height * length * norm / (2.0 * power + 2.0)),
@@ -277,6 +278,8 @@ def _enclosed(
     room = 8 * cells.comm.allreduce(n) + 1000
     pieces, (_, size, steep, least) = refine(pieces, steepness, weights, room, cells)
     jumps = _jump_at_ends(expression, whole, polynomial, cells, JUMP * scale, obstacle)
+    if has_conditions(expression):
+        jumps |= _jump_between(expression, pieces, polynomial, cells, JUMP * scale, obstacle)
     clear = np.zeros(n, dtype=bool)
     if obstacle:
         below = size <= 0.0
@@ -366,11 +369,50 @@ def _bounds(
 ) -> FloatArray:
     """Bound |δ|, |δ'|, and the data's mean from below, on pieces of facets, shape (3, n).
 
-    Taylor's formula about the middle m for δ', with what the orders 1, 2 and 3 say; whichever is
-    the best. With `signed` the first is an upper bound of δ itself.
+    Where conditions are decided but for strips at the ends, whose part of a piece is π, let D bound
+    |δ'| on all of the piece. Then |δ| is no more than π D times its length above what it is
+    elsewhere, and |δ'|² is in the mean not more than π D² above. If there is no D, data jump in the
+    strip, and are taken to do so at the end. With `signed` the first is an upper bound of δ itself.
     """
-    boxes = pieces.boxes(cells, decide=True)
-    over = Enclosure(boxes, rounding=DATA_ROUNDING * scale)(expression)
+
+    def bounds(which: slice | IndexArray, rounding: float) -> tuple[FloatArray, FloatArray]:
+        boxes = replace(pieces[which].boxes(cells, decide=True), rounding=rounding)
+        return _by_taylor(expression, pieces[which], boxes, base, cells, length, scale, signed)
+
+    found, part = bounds(slice(None), STRIP)
+    which = np.flatnonzero(part)
+    if len(which):
+        size, steep, least = found[:, which]
+        (whole, steepest, lowest), _ = bounds(which, 0.0)
+        # a jump so near to a vertex, as rounding makes of one at it, is none
+        part = np.where(np.isfinite(steepest), part[which], 0.0)
+        steepest = np.where(part > 0.0, steepest, 0.0)
+        width = part * length[pieces.parent[which]] * pieces.share[which]
+        found[:, which] = (
+            np.where(part > 0.0, np.fmin(whole, size + width * steepest), size),
+            np.hypot(steep, np.sqrt(part) * steepest),
+            np.where(part > 0.0, np.fmax(lowest, least - part * width * steepest), least),
+        )
+    return found
+
+
+def _by_taylor(
+    expression: Any,
+    pieces: Pieces,
+    boxes: Boxes,
+    base: Cubic,
+    cells: Cells,
+    length: FloatArray,
+    scale: float,
+    signed: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Bound the same on boxes, but for a part of each piece which is bounded as well, shape (n,).
+
+    Taylor's formula about the middle m for δ', with what the orders 1, 2 and 3 say; whichever is
+    the best.
+    """
+    enclosure = Enclosure(boxes, rounding=DATA_ROUNDING * scale)
+    over = enclosure(expression)
     at, s = pieces.parent, pieces.hats[:, 1].mean(axis=0)
     e = 0.5 * length[at] * pieces.share
     there = Enclosure(pieces.points(cells, np.full((2, 1), 0.5)))(expression)
@@ -408,7 +450,7 @@ def _bounds(
                 low + e**2 / 3.0 * (m[2][0] - m[2][1]) - 0.25 * e**3 * (np.abs(c[3][0]) + c[3][1]),
             )
         )
-    return np.stack([size, steep, least])
+    return np.stack([size, steep, least]), enclosure.left_out
 
 
 def _balls(jet: Jet, n: int) -> list[tuple[FloatArray, FloatArray]]:
@@ -424,14 +466,45 @@ def _jump_at_ends(
     """Tell where δ does not vanish at a facet's end: the data's limit is not the value there."""
     found = np.zeros(len(whole.parent), dtype=bool)
     for end in (0, 1):
-        corners = whole.corners.copy()
-        corners[1 - end] = corners[end] + END * (whole.corners[1 - end] - corners[end])
-        near = Pieces(whole.parent, corners, whole.hats, whole.share, whole.frame)
-        jet = Enclosure(near.boxes(cells, decide=True))(expression)
-        found |= jet.low > base.ends[end] + jump
+        low, high = _near(expression, whole, end, cells)
+        found |= low > base.ends[end] + jump
         if not obstacle:
-            found |= jet.high < base.ends[end] - jump
+            found |= high < base.ends[end] - jump
     return found
+
+
+def _jump_between(
+    expression: Any, pieces: Pieces, base: Cubic, cells: Cells, jump: float, obstacle: bool
+) -> BoolArray:
+    """Tell on which facets δ jumps from one piece to the next, of which each may be smooth."""
+    s = pieces.hats[:, 1]
+    order = np.lexsort((s.mean(axis=0), pieces.parent))
+    s, parent = s[:, order], pieces.parent[order]
+    near = [[x[order] for x in _near(expression, pieces, end, cells)] for end in (0, 1)]
+    forward = s[1] > s[0]
+    begin = [np.where(forward, a, b) for a, b in zip(*near, strict=True)]
+    stop = [np.where(forward, b, a) for a, b in zip(*near, strict=True)]
+    if obstacle:
+        begin = [np.maximum(x, base.at(parent, s.min(axis=0))) for x in begin]
+        stop = [np.maximum(x, base.at(parent, s.max(axis=0))) for x in stop]
+    low, high = (np.array(x) for x in zip(begin, stop, strict=True))  # rows: begin, stop
+    apart = (low[0, 1:] > high[1, :-1] + jump) | (high[0, 1:] < low[1, :-1] - jump)
+    found = np.zeros(len(base.height), dtype=bool)
+    found[parent[1:][(parent[1:] == parent[:-1]) & apart]] = True
+    return found
+
+
+def _near(expression: Any, pieces: Pieces, end: int, cells: Cells) -> tuple[FloatArray, FloatArray]:
+    """Enclose data next to one end of each piece, shapes (n,)."""
+    corners = pieces.corners.copy()
+    corners[1 - end] = corners[end] + END * (pieces.corners[1 - end] - corners[end])
+    # at a point conditions that change there would be those of the next piece
+    same = (corners[0] == corners[1]).all(axis=0)
+    corners[..., same] = pieces.corners[..., same]
+    near = Pieces(pieces.parent, corners, pieces.hats, pieces.share, pieces.frame)
+    jet = Enclosure(near.boxes(cells, decide=True))(expression)
+    n = len(pieces.parent)
+    return np.broadcast_to(jet.low, n), np.broadcast_to(jet.high, n)
 
 
 def affine(
@@ -457,12 +530,20 @@ def affine(
         return Lift.none(zero + trace.constant)
     whole = Pieces.of_facets(cells, side)
     boxes = whole.boxes(cells, decide=True)
+    enclosure = Enclosure(boxes)
     try:
-        jet = Enclosure(boxes)(trace.deviation.expression)
+        jet = enclosure(trace.deviation.expression)
+        every = Enclosure(replace(boxes, rounding=0.0))(trace.deviation.expression)
     except Unknown as error:
         return Lift.none(zero, NO_RANGE.format("u_D or α", error))
     off = zero.copy()
     half = whole.half(boxes)
+    # on strips, where slopes may be others
+    for row, rad in zip(every.rest.rows, every.rest.rad, strict=True):
+        index = indices(boxes.variables)[row]
+        if sum(index) == 1:
+            size = np.prod([h**k for h, k in zip(half, index, strict=True)], axis=0)
+            off = off + np.where(enclosure.left_out > 0.0, 4.0 * rad * size * enclosure.left_out, 0)
     for row, mid, rad in zip(jet.rest.rows, jet.rest.mid, jet.rest.rad, strict=True):
         index = indices(boxes.variables)[row]
         if sum(index) == 2:

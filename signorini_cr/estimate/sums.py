@@ -76,6 +76,8 @@ class Sums:
         zeroth: What the terms without gradients add to the cells' shares, shape (cells,); None
             where there are none.
         apart: c‖v − u_h‖²_T, shape (cells,); or None.
+        fields: ∫_T |p + b|², how far that may be off, and ∫_T |p|² + |b|², shape (3, cells); None
+            where no κ is another one on strips along the cells' sides.
         totals: All cells' together.
     """
 
@@ -85,6 +87,7 @@ class Sums:
     across: FloatArray
     zeroth: FloatArray | None = None
     apart: FloatArray | None = None
+    fields: FloatArray | None = None
     totals: Totals = field(default_factory=Totals)
 
     @classmethod

@@ -18,6 +18,7 @@ from signorini_cr import (
     Contact,
     Dirichlet,
     Domain,
+    Material,
     Neumann,
     Polygon,
     Problem,
@@ -276,3 +277,111 @@ def test_a_strip_between_kinks():
     # in x from 0 to 1 the strip is in the square: ∫ (1 − (s/w)²)/w ds = 4/3
     assert abs(volume @ found.load.mean - 4 / 3) <= found.missed.sum() + 1e-12
     assert found.missed.sum() < 0.02
+
+
+LAYERS = [(0.0, 1e-14, 1e-14), (1.0, 5e-14, 1e-14), (1e6, 5e-8, 1e-8), (1e9, 5e-5, 1e-5)]
+"""Where the square begins, how thick a layer is there, and κ in it, which is 1 elsewhere."""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("tensor", [False, True])
+@pytest.mark.parametrize("start, width, inside", [*LAYERS, (1.0, 5e-14, 1e-4), (1.0, 5e-14, 1e4)])
+def test_a_layer_that_is_thinner_than_strips_of_rounding(start, width, inside, tensor):
+    """u is affine on both sides of it: resistances in a row give J and the mean."""
+    corners = [[start, 0], [start + 1, 0], [start + 1, 1], [start, 1]]
+    polygon = Polygon(
+        corners, ("low", "right", "top", "left"), names=("low", "right", "top", "left")
+    )
+    sides = {"left": Dirichlet(0.0), "right": Dirichlet(1.0), "top": Neumann(0.0)}
+
+    def kappa(x):
+        k = ufl.conditional(ufl.lt(x[0], start + width), inside, 1.0)
+        return ufl.as_matrix([[k, 0], [0, k]]) if tensor else k
+
+    problem = Problem(coefficient=kappa, conditions={**sides, "low": Contact(-10.0)})
+    solution = solve(problem, polygon.mesh(0.25, MPI.COMM_SELF))
+    width = start + width - start  # as the numbers have it
+    certificate, resistance = solution.certificate, width / inside + 1.0 - width
+    if certificate.energy is None:
+        assert tensor and inside < 1e-12 and certificate.reason
+        return
+    low, high = certificate.energy
+    assert low <= 0.5 / resistance <= high
+    mean = 1.0 - 0.5 * (1.0 - width) ** 2 / resistance - 0.5 * width
+    assert solution.mean().lower <= mean <= solution.mean().upper
+    # ∇u beside the layer, and in it, against that of u_h = x
+    off = (1.0 / resistance - 1.0) ** 2 + width * (1.0 / (resistance * inside) - 1.0) ** 2
+    assert certificate.bound_h1 >= np.sqrt(off)
+    if 1e-5 < inside:
+        assert certificate.bound_energy_norm < 2e-3
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("tensor", [False, True])
+def test_layers_whose_ends_are_rounded_cost_nothing(tensor):
+    """Vertices are not where x is 0.3, and bounds are those of a layer that is a material."""
+    labels = ("contact", "neumann", "dirichlet", "neumann")
+    layer = [[0, 0], [0.3, 0], [0.3, 1], [0, 1]]
+    domain = Polygon(SQUARE.vertices, labels, materials={"layer": layer}).mesh(0.1, MPI.COMM_SELF)
+    unit = ufl.as_matrix([[1, 0], [0, 1]]) if tensor else ufl.as_ufl(1.0)
+    own = {"layer": Material(coefficient=1e4 * unit)}
+
+    def kappa(x):
+        return ufl.conditional(ufl.lt(x[0], 0.3), 1e4, 1.0) * unit
+
+    first, second = (
+        solve(Problem(f=-1.0, g=0.3, coefficient=k, materials=materials), domain).certificate
+        for k, materials in ((kappa, {}), (unit, own))
+    )
+    assert first.bound_energy_norm == pytest.approx(second.bound_energy_norm, rel=1e-5)
+    assert first.bound_h1 == pytest.approx(second.bound_h1, rel=1e-2)
+    assert first.energy == pytest.approx(second.energy, rel=1e-6)
+
+
+TENTS = {
+    "far from the origin": (1e6, 5e-8, lambda x: ufl.max_value(0.0, 5 * (1e6 + 5e-8 - x) / 5e-8)),
+    "near it": (1.0, 5e-14, lambda x: ufl.max_value(0.0, 5 * (1 + 5e-14 - x) / 5e-14)),
+    "a step": (0.0, 1e-14, lambda x: ufl.conditional(ufl.lt(x, 1e-14), 5.0, 0.0)),
+}
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", TENTS)
+def test_an_obstacle_that_is_narrower_than_strips_of_rounding(name):
+    """u is to be 5 at a corner, nearly: J of tents falls like 1/ln(1/width), not to 0.
+
+    By brackets on fine meshes its inverse is 0.361 and 0.456 for those 0.05 and 0.01 wide.
+    """
+    start, width, tent = TENTS[name]
+    corners = [[start, 0], [start + 1, 0], [start + 1, 1], [start, 1]]
+    polygon = Polygon(corners, ("contact", "neumann", "dirichlet", "neumann"))
+    certificate = solve(
+        Problem(obstacle=lambda x: tent(x[0])), polygon.mesh(0.25, MPI.COMM_SELF)
+    ).certificate
+    if certificate.energy is None:
+        assert "α" in certificate.reason
+        return
+    rate = (0.456 - 0.361) / np.log(5.0)
+    assert certificate.energy[1] >= 0.8 / (0.361 + rate * np.log(0.05 / width))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("at", [0.125, 0.03125])
+@pytest.mark.parametrize("height", [0.1, 5.0])
+def test_an_obstacle_with_a_step_where_facets_are_cut(at, height):
+    """On either side it is smooth, but what brings v above it is of no finite energy."""
+    labels = ("contact", "neumann", "dirichlet", "neumann")
+    polygon = Polygon([[0, 0], [0.25, 0], [0.25, 0.25], [0, 0.25]], labels)
+
+    def step(x):
+        return ufl.conditional(ufl.lt(x[0], at), height, 0.05)
+
+    brackets = []
+    domain = polygon.mesh(0.25, MPI.COMM_SELF)
+    for solution in solve_levels(Problem(obstacle=step), domain, levels=5):
+        found, h = solution.certificate, 0.25 / 2**solution.level.number
+        assert (found.energy is None) == (h > at)  # else a vertex is there
+        assert "α jumps" in (found.reason or "α jumps")
+        brackets += [found.energy] if found.energy else []
+    lows, highs = zip(*brackets, strict=True)
+    assert max(lows) <= min(highs)

@@ -239,16 +239,22 @@ def test_bounds_by_taylors_formula(signed, monkeypatch):
             ("there", inner, (m[1:], m_rad[1:])),
         )
     }
-    monkeypatch.setattr(lifting, "Enclosure", lambda where, **_: lambda _: jets[where])
+
+    class Made(SimpleNamespace):
+        left_out = np.zeros(n)
+
+        def __call__(self, _):
+            return jets[self.where]
+
+    monkeypatch.setattr(lifting, "Enclosure", lambda where, **_: Made(where=where))
     pieces = SimpleNamespace(
-        boxes=lambda *_, decide: "over",
         points=lambda *_: "there",
         parent=np.arange(n),
         hats=np.stack([np.stack([1 - t, t]) for t in (a, b)]),
         share=b - a,
     )
     scale = 100.0
-    found = lifting._bounds(None, pieces, base, None, length, scale, signed)
+    found = lifting._by_taylor(None, pieces, "over", base, None, length, scale, signed)[0]
     least = np.stack(
         [
             low,
@@ -288,7 +294,7 @@ def test_bounds_by_taylors_formula(signed, monkeypatch):
     assert np.isinf(best[:9]).all() and np.allclose(found[1], best, rtol=1e-9)
     assert np.allclose(found[2], np.fmax.reduce(least), rtol=1e-9)
     # What is no more than rounding counts as nothing
-    found = lifting._bounds(None, pieces, base, None, length, 1e14, signed)
+    found = lifting._by_taylor(None, pieces, "over", base, None, length, 1e14, signed)[0]
     assert np.array_equal(found[1, :9], np.full(9, np.inf if signed else 0.0))
     if not signed:
         assert np.array_equal(found[0] == 0.0, np.isinf(best))
@@ -542,7 +548,7 @@ def some_cells(seed):
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(seed)
     kappa = SimpleNamespace(
-        low=rng.uniform(0.5, 1, cells.number), high=rng.uniform(1, 3, cells.number)
+        strips=None, low=rng.uniform(0.5, 1, cells.number), high=rng.uniform(1, 3, cells.number)
     )
     kappa.mean = (kappa.low + kappa.high) / 2
     kappa.least, kappa.most = kappa.low, kappa.high

@@ -596,8 +596,9 @@ def test_signs_that_are_certain():
 
 
 def random_kappa(rng, number):
-    kappa = SimpleNamespace(values=None, cut=None, tensor=None, varies=False)
+    kappa = SimpleNamespace(values=None, cut=None, tensor=None, varies=False, strips=None)
     kappa.low, kappa.high = rng.uniform(0.5, 1, number), rng.uniform(1, 3, number)
+    kappa.core = kappa.low, kappa.high
     kappa.mean = kappa.low + rng.uniform(0.02, 0.98, number) * (kappa.high - kappa.low)
     return kappa
 
@@ -676,7 +677,7 @@ def test_the_gap_where_a_tensor_varies(more):
     off *= np.minimum(1.0, 0.8 / theta)[:, None, None]
     theta, rough = np.minimum(theta, 0.8), rng.uniform(0.01, 0.1, number)
     rule = SimpleNamespace(weights=at.weights, hats=at.hats)
-    kappa = SimpleNamespace(mean=mean, spread=theta, rough=rough, rule=rule)
+    kappa = SimpleNamespace(mean=mean, spread=theta, rough=rough, rule=rule, strips=None)
     kappa.apart = lambda *_: off
     P, w, excess, rise = rng.normal(size=(4, 3, number))
     rise -= rise.mean(axis=0)
