@@ -5,6 +5,8 @@ Nothing heavy is imported here: ``--help columns`` answers at once.
 
 from __future__ import annotations
 
+from .sheets import SHEETS
+
 PRINTED = {
     "level": ("", "The mesh: 0 is the first, and each next one is finer."),
     "cells": ("", "Number of triangles."),
@@ -139,21 +141,6 @@ LEVEL = {
 }
 """The keys of a level in report.json, those of an object behind a dot."""
 
-FACET = {
-    "part": "Connected piece of Γ1, from 0.",
-    "arc_length": "Of the facet's midpoint, from the piece's beginning, Ω to the left.",
-    "x": "Of its midpoint.",
-    "y": "Of its midpoint.",
-    "length": "Of the facet.",
-    "obstacle": "The lower bound of u_h there, the mean of α.",
-    "upper": "The upper bound of u_h there, the mean of β; only if there are some.",
-    "u": "u_h at the midpoint.",
-    "pressure": "λ_h, constant on the facet; below 0 on the upper bound, 0 without contact.",
-    "active": "1 in contact, 0 elsewhere.",
-    "name": "Of its part of the boundary; only if several have contact.",
-}
-"""The columns of contact.csv."""
-
 STEP = {
     "step": "From 1.",
     "time": "t at its end.",
@@ -182,6 +169,6 @@ SECTIONS = {
     "Keys of report.json": REPORT,
     "Keys of a level in report.json; columns of levels.csv, with _ in the place of the dot": LEVEL,
     "Columns of times.csv, a line a step, and keys of times in report.json, for [time]": STEP,
-    "Columns of contact.csv, a line a facet in order along the boundary": FACET,
+    **{sheet.head: sheet.columns for sheet in SHEETS.values()},
 }
 """Everything, under the heads that help and reference give it."""

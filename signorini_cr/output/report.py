@@ -7,13 +7,13 @@ Functions that take a solution or a communicator are collective: every rank call
 
 from __future__ import annotations
 
-import functools
 import importlib.metadata
 import json
 import math
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -32,8 +32,9 @@ from ..memory import ran_out_of_memory
 from ..options import OptionRefused
 from . import checkpoint, plots
 from .files import Where, Writer, write_files, write_text
+from .sheets import SHEETS
 from .strip import Moment, plot_strip
-from .tables import contact_csv, levels_csv, markdown_table
+from .tables import levels_csv, markdown_table
 from .tables import table_header as table_header
 from .tables import table_row as table_row
 from .units import PLAIN, Units
@@ -53,7 +54,7 @@ FILES = (
     REPORT,
     "levels.csv",
     "levels.md",
-    "contact.csv",
+    *SHEETS,
     checkpoint.NAME,
     "solution.vtu",
     "mesh.png",
@@ -350,7 +351,7 @@ def _clear_mesh(solution: Solution, path: Path, title: str) -> tuple[Domain, Pat
 def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
     """Prepare the report, which vouches for what lies beside it, and the tables; collective."""
     comm, records = solution.domain.mesh.comm, report["levels"]
-    table = solution.contact.table()
+    facets = solution.contact.table() or {}
 
     def text(make: Callable[[], str]) -> Writer:
         return lambda path: on_root(comm, write_text, path, make)
@@ -359,7 +360,7 @@ def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
         REPORT: text(lambda: report_json(report)),
         "levels.csv": text(lambda: levels_csv(records)),
         "levels.md": text(lambda: markdown_table(records, Units.of(report))),
-        "contact.csv": text(lambda: contact_csv(table or {})),
+        **{name: text(partial(sheet.text, report, facets)) for name, sheet in SHEETS.items()},
     }
 
 
@@ -387,7 +388,7 @@ def _rate(
     return math.log(value / before) / finer if finer else None
 
 
-@functools.cache  # looking takes longer than writing the report of a level
+@cache  # looking takes longer than writing the report of a level
 def _version(package: str) -> str | None:
     """Find the installed version, None if it can't be told."""
     module = sys.modules.get(package)

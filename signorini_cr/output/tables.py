@@ -1,20 +1,17 @@
-"""The tables: levels on a terminal, in Markdown and as CSV, contact facets as CSV.
+"""The tables: levels on a terminal, in Markdown and as CSV.
 
 The records are those of `output.level_record`.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
-
-import numpy.typing as npt
 
 from ..quantities import KINDS
 from ..rounding import at_most, counted, interval, known, rounded_up
 from .meanings import PRINTED
+from .sheets import as_csv
 from .units import GLUE, PLAIN, Units
 
 Column = tuple[str, int, Callable[[Mapping[str, Any]], str]]
@@ -226,25 +223,7 @@ def levels_csv(records: Sequence[Mapping[str, Any]]) -> str:
 
     rows = [dict(cells(record)) for record in records]
     names = list(rows[0]) if rows else []  # later rows may be a newer version's, and have more
-    return _csv(names, (map(row.get, names) for row in rows))
-
-
-def contact_csv(table: Mapping[str, npt.NDArray]) -> str:
-    """Write one line a contact facet, in order along the boundary; `active` is 0 or 1.
-
-    Args:
-        table: From `ContactFacts.table`.
-    """
-    columns = [column.astype(int) if column.dtype == bool else column for column in table.values()]
-    return _csv(table, zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _csv(names: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    text = io.StringIO()
-    lines = csv.writer(text, lineterminator="\n")
-    lines.writerow(names)
-    lines.writerows(rows)
-    return text.getvalue()
+    return as_csv(names, (map(row.get, names) for row in rows))
 
 
 def _columns(first: Mapping[str, Any]) -> list[Column]:

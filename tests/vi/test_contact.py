@@ -7,7 +7,7 @@ from dolfinx.mesh import GhostMode, create_unit_cube, locate_entities_boundary, 
 from mpi4py import MPI
 
 from signorini_cr import Contact, Dirichlet, Domain, Polygon, Problem, solve
-from signorini_cr.output.tables import contact_csv
+from signorini_cr.output.sheets import contact_csv
 
 pytestmark = pytest.mark.ranks
 
