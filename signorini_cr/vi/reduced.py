@@ -157,6 +157,15 @@ class ReducedSolver:
         """A."""
         return self._cycle.matrix
 
+    def set_jacobian(self) -> PETSc.Mat:
+        """Give SNES the matrix that its method works with; return that, which is to be freed."""
+        sizes = self._b.getSizes(), self._b.getSizes()
+        context, comm = FullJacobian(self.matrix), self._snes.getComm()
+        jacobian = PETSc.Mat().createPython(sizes, context, comm=comm)
+        jacobian.setUp()
+        self._snes.setJacobian(lambda *_: None, jacobian)
+        return jacobian
+
     def describe(self) -> str:
         """Say which preconditioner was taken, and why."""
         if self._uses_cycle:

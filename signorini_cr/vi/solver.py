@@ -28,7 +28,7 @@ from ..options import NEWTON, PREFIX, REDUCED_PREFIX, defaults, explained, read,
 from .active import ActiveSet
 from .bounds import Bounds
 from .extended import DataRounding, Extended
-from .reduced import LINEAR_SHARE, SET_SHARE, FullJacobian, ReducedSolver
+from .reduced import LINEAR_SHARE, SET_SHARE, ReducedSolver
 from .stopping import FLOWS, FORCES, GAIN, LOST, NOISE, ROUNDED, STORED, TOUCHING, Stiffness
 from .system import DATUM, Vectors
 
@@ -220,12 +220,8 @@ def _prepare(
         )
     # after the type, which brings functions of its own
     snes.setFunction(lambda _, x, r: stiffness.residual(x, vectors.b, r), vectors.residual)
-    sizes = vectors.b.getSizes(), vectors.b.getSizes()
-    jacobian = PETSc.Mat().createPython(sizes, FullJacobian(linear.matrix), comm=snes.getComm())
-    jacobian.setUp()
-    snes.setJacobian(lambda *_: None, jacobian)
     snes.setVariableBounds(vectors.lower, vectors.upper)
-    return outer, jacobian
+    return outer, linear.set_jacobian()
 
 
 def _reporting(
