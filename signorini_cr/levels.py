@@ -104,7 +104,7 @@ def solve_levels(
     def step(solution: Solution) -> Refined | None:
         if solution.level.number + 1 >= levels:
             return None
-        limits.admit(solution, 4 * solution.dofs)
+        limits.admit(solution, 2**domain.mesh.topology.dim * solution.dofs)
         return (*refine(solution.domain), None)
 
     yield from solve_sequence(problem, domain, step, element, monitor, nested, restart)
