@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from numbers import Integral, Real
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 from mpi4py import MPI
@@ -97,26 +95,6 @@ def insist_on_number(name: str, value: Any, least: float, strict: bool = False) 
     if not (value > least if strict else value >= least):
         needed = f"above {least:g}" if strict else f"{least:g} or more"
         raise InputError(f"{name} is {value}; it must be {needed}")
-
-
-def meant(
-    word: object,
-    known: Iterable[str],
-    there: str = "there are",
-    more: Mapping[str, str] = MappingProxyType({}),
-) -> str:
-    """Say what there is in the place of a word that is not known, the likeliest first.
-
-    Args:
-        word: What is not known.
-        known: What is.
-        there: What stands before the list of these.
-        more: What is told of some of them, in the list.
-    """
-    known = list(known)
-    near = difflib.get_close_matches(str(word).lower(), known, n=1)
-    there = f"{there} {', '.join(name + more.get(name, '') for name in known)}"
-    return f"did you mean {near[0]}? {there[0].upper()}{there[1:]}" if near else there
 
 
 def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:

@@ -12,7 +12,7 @@ from .arrays import FloatArray
 from .data.diffusion import diffusion
 from .data.loads import trace_of
 from .dual import certified
-from .errors import InputError, meant
+from .errors import InputError
 from .estimate.certificate import Made
 from .estimate.force import (
     Certified,
@@ -31,6 +31,7 @@ from .estimate.weights import Weighed, Weight, ranges, scalar
 from .fem.cells import measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin
 from .fem.problem import Forms, Problem
+from .hints import meant
 from .mesh.domain import named
 
 __all__ = ["Interval", "flux", "force_bounds"]

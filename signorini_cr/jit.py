@@ -34,7 +34,8 @@ from ffcx.options import FFCX_DEFAULT_OPTIONS
 from mpi4py import MPI
 
 from . import temporary
-from .errors import InputError, meant, naming, on_root
+from .errors import InputError, naming, on_root
+from .hints import meant
 
 T = TypeVar("T")
 Loaded: TypeAlias = tuple[list[Any], ModuleType]

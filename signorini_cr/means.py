@@ -10,7 +10,7 @@ from dolfinx import fem
 from .data.diffusion import diffusion
 from .data.loads import Certain, Segments, trace_of
 from .dual import Dual, certified, solved
-from .errors import InputError, meant
+from .errors import InputError
 from .estimate.certificate import Certificate, Made, certify
 from .estimate.force import Certified, Interval, against, extended, square
 from .estimate.pairing import Pairing, in_cells, on_side
@@ -21,6 +21,7 @@ from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
 from .fem.problem import Forms, Problem
 from .fem.space import function_space
+from .hints import meant
 from .mesh.domain import Domain, named
 from .mesh.shared import shared_sum
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from .errors import InputError, meant
+from .errors import InputError
 from .estimate.force import Interval
 from .fem.conditions import Data
+from .hints import meant
 from .solution import Solution
 
 

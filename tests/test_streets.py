@@ -17,6 +17,7 @@ FLOORS = (
     (
         "arrays",
         "errors",
+        "hints",
         "jit",
         "compat",
         "options",

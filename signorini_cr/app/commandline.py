@@ -7,7 +7,6 @@ is taken for an option.
 from __future__ import annotations
 
 import argparse
-import difflib
 import os
 import sys
 import tempfile
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from .. import __version__
+from ..hints import guess
 from ..output.meanings import SECTIONS
 from .screen import WIDTH
 
@@ -101,8 +101,7 @@ def read_arguments(argv: Sequence[str]) -> argparse.Namespace:
             parser.error(f"{shown}: this is no text in UTF-8, which DOLFINx needs")
     first = own[0] if own else ""
     if first.split("=")[0] not in ("-h", "--help", "--version", *commands):
-        near = difflib.get_close_matches(first, commands, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {' and '.join(commands)}"
+        hint = guess(first, commands) or f"there are {' and '.join(commands)}"
         if not first or first.startswith("-"):
             parser.error(f"a command comes first; {hint}")
         parser.error(f"there is no command {first!r}; {hint}")
@@ -294,8 +293,7 @@ def _unknown(word: str, command: _Parser) -> NoReturn:
     if option in command._option_string_actions:
         command.error(f"{word} is behind --, where there are no options; put it before that")
     options = [name for name in command._option_string_actions if name.startswith("--")]
-    near = difflib.get_close_matches(option, options, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(options)}"
+    hint = guess(option, options) or f"there are {', '.join(options)}"
     key = option.lstrip("-").replace("-", "_")
     with suppress(ImportError):  # DOLFINx may be missing, which is not what this is about
         from .reference import section_of

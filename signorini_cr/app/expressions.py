@@ -5,7 +5,6 @@ Python. What comes out is a graph of operations, see :mod:`signorini_cr.app.form
 """
 
 import ast
-import difflib
 import math
 import re
 import unicodedata
@@ -14,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import NoReturn, TypeAlias, TypeVar
 
 from ..errors import InputError
+from ..hints import guess
 from .formula import (
     CONSTANTS,
     FUNCTIONS,
@@ -323,16 +323,12 @@ class _Reader:
 
     def unknown(self, tree: ast.Name, kind: str, known: Collection[str]) -> NoReturn:
         """Reject a name, with what may have been meant and what there is."""
-        message = f"there is no {kind} {tree.id[:40]!r}"
-        close = difflib.get_close_matches(tree.id.lower(), (*known, *FUNCTIONS), n=1)
+        there = f"{kind}s are {_listed(known)}"
         if tree.id in _FOREIGN:
-            close = [_FOREIGN[tree.id]]
-        if close:
-            message += f"; did you mean {close[0]}?"
+            hint = guess(_FOREIGN[tree.id], _FOREIGN.values(), there)
         else:
-            message += ";"
-        label = "Functions are" if kind == "function" else "Names are"
-        self.reject(tree, f"{message} {label if close else label.lower()} {_listed(known)}")
+            hint = guess(tree.id.lower(), (*known, *FUNCTIONS), there)
+        self.reject(tree, f"there is no {kind} {tree.id[:40]!r}; {hint}")
 
 
 def check_name(name: str) -> str:

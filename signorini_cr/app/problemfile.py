@@ -6,7 +6,6 @@ what is allowed, the same on all ranks; the command puts the file's name before 
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 import re
@@ -29,6 +28,7 @@ from ..diffusion import Diffusion
 from ..errors import InputError, NotConverged, naming, on_root
 from ..evolution import SCHEMES, solve_in_time
 from ..fem.problem import Forms, Material, Problem
+from ..hints import guess
 from ..levels import check_pieces, solve_levels
 from ..means import BOTH, DOMAIN
 from ..mesh.balance import Refined
@@ -501,9 +501,8 @@ def _domain(
     labels = {label for each in (polygon, *polygon.holes) for label in each.boundary}
     for name in names:
         if name not in labels:
-            near = difflib.get_close_matches(name, labels, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            raise InputError(f"boundary.{name}: no edge is labelled {name}{hint}")
+            hint = guess(name, labels)
+            raise InputError(f"boundary.{name}: no edge is labelled {name}{hint and f'; {hint}'}")
     with naming("domain.boundary"):
         polygon.check_parts()
     # From the longest edge on, facets grow inside only; none is longer than the diameter

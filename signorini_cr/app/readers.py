@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import sys
@@ -12,7 +11,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import InputError, meant
+from ..errors import InputError
+from ..hints import guess, meant
 from ..reading import read_regular
 
 MOST_CHARACTERS = 40
@@ -128,12 +128,10 @@ def insist_known(
             continue
         full = f"{section}.{key}" if section else key
         homes = [name for name, keys in sections.items() if key in keys and name != section]
-        near = difflib.get_close_matches(key.lower(), allowed, n=1)
-        if homes and not near:
+        if homes and not guess(key.lower(), allowed):
             hint = f"it belongs under [{homes[0]}]"
         else:
-            hint = (f"did you mean {near[0]}? Allowed" if near else "allowed") + " are "
-            hint += ", ".join(allowed)
+            hint = meant(key, allowed, "allowed are")
         kind = "key" if section else "section"
         raise InputError(f"{full}: there is no such {kind}; {hint}")
 

@@ -31,7 +31,8 @@ from ufl.geometry import GeometricFacetQuantity
 from ufl.restriction import Restricted
 
 from ..arrays import FloatArray, Int32Array
-from ..errors import InputError, insist_on_kind, meant, together
+from ..errors import InputError, insist_on_kind, together
+from ..hints import meant
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials

@@ -5,7 +5,6 @@ gmsh is loaded on first use, so a mesh of the user's own works without it.
 
 from __future__ import annotations
 
-import difflib
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,6 +16,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
 from ..errors import InputError, naming
+from ..hints import guess
 from ..rounding import counted
 from . import mshfile
 from .lines import arranged, sorted_out
@@ -434,18 +434,17 @@ def _check_names(
     for name, ends in curves.items():
         number = np.count_nonzero(np.isin(_key(ends, tags), loose))
         if number:
-            near = [part for part in allowed if part in name.lower()]
-            near += difflib.get_close_matches(name.strip().lower(), allowed, n=1)
+            word = next((part for part in allowed if part in name.lower()), name.strip().lower())
             what = (
                 f"the physical curve {name!r}"
                 if not name.isdigit()
                 else (f"the physical curve with the number {name} and no name")
             )
-            hint = f"did you mean {near[0]}? Allowed there" if near else "allowed there"
+            hint = guess(word, allowed, f"allowed there are {', '.join(allowed)}")
             raise InputError(
-                f"{what} has {counted(number, 'facet')} on the boundary; {hint} are"
-                f" {', '.join(allowed)}, or a name with a condition of its own, in a problem file"
-                f" a section [boundary.{name.strip()}]; a curve without a physical group is neumann"
+                f"{what} has {counted(number, 'facet')} on the boundary; {hint}, or a"
+                " name with a condition of its own, in a problem file a section"
+                f" [boundary.{name.strip()}]; a curve without a physical group is neumann"
             )
 
 
