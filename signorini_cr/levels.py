@@ -27,7 +27,7 @@ from .vi.contact import contact_facts
 from .vi.floating import Floating
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
-from .vi.solver import SystemData, solve_vi
+from .vi.solver import Indefinite, SystemData, solve_vi
 from .vi.system import System
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
@@ -275,7 +275,7 @@ def solve_level(
             iterations = solve_vi(cycle, vectors, system.residual_scale, monitor=told, data=data)
     except NotConverged as failure:
         doubt = level.physics.not_definite
-        if doubt is not None and "DIVERGED_INDEFINITE" in failure.reason:
+        if doubt is not None and isinstance(failure, Indefinite):
             raise InputError(f"{doubt}; level {level.number} shows it") from None
         raise NotConverged(failure.reason, level.number) from None
     for function in (u, residual):

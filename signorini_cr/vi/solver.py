@@ -56,6 +56,12 @@ PASSES = 6
 SWAPS = 10
 """Times that dofs may turn out to be in the wrong set when all else is well."""
 
+INDEFINITE = (
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
+)
+"""PETSc's words for a product with A, or with the preconditioner, that is not above 0."""
+
 DIVERGED_NAN, DIVERGED_ROUNDING = -4, -5
 """PETSc's number for what is not finite, whose name depends on the version, and for "no gain"."""
 
@@ -63,6 +69,10 @@ DIVERGED_NAN, DIVERGED_ROUNDING = -4, -5
 Monitor = Callable[[int, float, int, int], None]
 """Called after each step, on the ranks that have one: step, residual norm, active dofs, linear
 iterations so far; the same on all ranks."""
+
+
+class Indefinite(NotConverged):
+    """Error where the linear solver finds that it is not solving with a positive definite A."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +148,8 @@ def solve_vi(
             stiffness, all contact is one neighbourhood, and what is lost in rounding stays so.
 
     Raises:
-        NotConverged: With the name PETSc gives to the reason, or what is lost in rounding.
+        NotConverged: With the name PETSc gives to the reason, or what is lost in rounding; an
+            `Indefinite` where CG has seen that A is not positive definite.
         InputError: PETSc can't solve with the options that are set.
     """
     target = tolerance * scale or 1e-300
@@ -188,7 +199,8 @@ def solve_vi(
         stiffness.free()
     if reason < 0 or test.failure:
         why = test.failure or _stopped(reason, inner, stiffness.contrast)
-        raise NotConverged(
+        kind = Indefinite if inner in INDEFINITE and not test.failure else NotConverged
+        raise kind(
             f"{why} after {iterations.newton} Newton steps "
             f"and {iterations.linear} linear iterations"
         )
