@@ -9,7 +9,6 @@ import numpy as np
 from ufl.core.expr import Expr
 
 from .arrays import FloatArray
-from .data.diffusion import diffusion
 from .data.loads import trace_of
 from .dual import certified
 from .errors import InputError
@@ -48,7 +47,7 @@ def force_bounds(solution: Certified) -> tuple[float, float]:
     Raises:
         InputError: There is no bound; the message says why.
     """
-    return _interval(solution, diffusion(made_of(solution).level.data).forms.bounded)[1:]
+    return _interval(solution, made_of(solution).data.forms.bounded)[1:]
 
 
 def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> Interval:
@@ -67,12 +66,12 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
         InputError: No part is named, there is no such part, or there is no bound; the message says
             why.
     """
-    level = made_of(solution).level
-    forms = diffusion(level.data).forms
+    made = made_of(solution)
+    forms = made.data.forms
     known = {c.part: c for c in (*forms.fixed, *forms.bounded)}
     if not parts:
         raise InputError(f"parts: there is none; {meant('', known)}")
-    names = [named(level.domain.parts, part) for part in parts]
+    names = [named(made.level.domain.parts, part) for part in parts]
     for part, name in zip(parts, names, strict=True):
         if name not in known:
             raise InputError(
@@ -128,11 +127,7 @@ def _corrected(
     known = [condition for condition in conditions if condition not in settled.free]
     if settled.mixed and known:
         return None
-    omega = (
-        None
-        if weight is None
-        else scalar(weight, diffusion(made.level.data).forms, made.level.domain)
-    )
+    omega = None if weight is None else scalar(weight, made.data.forms, made.level.domain)
     none: FloatArray = np.zeros((cells.tdim + 1, cells.number))
     found: _ByPhi | None = _ByPhi(0.0, 0.0, none, none)
     if known:
@@ -163,7 +158,7 @@ def _by_phi(
     """
     cells, bound = made.cells(), solution.certificate.bound_companion
     assert bound is not None
-    forms = diffusion(made.level.data).forms
+    forms = made.data.forms
     value = 1.0 if omega is None else omega
     dual = certified(_harmonic(forms, conditions, settled.free, value), made.level)
     phi = in_p1(dual, cells, bent=omega is not None)
@@ -217,7 +212,7 @@ def _left_on_contact(
         omega: ω; None for 1.
         found: φ.
     """
-    cells, data = made.cells(), diffusion(made.level.data)
+    cells, data = made.cells(), made.data
     through_facets, off = np.zeros((2, len(cells.exterior)))
     loss = np.zeros((2, len(cells.exterior)))
     loss[:, made.segments.facets.dofs] = made.segments.loss, made.segments.most

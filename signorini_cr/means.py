@@ -88,7 +88,7 @@ def _bounded(
     certificate, level = solution.certificate, solution.level
     forms = diffusion(level.data).forms
     place = _place(forms, level.domain, where)
-    made, bound = certificate._made, certificate.bound_companion
+    made, bound = certificate.made, certificate.bound_companion
     if made is None or bound is None:
         raise InputError(f"{NO_MEAN}: {certificate.reason}")
     if made.on_contact_alone:
@@ -224,7 +224,7 @@ def _corrected(
     if of_z is None or not _simple(made, cells):
         return []
     assert dual.bound_companion is not None
-    domain, forms = cells.domain, diffusion(made.level.data).forms
+    domain, forms = cells.domain, made.data.forms
     V = function_space(domain.mesh, "P1")
     z, marks = fem.Function(V), fem.Function(V)
     dofs = V.dofmap.list[: cells.number]
@@ -277,7 +277,7 @@ def _settled(
         reach = settled.unknown(made, cells, through, off)
         return [(0.0, reach)] if np.isfinite(reach) else []
     if settled.held:
-        forms = diffusion(made.level.data).forms
+        forms = made.data.forms
         psi = 1.0 if weight is None else scalar(weight, forms, made.level.domain)
         dual = certified(_dual(forms, where, psi, settled.held), made.level)
     of_z = in_p1(dual, cells)

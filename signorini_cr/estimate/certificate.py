@@ -75,7 +75,7 @@ class Certificate:
     indicators: FloatArray | None = None
     reason: str | None = None
     seconds: float = 0.0
-    _made: Made | None = None
+    made: Made | None = None  # told of nowhere: bounds of quantities go on from it, users don't
 
     def __repr__(self) -> str:
         """Write bound and energy on a line, or why there are none."""
@@ -90,9 +90,9 @@ class Certificate:
 
         It is in the Raviart-Thomas space of lowest order, on thin cells perhaps in the next one.
         """
-        if self._made is None:
+        made = self.made
+        if made is None:
             return None
-        made = self._made
         cells = made.cells()
         mesh, d = cells.domain.mesh, cells.tdim
         fluxes = made.through(cells)
@@ -118,7 +118,7 @@ class Certificate:
     @property
     def companion_at_vertices(self) -> FloatArray | None:
         """The companion v at the mesh's vertices, ghosts included, shape (vertices,)."""
-        return None if self._made is None else self._made.vertices
+        return None if self.made is None else self.made.vertices
 
     @cached_property
     def companion(self) -> fem.Function | None:
@@ -127,9 +127,9 @@ class Certificate:
         It is of degree 2 for d = 2, on thin cells perhaps 3, and affine else; without its lifting
         and, where there are some, its cusps.
         """
-        if self._made is None:
+        made = self.made
+        if made is None:
             return None
-        made = self._made
         cells = made.cells()
         degree = 2 if cells.tdim == 2 else 1
         v = fem.Function(fem.functionspace(cells.domain.mesh, ("Lagrange", degree)))
@@ -217,9 +217,14 @@ class Made:
     complementary: float
     above: float
 
+    @property
+    def data(self) -> DiffusionOnMesh:
+        """The scalar equation on the mesh."""
+        return diffusion(self.level.data)
+
     def cells(self) -> Cells:
         """Return the mesh's geometry."""
-        gamma_0 = diffusion(self.level.data).forms.gamma_0
+        gamma_0 = self.data.forms.gamma_0
         return Cells(self.level.domain, self.level.V, gamma_0, stretch=self.stretch)
 
     def through(self, cells: Cells) -> FloatArray:
@@ -597,7 +602,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             "solver": float(known.left + known.carried),
         },
         indicators=sums.indicators,
-        _made=_made(known, v, ball, lift),
+        made=_made(known, v, ball, lift),
     )
 
 

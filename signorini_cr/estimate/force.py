@@ -66,9 +66,9 @@ def made_of(solution: Certified) -> Made:
     """Return what the certificate is made of; an error where there is none, or another physics."""
     diffusion(solution.level.data)
     certificate = solution.certificate
-    if certificate._made is None or certificate.bound_h1 is None:
+    if certificate.made is None:
         raise InputError(f"{NO_BOUNDS}: {certificate.reason}")
-    return certificate._made
+    return certificate.made
 
 
 def interval(
@@ -257,8 +257,8 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
     """Make a P1 function, 1 on some parts, 0 on the rest of Γ0 and Γ1, with nearly least ‖Aφ‖."""
     domain = solution.domain
     mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
-    data = diffusion(solution.level.data)
-    V, forms = function_space(mesh, "P1"), data.forms
+    made = made_of(solution)
+    V, forms = function_space(mesh, "P1"), made.data.forms
     phi, marks = fem.Function(V), fem.Function(V)
     others = [c for c in (*forms.fixed, *forms.bounded) if c not in conditions]
     parts = []
@@ -279,7 +279,7 @@ def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Functio
         return phi
     marks.x.array[:] = 0.0
     marks.x.array[chosen] = 1.0
-    return extended(marks, np.concatenate(parts), made_of(solution))
+    return extended(marks, np.concatenate(parts), made)
 
 
 def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Function:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import FloatArray, Int32Array
-from ..data.diffusion import diffusion
 from ..data.quadrature import OnParts
 from ..fem.cells import Cells
 from ..fem.conditions import Condition
@@ -37,7 +36,7 @@ class Settled:
     @classmethod
     def of(cls, made: Made, cells: Cells) -> Settled:
         """Sort the parts; collective."""
-        data = diffusion(made.level.data)
+        data = made.data
         alpha = OnParts.of(data.alpha, cells)
         force = np.zeros(len(cells.exterior))
         np.maximum.at(force, alpha.side.dofs, made.contact)
@@ -90,7 +89,7 @@ def left_by(dual: Made, made: Made) -> float:
     Its own certificate asks of e what only z does: to vanish where there is contact. That goes for
     what the solver left, and for the means that quadrature may have missed; collective.
     """
-    around = diffusion(made.level.data).cells  # these know Γ0
+    around = made.data.cells  # these know Γ0
     left = dual.left if dual.taken_up is None else dual.left * ~dual.taken_up
     found = unbalanced(made.level, around, left, made.least, 0.0, made.reaction)
     if around.total(dual.missed.sum())[0] > 0.0:
@@ -107,7 +106,7 @@ def in_p1(dual: Certificate, cells: Cells, bent: bool = False) -> Made | None:
         cells: The mesh.
         bent: Whether v may have bumps beside that.
     """
-    made = dual._made
+    made = dual.made
     if made is None or dual.bound_companion is None:
         return None
     if made.thirds is not None or made.beyond is not None:

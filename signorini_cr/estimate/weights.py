@@ -15,7 +15,6 @@ from dolfinx import fem
 
 from ..arrays import FloatArray, Int32Array
 from ..data.admissible import place, shown
-from ..data.diffusion import diffusion
 from ..data.jets import Enclosure
 from ..data.pieces import Pieces
 from ..data.quadrature import OnFacets, OnParts, Trace
@@ -93,7 +92,7 @@ class Weight:
         Raises:
             InputError: It is no scalar, or not 0 where the parts meet the rest of Γ0 and Γ1.
         """
-        domain, data = cells.domain, diffusion(made.level.data)
+        domain, data = cells.domain, made.data
         trace = data.compiled.trace(scalar(weight, data.forms, domain))
         parts = OnParts.of([OnFacets.of(each, trace, domain) for each in conditions], cells)
         V, side, ends = function_space(domain.mesh, "P1"), parts.side, parts.ends

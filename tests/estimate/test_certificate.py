@@ -192,7 +192,7 @@ def test_weights_whose_squares_are_lost(power):
 
 def test_descents_end_where_products_are_lost():
     """Between numbers whose squares are some and such whose squares are none is a narrow strip."""
-    cells = solve(Problem(f=-1.0), HELD_ABOVE.mesh(0.5)).certificate._made.cells()
+    cells = solve(Problem(f=-1.0), HELD_ABOVE.mesh(0.5)).certificate.made.cells()
     numbers, down = np.zeros(len(cells.exterior)), np.full(len(cells.exterior), 1e-160)
     fall, left = descend(cells, lambda way: 1e-5 * way, numbers, down, np.ones(len(down)), 3)
     assert fall == 0.0 < left and not numbers.any()

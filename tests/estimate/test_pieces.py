@@ -1456,13 +1456,13 @@ def test_duals_that_may_correct_forces():
     """In P1, and with a flux that is constant on facets."""
     cells, *_ = some_cells(3)
     made = SimpleNamespace(thirds=None, beyond=None, bumps=np.zeros(len(cells.exterior)))
-    dual = SimpleNamespace(_made=made, bound_companion=1.0)
+    dual = SimpleNamespace(made=made, bound_companion=1.0)
     assert in_p1(dual, cells) is made
     for name, value in (("thirds", 1), ("beyond", 1), ("bumps", made.bumps + 1.0)):
         changed = SimpleNamespace(**{**vars(made), name: value})
-        assert in_p1(SimpleNamespace(_made=changed, bound_companion=1.0), cells) is None
-    assert in_p1(SimpleNamespace(_made=None, bound_companion=1.0), cells) is None
-    assert in_p1(SimpleNamespace(_made=made, bound_companion=None), cells) is None
+        assert in_p1(SimpleNamespace(made=changed, bound_companion=1.0), cells) is None
+    assert in_p1(SimpleNamespace(made=None, bound_companion=1.0), cells) is None
+    assert in_p1(SimpleNamespace(made=made, bound_companion=None), cells) is None
 
 
 @pytest.mark.serial
@@ -1494,7 +1494,7 @@ def test_no_round_leaves_v_below_the_obstacle(monkeypatch):
         coefficient=lambda x: ufl.conditional((x[0] - 0.5) * (x[1] - 0.5) > 0, 24.4, 1.0),
     )
     solution = solve(problem, square(4, sides, MPI.COMM_SELF))
-    made = certificate.certify(solution)._made
+    made = certificate.certify(solution).made
     data = diffusion(solution.level.data)
     alpha = data.alpha[0].seen_from(data.cells)
     side = alpha.side(data.cells)

@@ -511,7 +511,7 @@ def test_a_weight_against_the_flux(monkeypatch):
     Half of the curl of y's bumps, 4 h (1 − 2s)/|F|, meets ω's affine part unseen.
     """
     problem = Problem(f=-9.0, dirichlet=lambda x: x[0] / 4, obstacle=-0.3, coefficient=4.0)
-    made = solve(problem, square(3)).certificate._made
+    made = solve(problem, square(3)).certificate.made
     cells, rng = made.cells(), np.random.default_rng(28)
     condition = diffusion(made.level.data).forms.fixed[0]
     side = next(each for number, each in cells.sides.items() if number == condition.number)
@@ -814,7 +814,7 @@ def test_a_coefficient_against_affine_functions(kind):
             return ufl.as_matrix([[wave + 4.0, 0.1 * wave], [0.1 * wave, wave]])
         return wave if kind == "waves" else ufl.conditional(x[0] + 0.3 * x[1] < level, 1.0, high)
 
-    made = solve(Problem(f=-9.0, coefficient=kappa), square(3)).certificate._made
+    made = solve(Problem(f=-9.0, coefficient=kappa), square(3)).certificate.made
     cells = made.cells()
     plain = Cells(made.level.domain, made.level.V, (DIRICHLET,))
     at = Points(plain)

@@ -95,7 +95,7 @@ def test_a_tensor_is_a_number_on_the_image(angle, ratio, reaction):
         *_, solution = solve_levels(problem, domain, 3)
         made = solution.certificate
         if matrix is None:
-            ends = made._made.least, made._made.most
+            ends = made.made.least, made.made.most
             assert np.allclose(np.array(ends).T, np.linalg.eigvalsh(kappa))
         found.append(
             [

@@ -344,7 +344,7 @@ def test_thin_cells(monkeypatch):
     data = {"f": lambda x: 1 + x[0] / 25 - 2 * x[1], "g": lambda x: 0.3 + x[1] / 4}
     solution = solve(Problem(**data, obstacle=-0.001, coefficient=2.0), sheared(8))
     certificate = certify(solution)
-    assert certificate._made.beyond is not None and certificate._made.cusps is None
+    assert certificate.made.beyond is not None and certificate.made.cusps is None
     found = again(solution, certificate, 2.0, *data.values(), -0.001, carried=True)
     agrees(certificate, found, 1e-6)
     # No bump of ω that is free could bring y nearer to the middle
@@ -379,7 +379,7 @@ def test_data_that_are_not_affine_on_thin_cells(monkeypatch):
     }
     solution = solve(Problem(**data, obstacle=-0.001, coefficient=2.0), sheared(8))
     certificate = certify(solution)
-    assert certificate._made.thirds is not None
+    assert certificate.made.thirds is not None
     found = again(solution, certificate, 2.0, *data.values(), -0.001, carried=True)
     assert found.bound < certificate.bound_energy_norm < 1.1 * found.bound
     (low, high), width = certificate.energy, np.ptp(found.energy)
@@ -396,7 +396,7 @@ def test_a_cubic_solution_on_thin_cells(monkeypatch):
     u_D = lambda x: (x[0] / 51) ** 3 + x[1] ** 2 - x[1] ** 3  # noqa: E731
     solution = solve(Problem(f=f, dirichlet=u_D, obstacle=-9.0), domain)
     certificate = certify(solution)
-    assert certificate._made.thirds is not None
+    assert certificate.made.thirds is not None
     agrees(certificate, again(solution, certificate, 1.0, f, 0.0, -9.0, carried=True), 1e-6)
 
 
@@ -511,7 +511,7 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     for name, value in {"load": hidden, "boundary": np.sqrt(lift), "solver": left_over}.items():
         assert np.isclose(certificate.parts[name], value)
     reach = bound - near / 2 + loose + np.sqrt(lift) / 2
-    made = certificate._made
+    made = certificate.made
     assert np.isclose(made.reach, reach, rtol=1e-7)
     assert np.isclose(made.loose, loose + np.sqrt(lift), rtol=1e-7)
     # the ball's radius squared is what the two products on Γ1 and the distance from κ∇u add up to
@@ -549,7 +549,7 @@ def test_force():
     assert low <= lower <= upper <= high and upper - lower < 0.4 * (high - low)
     # A cusp pulls at a cell's vertices: half of ∫ κ∇ψ·∇φ
     pull = SimpleNamespace(at=np.array([0]), pulls=lambda _: (np.full((3, 1), 0.02), None))
-    object.__setattr__(certificate._made, "cusps", pull)
+    object.__setattr__(certificate.made, "cusps", pull)
     phi = _weight(solution, diffusion(solution.level.data).forms.bounded)
     change = 0.01 * phi.x.array[phi.function_space.dofmap.list[0]].sum()
     middle = sum(interval(solution, bounded)[1:]) / 2
@@ -679,7 +679,7 @@ def test_forces_that_may_be_less_hold_less(monkeypatch):
         monkeypatch.setattr(module, "carried_to_contact", more)
         solution = solve(problem, structured(SQUARE, 12, comm=WORLD))
         _, low, high = solution.flux("floor")  # u is y² − y, nearly
-        assert solution.certificate._made.on_contact_alone
+        assert solution.certificate.made.on_contact_alone
         assert low <= 1.0 <= high
         widths.append(high - low)
     assert widths[1] > 1.2 * widths[0]
@@ -708,7 +708,7 @@ def test_what_is_missed_of_f_or_g_alone_is_kept_for_intervals(of_g):
     wave = lambda x: ufl.exp(2.0 * x[0] - 3.0 * x[1])  # noqa: E731
     solution = solve(Problem(f=1.0, g=wave) if of_g else Problem(f=wave, g=1.0), square(jitter=0.0))
     at = solution.domain.mesh.geometry.x[cell_nodes(solution.domain.mesh)].mean(axis=1)
-    missed = np.broadcast_to(solution.certificate._made.missed, len(at))  # a number without Γg
+    missed = np.broadcast_to(solution.certificate.made.missed, len(at))  # a number without Γg
     west = missed[at[:, 0] < 0.5]
     assert WORLD.allreduce(missed.sum()) > 0.0
     assert (WORLD.allreduce(west.sum()) == 0.0) == of_g  # Γg is on the right
