@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import BoolArray, FloatArray, IndexArray
 from ..errors import InputError, naming
 
 FARTHEST = 1e100
@@ -161,52 +162,91 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
         loops: Vertices of the polygon and of each hole, shapes (n, 2).
         edges: What edges are called in messages, where it is not by their places in the loops.
     """
-    a = np.concatenate(loops)
-    if len(a) > MOST_EDGES:
-        raise InputError(f"there are {len(a)} edges; {MOST_EDGES} are allowed")
-    sizes = np.array([len(loop) for loop in loops])
-    starts = np.repeat(np.cumsum(sizes) - sizes, sizes)
-    local = np.arange(len(a)) - starts
-    ring = np.repeat(np.arange(len(loops)), sizes)
-    after = starts + (local + 1) % np.repeat(sizes, sizes)
-    b = a[after]
-    called = local if edges is None else np.concatenate(list(map(np.asarray, edges)))
-    before = np.argsort(after)
+    number = sum(map(len, loops))
+    if number > MOST_EDGES:
+        raise InputError(f"there are {number} edges; {MOST_EDGES} are allowed")
     near = 1e-12 * np.ptp(loops[0], axis=0).max()
+    of_all = _Edges.of(loops, edges)
+    _check_corners(of_all, near)
+    _check_meetings(of_all, near)
+    _check_holes(loops)
 
-    def vertex(i: int) -> str:
-        on_arc = called[before[i]] == called[i]
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """The edges of loops, one loop after the other; edge i begins in vertex i.
+
+    Attributes:
+        start: Where they begin, shape (n, 2).
+        end: Where they end, shape (n, 2).
+        after: The edge that begins there, shape (n,).
+        loop: The loop that each is of, shape (n,).
+        called: What each is called, shape (n,).
+    """
+
+    start: FloatArray
+    end: FloatArray
+    after: IndexArray
+    loop: IndexArray
+    called: IndexArray
+
+    @classmethod
+    def of(cls, loops: Sequence[FloatArray], called: Sequence[Sequence[int]] | None) -> _Edges:
+        """Take the edges of all loops together; see `check_loops`."""
+        places = [np.arange(len(loop)) for loop in loops]
+        first = np.cumsum([0, *map(len, loops[:-1])])
+        after = np.concatenate([k + np.roll(at, -1) for k, at in zip(first, places, strict=True)])
+        start = np.concatenate(loops)
+        loop = np.repeat(np.arange(len(loops)), [len(at) for at in places])
+        names = np.concatenate([np.asarray(each) for each in called or places])
+        return cls(start, start[after], after, loop, names)
+
+    def vertex(self, i: int) -> str:
+        """Name a vertex; that between two facets of an arc is one of the arc's points."""
+        (before,) = np.flatnonzero(self.after == i)
+        on_arc = self.called[before] == self.called[i]
         kind = "the point of edge" if on_arc else "vertex"
-        return f"{kind} {called[i]}{_where(ring[i])} at {_point(a[i])}"
+        return f"{kind} {self.called[i]}{self._where(i)} at {_point(self.start[i])}"
 
-    def edge(i: int) -> str:
-        return f"edge {called[i]}{_where(ring[i])}"
+    def edge(self, i: int) -> str:
+        """Name an edge."""
+        return f"edge {self.called[i]}{self._where(i)}"
 
-    # a look at those alone whose boxes meet, which are few where there are many
-    left, below = np.ascontiguousarray(np.minimum(a, b).T) - near
-    right, above = np.ascontiguousarray(np.maximum(a, b).T) + near
-    x = a[:, 0].copy()
-    for i in range(len(a)):
+    def _where(self, i: int) -> str:
+        return f" of hole {self.loop[i] - 1}" if self.loop[i] else ""
+
+
+def _check_corners(edges: _Edges, near: float) -> None:
+    """Refuse two vertices at the same point."""
+    x, y = np.ascontiguousarray(edges.start.T)
+    for i in range(len(x)):
         same = i + 1 + np.flatnonzero(np.abs(x[i + 1 :] - x[i]) <= near)
-        same = same[np.abs(a[same, 1] - a[i, 1]) <= near]
+        same = same[np.abs(y[same] - y[i]) <= near]
         if len(same):
-            raise InputError(f"{vertex(i)} is the same point as {vertex(same[0])}")
-    direction = b - a
-    length2 = (direction**2).sum(axis=1)
-    for i in range(len(a)):
+            raise InputError(f"{edges.vertex(i)} is the same point as {edges.vertex(same[0])}")
+
+
+def _check_meetings(edges: _Edges, near: float) -> None:
+    """Refuse vertices that lie on edges of others, and edges that cross."""
+    start, end = edges.start, edges.end
+    left, bottom = np.ascontiguousarray(np.minimum(start, end).T) - near
+    right, top = np.ascontiguousarray(np.maximum(start, end).T) + near
+    for i, (a, b) in enumerate(zip(start, end, strict=True)):
+        # a look at those alone whose boxes meet, which are few where there are many
         at = np.flatnonzero((left <= right[i]) & (right >= left[i]))
-        at = at[(below[at] <= above[i]) & (above[at] >= below[i])]
-        c, d, along = a[at], b[at], direction[at]
-        t = np.clip(((a[i] - c) * along).sum(axis=1) / length2[at], 0, 1)
-        distance = np.linalg.norm(c + t[:, None] * along - a[i], axis=1)
-        distance[(at == i) | (after[at] == i)] = np.inf
+        at = at[(bottom[at] <= top[i]) & (top[at] >= bottom[i])]
+        c, d = start[at], end[at]
+        distance = _distance(a, c, d)
+        distance[(at == i) | (edges.after[at] == i)] = np.inf
         if distance.min() <= near:
-            raise InputError(f"{vertex(i)} lies on {edge(int(at[distance.argmin()]))}")
-        crossing = (_side(a[i], b[i], c) * _side(a[i], b[i], d) < 0) & (
-            _side(c, d, a[i]) * _side(c, d, b[i]) < 0
-        )
+            raise InputError(f"{edges.vertex(i)} lies on {edges.edge(at[distance.argmin()])}")
+        crossing = _parts(a, b, c, d) & _parts(c, d, a, b)
         if crossing.any():
-            raise InputError(f"{edge(i)} crosses {edge(int(at[crossing.argmax()]))}")
+            raise InputError(f"{edges.edge(i)} crosses {edges.edge(at[crossing.argmax()])}")
+
+
+def _check_holes(loops: Sequence[FloatArray]) -> None:
+    """Refuse holes outside of the polygon, and inside of others, where none cross."""
     first = np.stack([loop[0] for loop in loops])
     outside = ~inside(first[1:], loops[0])
     if outside.any():
@@ -219,8 +259,17 @@ def check_loops(loops: Sequence[FloatArray], edges: Sequence[Sequence[int]] | No
             raise InputError(f"hole {within[0] - 1} lies inside hole {j - 1}")
 
 
-def _where(ring: int) -> str:
-    return f" of hole {ring - 1}" if ring else ""
+def _distance(x: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Compute how far a point is from segments from a to b, shape (n,)."""
+    along = b - a
+    t = np.clip(((x - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+    distance: FloatArray = np.linalg.norm(a + t[:, None] * along - x, axis=1)
+    return distance
+
+
+def _parts(a: FloatArray, b: FloatArray, x: FloatArray, y: FloatArray) -> BoolArray:
+    """Tell whether the line through a and b runs between x and y."""
+    return np.asarray(_side(a, b, x) * _side(a, b, y) < 0)
 
 
 def _side(a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
