@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from .. import compat
@@ -75,41 +76,45 @@ class Floating:
         Raises:
             InputError: One is not.
         """
-        V = system.u_D.function_space
-        owned, comm = Layout.of_space(V).size[0], V.mesh.comm
-        piece, chi = self.piece[:owned], system.chi[:owned]
-        sums = [np.bincount(piece, values, self.count + 1) for values in (np.abs(chi), piece > 0)]
-        finite = [np.isfinite(_floors(system, side)[system.bounded]) for side in (1.0, -1.0)]
-        sums += [np.bincount(piece[system.bounded], which, self.count + 1) for which in finite]
-        size, number, *contact = comm.allreduce(np.array(sums))
-        net, (below, above) = self._net(system), contact
-        doubt = NOISE * np.sqrt(number) * size
-        rules = [net]
+        V, net = system.u_D.function_space, self._net(system)
+        owned = system.A.getLocalSize()[0]
+        sizes, dofs = np.abs(system.chi[:owned]), np.ones(owned)
+        size, number = self._sums(V.mesh.comm, self.piece[:owned], sizes, dofs)
+        finite = (np.isfinite(_floors(system, side)[system.bounded]) for side in (1.0, -1.0))
+        below, above = self._sums(V.mesh.comm, self.piece[system.bounded], *finite) > 0.0
+        forces, doubt = net[None], NOISE * np.sqrt(number) * size
         if inflow is not None:
-            of_cells = self.piece[_cell_dofs(V)[:, 0]]
-            fine = [np.bincount(of_cells, each, self.count + 1) for each in inflow]
-            less, finest = comm.allreduce(np.array(fine))
-            rules, doubt = [net, finest], doubt + DOUBT * np.abs(finest - less)
-        pressed = np.full(len(net), np.inf)
-        for each in rules:
-            here = np.where(below > 0.0, -each, -np.inf)
-            here = np.maximum(here, np.where(above > 0.0, each, -np.inf))
-            pressed = np.minimum(pressed, here)
-        adrift = pressed <= doubt
-        adrift[0] = False
-        complaint, bad = None, int(np.argmax(adrift))
-        if adrift.any() and (where := self._where(V, bad)) is not None:
-            found = [each[bad] for each in rules]
-            amount = f"of {found[-1]:g}"
-            if abs(found[-1]) <= doubt[bad] and any(found):
+            less, finest = self._sums(V.mesh.comm, self.piece[_cell_dofs(V)[:, 0]], *inflow)
+            forces, doubt = np.stack([net, finest]), doubt + DOUBT * np.abs(finest - less)
+        # an obstacle below is pressed by forces below 0, one above by those above 0, as all rules
+        # see them
+        down, up = np.where(below, -forces, -np.inf), np.where(above, forces, -np.inf)
+        pressed = np.maximum(down, up).min(axis=0)
+        adrift = 1 + np.flatnonzero(pressed[1:] <= doubt[1:])
+        complaint = None
+        if len(adrift) and (where := self._where(V, bad := int(adrift[0]))) is not None:
+            amount = f"of {forces[-1, bad]:g}"
+            if abs(forces[-1, bad]) <= doubt[bad] and forces[:, bad].any():
                 amount = "that can't be told from 0"
             alone = number[bad] == V.dofmap.index_map.size_global * V.dofmap.index_map_bs
             complaint = (
                 ("there is " if alone else f"the domain falls into pieces, and {where} has ")
                 + "no Dirichlet facet, no loss of heat, no reaction, and "
-                + _of_contact(below[bad] > 0.0, above[bad] > 0.0, amount)
+                + _of_contact(below[bad], above[bad], amount)
             )
-        raise_together(comm, complaint)
+        raise_together(V.mesh.comm, complaint)
+
+    def _sums(self, comm: MPI.Comm, piece: IndexArray, *values: FloatArray) -> FloatArray:
+        """Sum up over each piece, on all ranks, shape (len(values), count + 1); collective.
+
+        Args:
+            comm: The ranks.
+            piece: The piece of each thing that has a value, shape (n,).
+            *values: Each of shape (n,).
+        """
+        sums = [np.bincount(piece, each, self.count + 1) for each in values]
+        found: FloatArray = comm.allreduce(np.array(sums))
+        return found
 
     def _where(self, V: fem.FunctionSpace, piece: int) -> str | None:
         """Name a piece by a point in it; None on ranks that have no cell of it."""
@@ -162,9 +167,9 @@ class Floating:
     def _net(self, system: System) -> FloatArray:
         """Compute the net force ∫ f + ∫ g on each piece, shape (count + 1,); collective."""
         owned = system.A.getLocalSize()[0]
-        chi = np.bincount(self.piece[:owned], system.chi[:owned], self.count + 1)
-        net: FloatArray = system.u_D.function_space.mesh.comm.allreduce(chi)
-        return net
+        comm = system.u_D.function_space.mesh.comm
+        (net,) = self._sums(comm, self.piece[:owned], system.chi[:owned])
+        return np.asarray(net)
 
 
 def _of_contact(below: bool, above: bool, amount: str) -> str:
