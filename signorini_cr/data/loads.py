@@ -502,44 +502,24 @@ class Segments:
             norms: Whether ‖g − q‖ is to be small, too, and not the integrals alone.
         """
         g, facets, n = edge.g, edge.side, len(edge.measure)
-        pieces, reason = Pieces.of_facets(cells, facets).finer(HALVINGS * edge.varies), None
-        inside: FloatArray = np.zeros((2, len(pieces.share)))
         points, weights = facet_quadrature(cells.domain.mesh, max(LOAD_DEGREE, g.degree))
-        hats = np.column_stack([1.0 - points.sum(axis=1), points])
-        known = g.constant is not None or not cells.comm.allreduce(n)
-        if not known:
-
-            def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-                quadratic, cubic = g.deviation(Enclosure(boxes), half, hats=hats.T)
-                return np.stack([cubic, quadratic**2])
-
-            here, goal = pick(low, facets.cells), TOLERANCE * size
-            most = trace_constant(cells, facets) ** 2 / here
-            inverse = np.divide(1.0, edge.loss, out=np.full(n, np.inf), where=edge.loss > 0.0)
-            scales = np.stack(
-                [
-                    2.0 * edge.measure / np.sqrt(here) / goal,
-                    4.0 * edge.measure * np.minimum(most, inverse) / goal**2,
-                ]
-            )
-            scales[1] *= norms
-            room = 8 * cells.comm.allreduce(len(pieces.share)) + 1000
+        hats = np.column_stack([1.0 - points.sum(axis=1), points]).T
+        pieces = Pieces.of_facets(cells, facets).finer(HALVINGS * edge.varies)
+        of_integral, of_square = np.zeros((2, len(pieces.share)))
+        values, reasons = None, []
+        if g.constant is None and cells.comm.allreduce(n):
+            reason = None
             try:
-                pieces, inside = refine(
-                    pieces,
-                    lambda p: errors_on(p, errors, cells),
-                    scales,
-                    room,
-                    cells,
-                    g.deviation.apart,
+                pieces, (of_integral, of_square) = _cut_facets(
+                    pieces, edge, cells, low, TOLERANCE * size, norms, hats
                 )
-                values = g.deviation.values(pieces, cells, hats.T)
+                values = g.deviation.values(pieces, cells, hats)
             except Unknown as error:
                 reason = f"g holds an operator that has no enclosure: {error}"
-            if not np.isfinite(inside).all():
+            if not (np.isfinite(of_integral).all() and np.isfinite(of_square).all()):
                 reason = G_UNBOUNDED
-        reasons = [words for words in cells.comm.allgather(reason) if words]
-        if known or reasons:
+            reasons = [words for words in cells.comm.allgather(reason) if words]
+        if values is None or reasons:
             values = np.full((len(weights), len(pieces.share)), g.constant or 0.0)
         at, measure = pieces.parent, edge.measure[pieces.parent] * pieces.share
 
@@ -549,17 +529,15 @@ class Segments:
         return cls(
             cells=cells,
             facets=facets,
-            side=BoundaryFacets(
-                facets.cells[at], facets.local[at], facets.dofs[at], facets.ends[:, at]
-            ),
+            side=facets.picked(at),
             place=at,
-            hats=at_points(pieces.hats, hats.T).swapaxes(0, 1),
+            hats=at_points(pieces.hats, hats).swapaxes(0, 1),
             weights=weights,
             measure=measure,
             values=values,
             through=total(weights @ values),
-            missed=2.0 * total(inside[0]),
-            rough=2.0 * np.sqrt(total(inside[1])),
+            missed=2.0 * total(of_integral),
+            rough=2.0 * np.sqrt(total(of_square)),
             loss=edge.loss,
             bounded=np.full(n, edge.bounded),
             low=low,
@@ -774,6 +752,59 @@ class Segments:
         if thirds is not None:  # their means are 0
             swing = swing + THIRD * np.abs(thirds[self.facets.dofs])
         return float(np.sum(mean * self.missed + swing * np.sqrt(area) * self.rough))
+
+
+def _cut_facets(
+    pieces: Pieces,
+    edge: NeumannMoments,
+    cells: Cells,
+    low: FloatArray,
+    goal: float,
+    norms: bool,
+    hats: FloatArray,
+) -> tuple[Pieces, FloatArray]:
+    """Cut pieces of facets until quadrature misses little of g; collective.
+
+    Args:
+        pieces: To begin with.
+        edge: g.
+        cells: The mesh.
+        low: Lower bound of κ, shape (cells,) or ().
+        goal: The share of the bound, or thereabouts, that may come of it.
+        norms: As for `Segments.of`.
+        hats: The points' barycentric coordinates on a piece, shape (d, q).
+
+    Returns:
+        Pieces; and half of what may be missed of ∫ g on each, and a quarter of that of ‖g − q‖²,
+        both in parts of its measure, shape (2, n).
+
+    Raises:
+        Unknown: An operator in g has no enclosure.
+    """
+
+    def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
+        quadratic, cubic = edge.g.deviation(Enclosure(boxes), half, hats=hats)
+        return np.stack([cubic, quadratic**2])
+
+    kappa, n = pick(low, edge.side.cells), len(edge.measure)
+    # C with ‖e‖²_F at most C times the square of e's energy, which b has a share in
+    of_gradients = trace_constant(cells, edge.side) ** 2 / kappa
+    of_loss = np.divide(1.0, edge.loss, out=np.full(n, np.inf), where=edge.loss > 0.0)
+    importance = np.stack(
+        [
+            2.0 * edge.measure / np.sqrt(kappa) / goal,
+            4.0 * edge.measure * np.minimum(of_gradients, of_loss) / goal**2 * norms,
+        ]
+    )
+    room = 8 * cells.comm.allreduce(len(pieces.share)) + 1000
+    return refine(
+        pieces,
+        lambda some: errors_on(some, errors, cells),
+        importance,
+        room,
+        cells,
+        edge.g.deviation.apart,
+    )
 
 
 THIRD = 0.1

@@ -142,7 +142,7 @@ class BoundaryFacets:
             np.concatenate([side.ends for side in sides], axis=1),
         )
 
-    def picked(self, where: BoolArray) -> BoundaryFacets:
+    def picked(self, where: BoolArray | IndexArray) -> BoundaryFacets:
         """Take some of the facets."""
         ends = self.ends[:, where]
         return BoundaryFacets(self.cells[where], self.local[where], self.dofs[where], ends)
