@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -295,12 +296,37 @@ class _Facets:
         )
 
     @property
-    def paths(self) -> tuple[FloatArray, FloatArray, Int32Array]:
-        """Segments that every facet is looked at along: their ends and cells."""
+    def paths(self) -> _Paths:
+        """Segments that every facet is looked at along: the facet itself, or to its middle."""
         if self.x.shape[1] == 2:
-            return self.x[:, 0], self.x[:, 1], self.cells
+            return _Paths(self.x[:, 0], self.x[:, 1], self.cells)
         middle = np.repeat(self.x.mean(axis=1), self.x.shape[1], axis=0)
-        return self.x.reshape(-1, 3), middle, np.repeat(self.cells, self.x.shape[1])
+        return _Paths(self.x.reshape(-1, 3), middle, np.repeat(self.cells, self.x.shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Paths:
+    """Segments on facets, all of shape (n, …).
+
+    Attributes:
+        start: One end of each.
+        end: The other.
+        cells: A cell that it is in.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    cells: Int32Array
+
+    @cached_property
+    def lengths(self) -> FloatArray:
+        """Lengths of the segments."""
+        return np.asarray(np.linalg.norm(self.end - self.start, axis=1))
+
+    def at(self, segment: IndexArray, s: FloatArray) -> FloatArray:
+        """Find the points at s, from 0 to 1, of some segments, shape (*s.shape, 3)."""
+        start = self.start[segment]
+        return start + s[..., None] * (self.end[segment] - start)
 
 
 def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
@@ -310,21 +336,17 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     until the digits of the coordinates end. What is continuous has fallen by then, however steep it
     is; a jump is as high as before. (|t|^s falls far enough for s > 0.05, near 0.)
     """
-    comm, error = u_D.mesh.comm, u_D.precision.points
-    start, end, cells = fixed.paths
-    total = comm.allreduce(len(start))
-    if u_D.constant or not total:
+    comm, paths = u_D.mesh.comm, fixed.paths
+    number = comm.allreduce(len(paths.cells))
+    if u_D.constant or not number:
         return []
-    way = end - start
-    length = np.linalg.norm(way, axis=1)
-    shortest = SHORTEST * error
-    longest = max(comm.allgather(float(length.max(initial=0.0))))
-    pieces = int(
-        min(np.clip(SAMPLES // total, FEWEST_SAMPLES, MOST_SAMPLES), longest / (SPAN * shortest))
-    )
+    shortest = SHORTEST * u_D.precision.points
+    longest = max(comm.allgather(float(paths.lengths.max(initial=0.0))))
+    usual = np.clip(SAMPLES // number, FEWEST_SAMPLES, MOST_SAMPLES)
+    pieces = int(min(usual, longest / (SPAN * shortest)))
     if pieces < 1:
-        return [_far_message(key, u_D.mesh, x) for x in start[:1]]
-    intervals = _sampled(u_D, fixed, pieces)
+        return [_far_message(key, u_D.mesh, x) for x in paths.start[:1]]
+    intervals = _sampled(u_D, paths, pieces)
     if intervals is None:
         return []
     finite = np.abs(intervals.u[np.isfinite(intervals.u)])
@@ -332,24 +354,23 @@ def _jump(u_D: _Values, fixed: _Facets, key: str) -> list[Complaint]:
     scale = TOLERANCE * largest
     complaints = _between([(u_D, fixed)], scale, key) if u_D.tied else []
 
+    # a jump is higher than intervals around it, of this length at most, are far from affine
     halfway = 16.0 * math.sqrt(longest / pieces * shortest)
     while len(intervals.segment):
-        segment, s, u = intervals.segment, intervals.s, intervals.u
-        rough, width = _roughness(u), (s[2] - s[0]) * length[segment]
+        rough, width = intervals.roughness, intervals.widths(paths)
         roughest = np.where(width <= halfway, np.maximum(rough, intervals.roughest), 0.0)
-        middle = start[segment] + s[1][:, None] * way[segment]
-        for i in np.flatnonzero(np.abs(u).max(axis=0) > POLE * largest):
-            complaints.append(_pole_message(key, u_D.mesh, middle[i]))
-        rounding, short = np.maximum(scale, _noise(intervals.e)), width < shortest
-        height = np.abs(u[2] - u[0])
-        for i in np.flatnonzero(short & (height > np.maximum(rounding, roughest))):
-            complaints.append(_jump_message(key, u_D.mesh, middle[i], u[0, i], u[2, i]))
-        rest = replace(intervals, roughest=roughest).picked(~short & (rough > rounding))
-        cuts = rest.cuts
-        x = start[rest.segment] + cuts[:, :, None] * way[rest.segment]
-        found = u_D.at(x.swapaxes(0, 1), cells[rest.segment], error)
-        assert found is not None
-        intervals = rest.halved(cuts, found[0].T, found[1].T)
+        rounding, u = np.maximum(scale, _noise(intervals.e)), intervals.u
+        pole = np.abs(u).max(axis=0) > POLE * largest
+        short, height = width < shortest, np.abs(u[2] - u[0])
+        jump = short & (height > np.maximum(rounding, roughest))
+        middle = paths.at(intervals.segment, intervals.s[1])
+        complaints += [_pole_message(key, u_D.mesh, x) for x in middle[pole]]
+        complaints += [
+            _jump_message(key, u_D.mesh, x, before, after)
+            for x, before, after in zip(middle[jump], u[0, jump], u[2, jump], strict=True)
+        ]
+        still_open = replace(intervals, roughest=roughest).picked(~short & (rough > rounding))
+        intervals = still_open.halved(u_D, paths)
         if len(intervals.segment) > AT_A_TIME:
             intervals = intervals.rougher()
     return complaints
@@ -375,9 +396,15 @@ class _Intervals:
     roughest: FloatArray
 
     @property
-    def cuts(self) -> FloatArray:
-        """The middles of both parts of each, shape (2, n)."""
-        return np.asarray(self.s[:2] + MIDDLE * np.diff(self.s, axis=0))
+    def roughness(self) -> FloatArray:
+        """Distances of u from affine; 0 where it is not finite, shape (n,)."""
+        with np.errstate(all="ignore"):
+            difference = np.abs((1.0 - MIDDLE) * self.u[0] - self.u[1] + MIDDLE * self.u[2])
+        return np.where(np.isfinite(difference), difference, 0.0)
+
+    def widths(self, paths: _Paths) -> FloatArray:
+        """Compute the lengths of the intervals, shape (n,)."""
+        return np.asarray((self.s[2] - self.s[0]) * paths.lengths[self.segment])
 
     def picked(self, which: BoolArray | IndexArray) -> _Intervals:
         """Return some of them."""
@@ -389,32 +416,30 @@ class _Intervals:
             self.roughest[which],
         )
 
-    def halved(self, cuts: FloatArray, u: FloatArray, e: FloatArray) -> _Intervals:
-        """Cut all in two; the first parts come first.
-
-        Args:
-            cuts: The middles of both parts, shape (2, n).
-            u: Values there, shape (2, n).
-            e: What they may be off by, shape (2, n).
-        """
+    def halved(self, u_D: _Values, paths: _Paths) -> _Intervals:
+        """Cut all in two, with values in the middles of both parts; the first parts come first."""
+        cuts = self.s[:2] + MIDDLE * np.diff(self.s, axis=0)
+        x = paths.at(self.segment, cuts).swapaxes(0, 1)
+        found = u_D.at(x, paths.cells[self.segment], u_D.precision.points)
+        assert found is not None
         return _Intervals(
             np.tile(self.segment, 2),
             _halves(self.s, cuts),
-            _halves(self.u, u),
-            _halves(self.e, e),
+            _halves(self.u, found[0].T),
+            _halves(self.e, found[1].T),
             np.tile(self.roughest, 2),
         )
 
     def rougher(self) -> _Intervals:
         """Keep of both parts, the first ones first, that which is farther from affine."""
-        half = len(self.segment) // 2
-        first = _roughness(self.u[:, :half]) >= _roughness(self.u[:, half:])
-        return self.picked(np.where(first, np.arange(half), np.arange(half, 2 * half)))
+        first, second = np.split(self.roughness, 2)
+        place = np.arange(len(first))
+        return self.picked(np.where(first >= second, place, len(first) + place))
 
 
-def _sampled(u_D: _Values, fixed: _Facets, pieces: int) -> _Intervals | None:
+def _sampled(u_D: _Values, paths: _Paths, pieces: int) -> _Intervals | None:
     """Cut facets into intervals; None where u_D has no values there on some rank; collective."""
-    start, end, cells = fixed.paths
+    start, end, cells = paths.start, paths.end, paths.cells
     t = np.arange(pieces)[:, None] + [0.0, MIDDLE]
     t = np.append(t, pieces) / pieces
     x = start[:, None] + t[:, None] * (end - start)[:, None]
@@ -440,13 +465,6 @@ def _halves(triples: FloatArray, cuts: FloatArray) -> FloatArray:
     """Cut every interval in two, the first parts first, shape (3, 2 intervals)."""
     (a, m, b), (p, q) = triples, cuts
     return np.hstack([np.stack([a, p, m]), np.stack([m, q, b])])
-
-
-def _roughness(u: FloatArray) -> FloatArray:
-    """Tell how far u, at ends and middles, is from affine; 0 where it is not finite."""
-    with np.errstate(all="ignore"):
-        difference = np.abs((1.0 - MIDDLE) * u[0] - u[1] + MIDDLE * u[2])
-    return np.where(np.isfinite(difference), difference, 0.0)
 
 
 def _noise(e: FloatArray) -> FloatArray:
