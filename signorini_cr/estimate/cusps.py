@@ -13,7 +13,9 @@ coordinate along the side opposite z: Gauss's rule is exact for them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +31,36 @@ EXPONENTS = (0.5, 0.25)
 
 HOLDS = 0.1
 """Part of ‖κ^{1/2}(∇v − ∇u_h)‖² that the cells around a vertex hold if it is to get a cusp."""
+
+
+class _Share(NamedTuple):
+    """A cell's share of the system around a vertex.
+
+    Attributes:
+        facets: Global numbers of the two facets that its functions belong to, −1 on the boundary.
+        matrix: For the functions of the one and then the other, shape (functions, functions).
+        right: Right-hand side, shape (functions,).
+    """
+
+    facets: list[int]
+    matrix: FloatArray
+    right: FloatArray
+
+
+def _solved(around: Sequence[_Share]) -> dict[int, FloatArray]:
+    """Solve the system around a vertex, in least squares; the coefficients by facet."""
+    facets = sorted({facet for share in around for facet in share.facets if facet >= 0})
+    # what belongs to the boundary, which has no such functions, goes behind all that is solved for
+    number = {facet: i for i, facet in enumerate(facets)} | {-1: len(facets)}
+    count = len(EXPONENTS)
+    size = count * len(facets)
+    matrix, right = np.zeros(2 * (size + count,)), np.zeros(size + count)
+    for share in around:
+        rows = np.concatenate([count * number[facet] + np.arange(count) for facet in share.facets])
+        np.add.at(matrix, np.ix_(rows, rows), share.matrix)
+        np.add.at(right, rows, share.right)
+    found = np.linalg.lstsq(matrix[:size, :size], right[:size], rcond=None)[0]
+    return dict(zip(facets, found.reshape(-1, count), strict=True))
 
 
 @dataclass(eq=False)
@@ -144,31 +176,20 @@ class Cusps:
         right = -np.einsum("q,qin,fqin->nf", self.weights, self.before(cells, excess, bumps), flows)
         # The function of the facet from the apex to an end belongs to the facet opposite the other
         number = self.names[1][cells.others[self.apex].T[::-1], np.arange(len(self.at))]
-        names = [int(name) for name in self.names[0]]
-        mine = list(zip(names, number.T.tolist(), matrices, right, strict=True))
-        everyones = [each for rank in cells.comm.allgather(mine) for each in rank]
-        heights = {}
-        count = len(EXPONENTS)
-        for vertex in {each[0] for each in everyones}:
-            around = [each for each in everyones if each[0] == vertex]
-            facets = sorted({facet for each in around for facet in each[1] if facet >= 0})
-            place = {facet: count * i for i, facet in enumerate(facets)}
-            size = count * len(facets)
-            matrix, vector = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
-            for _, ends, part, pull in around:  # what belongs to the boundary goes to the last row
-                rows = [
-                    place[facet] + i if facet >= 0 else size for facet in ends for i in range(count)
-                ]
-                np.add.at(matrix, (np.array(rows)[:, None], np.array(rows)), part)
-                np.add.at(vector, rows, pull)
-            found = np.linalg.lstsq(matrix[:size, :size], vector[:size], rcond=None)[0]
-            for facet in facets:
-                heights[vertex, facet] = found[place[facet] : place[facet] + count]
-        nothing, best = np.zeros(count), np.empty_like(self.heights)
-        for n, (vertex, ends) in enumerate(zip(names, number.T.tolist(), strict=True)):
-            own = [heights.get((vertex, facet), nothing) for facet in ends]
-            best[:, n] = np.concatenate(own)
-        return replace(self, heights=best)
+        vertices = [int(name) for name in self.names[0]]
+        facets = [[int(name) for name in pair] for pair in number.T]
+        mine = list(zip(vertices, facets, matrices, right, strict=True))
+        around: dict[int, list[_Share]] = {}
+        for vertex, *share in (each for rank in cells.comm.allgather(mine) for each in rank):
+            around.setdefault(vertex, []).append(_Share(*share))
+        heights = {vertex: _solved(shares) for vertex, shares in around.items()}
+        nothing = np.zeros(len(EXPONENTS))  # on the boundary
+        own = [
+            [heights[vertex].get(facet, nothing) for facet in pair]
+            for vertex, pair in zip(vertices, facets, strict=True)
+        ]
+        best = np.array(own).reshape(len(own), len(self.heights)).T
+        return replace(self, heights=np.ascontiguousarray(best))
 
     def before(self, cells: Cells, excess: FloatArray, bumps: FloatArray) -> FloatArray:
         """Compute ∇(v − u_h) without ψ, as γ_i by ∇λ_i, at the points, shape (q, d + 1, n)."""
