@@ -368,49 +368,76 @@ def solve_in_time(
         raise InputError("f: a problem in time derives none from exact, which tells no ∂u/∂t")
     if domain.mesh.topology.dim != 2:
         raise InputError("problems in time are worked out for d = 2 only")
-    reactions = _reactions(problem, domain)
-    factor, rates = 0.0, np.array(0.0)
-    solver: Solver | None = None
-    start: fem.Function | None = None
-    then: FloatArray = np.empty(0)
-    before: FloatArray = then
+    stepper = _Stepper(problem, domain, levels, capacity, own)
     limits, comm = Limits(max_time), domain.mesh.comm
     known, more = _given(levels, domain)
     limits.begin(known[-1][0] if known else domain, "CR", restart, 1 + more)
+    start: fem.Function | None = None
+    past: list[FloatArray] = []  # u_h one step before, and two
     try:
         for step in range(max(done, 1), steps + 1):
-            weights = SCHEMES[scheme].weights
-            method = SCHEMES[scheme if step >= len(weights) else "euler"]
-            needed = method.factor * steps / end
+            method = SCHEMES[scheme if step >= len(SCHEMES[scheme].weights) else "euler"]
             t = end * step / steps
             if time is not None:
                 time.value = t
-            if solver is None or needed != factor:
-                factor, former = needed, solver
-                added = {name: factor * each for name, each in {"": capacity, **own}.items()}
-                meshes = levels if former is None else former.refined
-                solver = Solver(_stepping(problem, reactions, added), domain, meshes)
-                rates = factor * solver.by_material(capacity, own)
-                if former is not None:
-                    former.close()
-                elif restart is None:
-                    then = _at_first(solver, initial, time)
-                else:
-                    start, then, before = _gone_on(solver, restart, initial, step, time)
+            solver = stepper.prepare(method.factor * steps / end)
+            if not past and restart is not None:
+                start, past = _gone_on(solver, restart, initial, step, time)
+            elif not past:
+                past = [_at_first(solver, initial, time)]
             source = fem.Function(solver.V)
-            kept = (then, before)[: len(method.weights)]
-            for weight, former_u in zip(method.weights, kept, strict=True):
-                source.x.array[:] += weight * former_u
-            solution = solver.solve(source, start, rates, monitor)
-            before, then = then, solution.u.x.array
+            needed = past[: len(method.weights)]
+            for weight, former in zip(method.weights, needed, strict=True):
+                source.x.array[:] += weight * former
+            solution = solver.solve(source, start, stepper.rates, monitor)
+            past = [solution.u.x.array, past[0]]
             start = fem.Function(solver.V)
-            start.x.array[:] = 2.0 * then - before
+            start.x.array[:] = 2.0 * past[0] - past[1]
             yield t, solution
             if step < steps:
                 limits.admit_step(comm)
     finally:
-        if solver is not None:
-            solver.close()
+        stepper.close()
+
+
+class _Stepper:
+    """The solver of steps in time; another one where the scheme asks for another rate.
+
+    Attributes:
+        rates: What w is multiplied by, as `Solver.solve` takes it.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        domain: Domain,
+        levels: int | Sequence[Refined],
+        capacity: float,
+        own: Mapping[str, float],
+    ):
+        """Begin without a solver; `own` are the capacities of materials, from `_capacities`."""
+        self._problem, self._domain, self._levels = problem, domain, levels
+        self._capacity, self._own, self._reactions = capacity, own, _reactions(problem, domain)
+        self._solver: Solver | None = None
+        self._factor, self.rates = 0.0, np.array(0.0)
+
+    def prepare(self, factor: float) -> Solver:
+        """Return a solver with so many times the capacity added to c; collective."""
+        if self._solver is None or factor != self._factor:
+            capacities = {"": self._capacity, **self._own}
+            added = {name: factor * each for name, each in capacities.items()}
+            former, problem = self._solver, _stepping(self._problem, self._reactions, added)
+            self._solver = solver = Solver(problem, self._domain, self._levels)
+            if former is not None:
+                former.close()
+            self._factor, self._levels = factor, solver.refined
+            self.rates = factor * solver.by_material(self._capacity, self._own)
+        return self._solver
+
+    def close(self) -> None:
+        """Free what there is; collective."""
+        if self._solver is not None:
+            self._solver.close()
 
 
 def _check_steps(end: float, steps: int, done: int, scheme: str, time: object) -> None:
@@ -485,13 +512,13 @@ def _stepping(
 
 def _gone_on(
     solver: Solver, restart: Restart, initial: Data, step: int, time: Clock | None
-) -> tuple[fem.Function, FloatArray, FloatArray]:
-    """Read u_h after a step, and what u was one and two steps before; collective."""
-    known = [restart.function(solver.V, k) for k in range(len(restart.u))]
-    former = [each.x.array for each in known[1:]]
-    if len(former) < 2:
-        former.append(_at_first(solver, initial, time) if step <= 2 else np.empty(0))
-    return known[0], former[0], former[-1]
+) -> tuple[fem.Function, list[FloatArray]]:
+    """Read u_h after a step, and what it was one step before and, if need be, two; collective."""
+    last, *before = (restart.function(solver.V, k) for k in range(len(restart.u)))
+    past = [each.x.array for each in before]
+    if len(past) < 2 and step <= 2:
+        past.append(_at_first(solver, initial, time))
+    return last, past
 
 
 def _at_first(solver: Solver, initial: Data, time: Clock | None) -> FloatArray:
