@@ -781,30 +781,36 @@ def _at_points(
     """
     d, mean, volume = cells.tdim, pick(mean, where), cells.volume[where]
     P, W, slopes = flux.excess[:, where], w[:, where], v.slopes(cells, where)
-    s = sum_rows(P)
-    gg = dot_rows(W, cells.apply(W, where))
+    out_of_cell = sum_rows(P)
+    # |T| times products of q = y − κ_T∇u_h, of ∇u_h, and of e = ∇(v − u_h)
+    uu = dot_rows(W, cells.apply(W, where))
     rows = np.zeros((9, len(volume)))
-    for k, weight, hat in points:
+    for kappa, weight, hat in points:
         hat = hat.reshape(len(hat), -1)
-        Q = hat * s - P
+        Q = hat * out_of_cell - P
         if flux.beyond is not None:
             Q += flux.beyond.through(cells, where, hat)
-        gamma = slopes(hat)
-        qq = np.zeros_like(s)
+        qq = np.zeros_like(out_of_cell)
         for (i, j), length in zip(cells.pairs, cells.lengths[:, where], strict=True):
             qq -= Q[i] * Q[j] * length
         qq /= d**2 * volume
-        S_gamma = cells.apply(gamma, where)
-        bend, along = dot_rows(gamma, S_gamma), dot_rows(W, S_gamma)
-        Qw = dot_rows(Q, W) / d
-        off = k - mean
-        pp, bb = (qq - 2.0 * off * Qw + off**2 * gg) / k, k * bend
-        pb = dot_rows(Q, gamma) / d - off * along
-        yy = qq + 2.0 * mean * Qw + mean**2 * gg
-        values = [pp, bb, pb, k * (gg + 2.0 * along + bend), yy]
-        for sign in (2.0, -2.0):
-            zz = gg + sign * along + bend
-            values += [zz, zz / k]
+        gamma = slopes(hat)
+        of_e = cells.apply(gamma, where)
+        ee, ue = dot_rows(gamma, of_e), dot_rows(W, of_e)
+        qu, qe = dot_rows(Q, W) / d, dot_rows(Q, gamma) / d
+        off = kappa - mean
+        vv, other = uu + 2.0 * ue + ee, uu - 2.0 * ue + ee  # of ∇v, and of ∇(2u_h − v)
+        values = (
+            (qq - 2.0 * off * qu + off**2 * uu) / kappa,
+            kappa * ee,
+            qe - off * ue,
+            kappa * vv,
+            qq + 2.0 * mean * qu + mean**2 * uu,
+            vv,
+            vv / kappa,
+            other,
+            other / kappa,
+        )
         for row, value in zip(rows, values, strict=True):
             row += weight * value
     return rows
