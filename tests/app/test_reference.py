@@ -21,6 +21,7 @@ from signorini_cr.app.commandline import UsageError, _parser, read_arguments
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, ADAPTIVE, KEYS, MATERIAL, PART, QUANTITY, TYPES
 from signorini_cr.fem.problem import Material, Problem
+from signorini_cr.output.sheets import SHEETS
 from signorini_cr.output.units import Units
 
 BASE = {
@@ -133,6 +134,9 @@ def test_every_figure_is_in_the_reference(known, shared_tmp_path, capsys) -> Non
     named = names_in("Columns of contact.csv")
     # not bounded from above, on one part
     assert head == [name for name in named if name not in ("upper", "name")]
+    for name, sheet in SHEETS.items():
+        head = next(csv.reader((folder / name).read_text(encoding="utf-8").splitlines()))
+        assert head and head == [each for each in names_in(sheet.head) if each in head]
     (head,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("level "))
     printed = head.replace("H1 error", "H1_error").replace("L2 error", "L2_error").split()
     known_names = names_in("Columns of the printed table")
