@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from .errors import InputError
 from .estimate.force import Interval
-from .fem.conditions import Data
+from .fem.conditions import Condition, Contact, Data, Dirichlet, Neumann, Robin
 from .hints import meant
 from .solution import Solution
 
@@ -17,14 +17,14 @@ class Kind(NamedTuple):
 
     Attributes:
         bound: Puts one between two numbers, given a solution, the place and a weight; collective.
-        parts: The types of the parts of the boundary that it may be of.
+        parts: The conditions on parts of the boundary that it may be of.
         of_u: Whether it may be of materials, and of all of the domain, as well.
         unit: What it is measured in: "u", "force", or "" where that isn't told.
         weighted_unit: The same where it has a weight.
     """
 
     bound: Callable[[Solution, str | None, Data | None], Interval]
-    parts: tuple[str, ...]
+    parts: tuple[type[Condition], ...]
     of_u: bool
     unit: str
     weighted_unit: str
@@ -35,10 +35,10 @@ def _flux(solution: Solution, place: str | None, weight: Data | None) -> Interva
 
 
 KINDS = {
-    "force": Kind(_flux, ("contact",), False, "force", ""),
-    "flux": Kind(_flux, ("dirichlet",), False, "force", ""),
-    "mean": Kind(Solution.mean, ("contact", "neumann", "robin"), True, "u", "u"),
-    "integral": Kind(Solution.integral, ("contact", "neumann", "robin"), True, "", ""),
+    "force": Kind(_flux, (Contact,), False, "force", ""),
+    "flux": Kind(_flux, (Dirichlet,), False, "force", ""),
+    "mean": Kind(Solution.mean, (Contact, Neumann, Robin), True, "u", "u"),
+    "integral": Kind(Solution.integral, (Contact, Neumann, Robin), True, "", ""),
 }
 """All there are, by the key that asks for one."""
 

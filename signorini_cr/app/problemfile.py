@@ -426,7 +426,7 @@ def _quantities(
                 f" {shown(value)}"
             )
         kind, of_u = kinds[0], QUANTITIES[kinds[0]].of_u
-        own = [each for each, what in types.items() if what in QUANTITIES[kind].parts]
+        own = [each for each, what in types.items() if KINDS[what] in QUANTITIES[kind].parts]
         if of_u:
             own += [*materials, DOMAIN]
         place = one_of(own)(f"{key}.{kind}", value[kind])
