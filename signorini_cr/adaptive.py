@@ -22,6 +22,7 @@ from .errors import (
     insist_on_kind,
     insist_on_number,
 )
+from .estimate.certificate import Certificate
 from .fem.problem import Problem
 from .levels import LevelMonitor, check_arguments, solve_sequence
 from .limits import Limits
@@ -29,11 +30,19 @@ from .mesh.balance import Refined, balance
 from .mesh.domain import Domain
 from .mesh.refinement import refine_marked
 from .restart import Restart
+from .rounding import at_most
 from .solution import Solution
 
 ALIKE = 1e-6
 """Part by which indicators may differ that count as one: the solver leaves 1e-9 to 1e-7 of them,
 and where a problem is symmetric, cells are twins but for that."""
+
+HALVINGS = 40
+"""Steps of the bisection for the value that separates marks: they leave 1e-12 of the largest."""
+
+NOTHING = 0.1
+"""Part of the rounding in a bound that is nothing beside it: cells' shares that are all noise come
+to 0.07 of it at most, and to cut what is left once more adds more rounding than it takes away."""
 
 RUNS = 3.0
 """Time that a run in time, the one on the mesh that is found, and its output take, in runs."""
@@ -57,6 +66,8 @@ def solve_adaptive(
 ) -> Iterator[Solution]:
     """Solve on meshes that are refined where the error is; each starts from the one below.
 
+    The sequence ends, too, where what is left of the bound is rounding, see `Shares.rounded`.
+
     Args:
         problem: The data; a Function in them must be of degree 0, on the coarsest mesh.
         domain: The coarsest mesh and its boundary parts.
@@ -77,7 +88,8 @@ def solve_adaptive(
             a mesh of other cells than straight-sided triangles is to be refined; or the fraction or
             the number of levels is out of its range.
         NotConverged: The solver stopped short on one of the meshes, or cells got too small, or the
-            next level would not fit into the memory there is, or into ``max_time``.
+            next level would not fit into the memory there is, or into ``max_time``; or what is left
+            of the bound is rounding, and above a ``tolerance`` that is not 0.
     """
     check_arguments(problem, domain)
     limits = Limits(max_time)
@@ -96,10 +108,13 @@ class Shares(NamedTuple):
     Attributes:
         bound: Of the broken error (1.6).
         indicators: What this rank's cells hold of its square, shape (cells,).
+        rounding: What it has beyond all its parts, in the norm of the energy: rounding in the
+            certificate's own sums, which grows with the number of cells. 0 where it is not known.
     """
 
     bound: float
     indicators: FloatArray
+    rounding: float
 
     @classmethod
     def of(cls, solution: Solution) -> Shares:
@@ -114,7 +129,23 @@ class Shares(NamedTuple):
                 f"adaptive refinement goes by the certified bound, and there is none: "
                 f"{certificate.reason}"
             )
-        return cls(certificate.bound_h1, certificate.indicators)
+        rounding = 0.0
+        if isinstance(certificate, Certificate):  # that of another physics may tell no parts
+            bound = certificate.bound_energy_norm or 0.0
+            rounding = max(bound - sum(certificate.parts.values()), 0.0)
+        return cls(certificate.bound_h1, certificate.indicators, rounding)
+
+    def rounded(self, comm: MPI.Comm) -> bool:
+        """Tell whether refinement has nothing to reduce but rounding; collective.
+
+        That is so where all cells together hold less than a hundredth of its square, and where they
+        hold nothing, so that none can be marked.
+
+        Args:
+            comm: The ranks that take part.
+        """
+        held = comm.allreduce(float(np.sum(self.indicators)))
+        return self.bound > 0.0 and not held > (NOTHING * self.rounding) ** 2
 
 
 class Tried(NamedTuple):
@@ -125,11 +156,13 @@ class Tried(NamedTuple):
             last of these, or the coarsest.
         last: The solution of the last step.
         bound: The largest of the bounds of the steps.
+        rounded: Whether what is left of the bounds is rounding, which no finer mesh makes smaller.
     """
 
     meshes: list[Refined]
     last: Solution
     bound: float
+    rounded: bool
 
 
 def adapt_to_run(
@@ -146,7 +179,7 @@ def adapt_to_run(
 
     Cells are marked by the sum of their shares over all steps, each in the bound of its own
     problem; the mesh they lead to is that of the next run. What the length of the steps does to u
-    is in none of these bounds.
+    is in none of these bounds. As with `solve_adaptive` it ends where rounding is all that is left.
 
     Args:
         run: Solves step by step, as `solve_in_time` does, on the last of some refined meshes.
@@ -169,19 +202,22 @@ def adapt_to_run(
     step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction, runs=RUNS)
     refined = [*meshes]
     while True:
-        bound, last = 0.0, None
-        indicators: FloatArray = np.zeros(1)
+        total, last = Shares(0.0, np.zeros(1), 0.0), None
         steps = run(refined)
         insist_on_kind("what run returns", steps, Iterable, "pairs of a time and a solution")
         for _, last in steps:
             shares = Shares.of(last)
-            bound, indicators = max(bound, shares.bound), indicators + shares.indicators
+            total = Shares(
+                max(total.bound, shares.bound),
+                total.indicators + shares.indicators,
+                float(np.hypot(total.rounding, shares.rounding)),
+            )
         if last is None:
             raise InputError("the run has no steps")
         if last.level.number != len(refined):
             raise InputError("the run is to be on the meshes that it is given, as its levels")
-        yield Tried([*refined], last, bound)
-        following = step(last, Shares(bound, indicators))
+        yield Tried([*refined], last, total.bound, total.rounded(last.domain.mesh.comm))
+        following = step(last, total)
         if following is None:
             break
         refined.append(following)
@@ -225,6 +261,15 @@ def _by_shares(
         if last or shares.bound <= tolerance or solution.dofs >= max_dofs:
             return None
         comm = solution.domain.mesh.comm
+        if shares.rounded(comm):
+            if tolerance == 0.0:
+                return None
+            raise NotConverged(
+                f"the certified bound is {at_most(shares.bound)}, above the tolerance of"
+                f" {tolerance:g}, and what is left of it is rounding, which no finer mesh makes"
+                " smaller",
+                solution.level.number,
+            )
         marked = mark(shares.indicators, fraction, comm)
         if _smallest(solution.domain, marked) < RESOLUTION:
             raise NotConverged(
@@ -268,7 +313,7 @@ def mark(indicators: FloatArray, fraction: float, comm: MPI.Comm) -> BoolArray:
     above = np.concatenate([np.cumsum(ordered[::-1])[::-1], [0.0]])
     total, top = comm.allreduce(above[0]), comm.allreduce(ordered.max(initial=0.0), op=MPI.MAX)
     low, high = 0.0, float(top)
-    while high - low > 1e-12 * top:
+    for _ in range(HALVINGS):  # whatever the numbers are: beside tiny ones 1e-12 of them is 0
         middle = 0.5 * (low + high)
         held = comm.allreduce(above[np.searchsorted(ordered, middle)])
         low, high = (middle, high) if held >= fraction * total else (low, middle)

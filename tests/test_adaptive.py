@@ -14,7 +14,9 @@ from signorini_cr import (
     Polygon,
     Problem,
     Solution,
+    adapt_to_run,
     exact,
+    solve,
     solve_adaptive,
     solve_levels,
 )
@@ -31,6 +33,9 @@ WORLD = MPI.COMM_WORLD
 def run(example, size=4, **limits):
     return list(solve_adaptive(example.problem, example.structured(size), **limits))
 
+
+THROUGH = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
+"""What flows from above to the contact below."""
 
 MOST = {"S1": 4000, "B": 4000, "D": 10_000, "I": 1500}
 
@@ -61,6 +66,61 @@ def test_marks_of_nothing():
 def test_a_rank_without_cells_may_take_part():
     mine = np.arange(1.0, 5.0) if WORLD.rank == 0 else np.zeros(0)
     assert WORLD.allreduce(int(mark(mine, 0.4, WORLD).sum())) == 1
+
+
+@pytest.mark.parametrize(
+    ("numbers", "fraction", "wanted"),
+    [
+        ([1e-312, 2e-312], 0.5, [False, True]),
+        ([5e-324, 1e-323], 0.9, [True, True]),
+        ([1e308, 1e308], 0.5, [True, True]),
+        ([1.0, np.inf], 0.5, [False, True]),
+        ([1.0, np.nan], 0.5, [False, False]),
+    ],
+)
+def test_marks_of_any_numbers_come_to_an_end(numbers, fraction, wanted):
+    """Their sum may be beyond all numbers, and 1e-12 of the largest below all."""
+    mine = slice(None) if WORLD.rank == 0 else slice(0)
+    with np.errstate(all="ignore"):
+        marked = mark(np.array(numbers)[mine], fraction, WORLD)
+    assert marked.tolist() == wanted[mine]
+
+
+def constant(value: float) -> Problem:
+    return Problem(dirichlet=value)
+
+
+@pytest.mark.parametrize("value", [1.0, 1 / 3, 0.1 + 0.3])
+def test_nothing_but_rounding_ends_the_sequence(value):
+    """Finer meshes have more rounding: a constant needs one mesh, whatever is asked of it."""
+    domain = THROUGH.mesh(0.5)
+    (solution,) = solve_adaptive(constant(value), domain)
+    bound = solution.certificate.bound_h1
+    assert 0.0 < bound < 1e-12
+    assert [s.dofs for s in solve_adaptive(constant(value), domain, levels=5)] == [solution.dofs]
+    (_,) = solve_adaptive(constant(value), domain, tolerance=1.01 * bound)
+    solutions = solve_adaptive(constant(value), domain, tolerance=0.5 * bound)
+    assert next(solutions).dofs == solution.dofs
+    with pytest.raises(NotConverged, match="what is left of it is rounding") as caught:
+        next(solutions)
+    assert caught.value.level == 0
+
+
+def test_nothing_but_rounding_ends_the_search_for_a_mesh():
+    solution = solve(constant(1.0), THROUGH.mesh(0.5))
+    (tried,) = adapt_to_run(lambda _: [(1.0, solution), (2.0, solution)])
+    assert tried.rounded and not tried.meshes
+    search = adapt_to_run(lambda _: [(1.0, solution)], tolerance=1e-14)
+    assert next(search).rounded
+    with pytest.raises(NotConverged, match="what is left of it is rounding"):
+        next(search)
+
+
+def test_refinement_ends_where_rounding_is_all_of_an_affine_solution():
+    """The solver leaves less on finer meshes; once that is nothing, the bound would rise."""
+    problem = Problem(dirichlet=lambda x: 1e6 + x[0] / 3.0, obstacle=-1e9)
+    held = Polygon(THROUGH.vertices, ["contact", *["dirichlet"] * 3]).mesh(0.5)
+    assert len(list(solve_adaptive(problem, held, max_dofs=3000))) == 1
 
 
 def test_adaptive_meshes_restore_the_rate_at_a_corner():

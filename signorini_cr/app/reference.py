@@ -166,7 +166,7 @@ KEYS = (
         "Number of meshes, the coarsest included.", "levels = 5", ends=True),
     Key("refine", "tolerance", "a number, 0 or above", USUAL["tolerance"],
         "Adaptive: stop when the certified bound of ‖∇(u − u_h)‖ is below it, with [time] in each "
-        "step.",
+        "step. All stop where nothing but rounding is left of it.",
         "tolerance = 0.05", not_negative, ends=True),
     Key("refine", "max_dofs", "a whole number above 0", USUAL["max_dofs"],
         "Adaptive: stop before a mesh with more degrees of freedom.", "max_dofs = 200000", whole,

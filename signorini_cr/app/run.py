@@ -251,6 +251,11 @@ def tell_of_tolerance(case: ProblemFile, bound: float | None, screen: Screen) ->
         )
 
 
+def tell_of_rounding(screen: Screen) -> None:
+    """Say what ended a run that no tolerance was to end."""
+    screen.text("what is left of the bound is rounding: no finer mesh would make it smaller")
+
+
 def above_tolerance(case: ProblemFile, bound: float, level: int) -> NotConverged | None:
     """Say what stopped an adaptive run before the bound that was asked for was reached.
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..adaptive import Shares
 from ..errors import InputError, NotConverged, naming
 from ..mesh.domain import Domain
 from ..output import report as output
@@ -24,6 +25,7 @@ from .run import (
     out_of_reach,
     step_of_solver,
     stopped,
+    tell_of_rounding,
     tell_of_tolerance,
 )
 from .screen import Screen, wrapped
@@ -115,7 +117,7 @@ def _solve_levels(run: Run) -> None:
         failure = failure or above_tolerance(run.case, kept[-1]["bound_h1"], kept[-1]["level"])
     if finest is not None:
         names = run.write(run.report(kept, failure is None), finest)
-        _conclude(run, names)
+        _conclude(run, finest, names)
     if failure is not None:
         raise NotConverged(stopped(failure, kept, run.folder))
 
@@ -141,8 +143,8 @@ def _tell(record: output.Record, first: output.Record, screen: Screen) -> None:
     screen.line(output.table_row(record, first))
 
 
-def _conclude(run: Run, names: str) -> None:
-    """Say what the table above means, and what has come out."""
+def _conclude(run: Run, finest: Solution, names: str) -> None:
+    """Say what the table above means, and what has come out; collective."""
     screen, records, units = run.screen, run.kept, run.case.units
     screen.line("")
     screen.text(tables.legend(records[0], units))
@@ -150,5 +152,8 @@ def _conclude(run: Run, names: str) -> None:
     screen.text(tables.facts(records[-1], units))
     screen.items(*tables.certified(records[-1], units))
     tell_of_tolerance(run.case, records[-1]["bound_h1"], screen)
+    endless = run.case.mode == "adaptive" and run.case.adaptive["tolerance"] == 0.0
+    if endless and Shares.of(finest).rounded(run.comm):
+        tell_of_rounding(screen)
     screen.text(tables.times(records))
     run.tell_the_end(names)

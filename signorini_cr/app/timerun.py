@@ -21,6 +21,7 @@ from .run import (
     above_tolerance,
     out_of_reach,
     step_of_solver,
+    tell_of_rounding,
     tell_of_tolerance,
     what_is_kept,
 )
@@ -85,6 +86,8 @@ class Search:
                 known = found.meshes
                 if level >= len(self.tried):  # else it is the one that it goes on from
                     self._add(series.search_record(found.last, found.bound), found.last)
+            if found.rounded and case.adaptive["tolerance"] == 0.0:
+                tell_of_rounding(screen)
         except NotConverged as error:
             where = level if error.level is None else error.level
             failure = NotConverged(

@@ -139,5 +139,5 @@ class Physics(Protocol):
 
         Returns:
             A `Certificate`, or what has its `bound_h1`, `indicators` and `reason`, which is what
-            adaptive refinement goes by.
+            adaptive refinement goes by. Of a `Certificate` it knows how much is rounding, too.
         """

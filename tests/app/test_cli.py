@@ -1144,6 +1144,28 @@ def test_an_adaptive_run_that_is_good_enough_says_so(write) -> None:
         assert "and restart.npz for --resume" in said and "−Δu + u = " in said
 
 
+def test_an_adaptive_run_that_rounding_ends_says_so(write) -> None:
+    """A constant needs one mesh: without a tolerance that is the end, else it is out of reach."""
+    text = with_('dirichlet", "dirichlet", "dirichlet', 'neumann", "dirichlet", "neumann')
+    text = text.replace('f = "1 + r"', "dirichlet = 1").replace("uniform", "adaptive")
+    path = write(text.replace("levels = 2", "levels = 9"))
+    status, said, err = run("solve", path, "--out", "out")
+    assert (status, err) == (0, "")
+    if COMM.rank == 0:
+        assert "what is left of the bound is rounding: no finer mesh" in " ".join(said.split())
+        assert len(json.loads(Path("out/report.json").read_text())["levels"]) == 1
+    path = write(
+        text.replace("levels = 2", "levels = 9").replace("tolerance = 0", "tolerance = 1e-15")
+    )
+    status, said, err = run("solve", path, "--out", "other")
+    assert status == cli.NOT_CONVERGED
+    if COMM.rank == 0:
+        message = " ".join(err.split())
+        assert "stopped on level 0: the certified bound is" in message
+        assert "above the tolerance of 1e-15, and what is left of it is rounding" in message
+        assert "what is left of the bound" not in said
+
+
 def test_an_adaptive_run_without_a_tolerance_ends_at_its_limit(write) -> None:
     assert run("solve", write(with_("uniform", "adaptive")), "--out", "out", "-q") == (0, "", "")
 
