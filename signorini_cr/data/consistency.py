@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -158,27 +159,42 @@ class _Solution:
         u, pressure = ((sign * each[0], each[1]) for each in (u, pressure))
         gap = _difference(u, alpha)
         height, force = self._size(u, alpha), self._size(pressure)
+        off, other = ("below", "above") if sign > 0 else ("above", "below")
         said = self._first(
             gap[0] < -SAME * height - gap[1],
             x,
-            f"u is {{:.6g}}, {'below' if sign > 0 else 'above'} the obstacle, {{:.6g}}",
+            lambda u, bound: f"u is {u:.6g}, {off} the obstacle, {bound:.6g}",
             (sign * u[0], u[1]),
             (sign * alpha[0], alpha[1]),
         )
         low = SAME * force + pressure[1]
         pulls = (pressure[0] < -low) & (len(contact.bounds) == 1)
-        words = "the pressure on the obstacle is {:.6g}, below 0"
-        said = said or self._first(pulls, x, words, pressure)
+        said = said or self._first(
+            pulls,
+            x,
+            lambda force: f"the pressure on the obstacle is {force:.6g}, below 0",
+            pressure,
+        )
         apart = (gap[0] > SAME * height + gap[1]) & (pressure[0] > low)
-        words = "the pressure on the obstacle is {:.6g} though u is "
-        words += ("above" if sign > 0 else "below") + " it by {:.6g}"
-        return said or self._first(apart, x, words, pressure, gap)
+        return said or self._first(
+            apart,
+            x,
+            lambda force, gap: f"the pressure on the obstacle is {force:.6g} though u is {other} it"
+            f" by {gap:.6g}",
+            pressure,
+            gap,
+        )
 
     def _same(self, key: str, x: FloatArray, given: Values, wanted: Values) -> str | None:
         gap = _difference(given, wanted)
         wrong = np.abs(gap[0]) > SAME * self._size(given, wanted) + gap[1]
-        words = f"{key} is {{:.6g}}, but it asks for {{:.6g}}"
-        return self._first(wrong, x, words, given, wanted)
+        return self._first(
+            wrong,
+            x,
+            lambda value, asked: f"{key} is {value:.6g}, but it asks for {asked:.6g}",
+            given,
+            wanted,
+        )
 
     def _facets(self, part: int) -> tuple[FloatArray, Int32Array, FloatArray]:
         """Find midpoints of facets, their cells and outward normals."""
@@ -212,11 +228,17 @@ class _Solution:
         largest = float(values[np.isfinite(values)].max(initial=0.0))
         return float(self.mesh.comm.allreduce(largest, op=MPI.MAX))
 
-    def _first(self, wrong: BoolArray, x: FloatArray, words: str, *found: Values) -> str | None:
+    def _first(
+        self, wrong: BoolArray, x: FloatArray, words: Callable[..., str], *found: Values
+    ) -> str | None:
+        """Say what is wrong at the first point, in words made of what was found there; collective.
+
+        They are made by a function, and of no template: a part's name may have braces.
+        """
         complaints: list[Complaint] = []
         for i in np.flatnonzero(wrong):
             where = place(x[i], self.mesh)
-            said = words.format(*(each[0][i] for each in found))
+            said = words(*(each[0][i] for each in found))
             complaints.append((where, f"at {shown(where)} {said}"))
         return first(self.mesh.comm, complaints)
 

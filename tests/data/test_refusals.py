@@ -18,7 +18,7 @@ from signorini_cr.app.expressions import parse
 from signorini_cr.data.admissible import check_data
 from signorini_cr.data.consistency import doubts
 from signorini_cr.errors import InputError, on_root
-from signorini_cr.fem.conditions import Robin
+from signorini_cr.fem.conditions import Contact, Dirichlet, Robin
 from signorini_cr.fem.pointwise import evaluate
 from signorini_cr.fem.problem import Forms, Material, Problem
 from signorini_cr.levels import solve, solve_levels
@@ -505,6 +505,17 @@ def test_exact_solutions_that_are_none(data, words: str):
     domain = Polygon(RECTANGLE, ("contact", "neumann", "dirichlet", "dirichlet")).mesh(0.5)
     (said,) = doubts(Forms(Problem(**data), domain.mesh), domain)
     assert words in said and "it is not the solution" in said
+
+
+@pytest.mark.parametrize("name", ["to{p", "a{}b", "{0}", "}{1!r}", "{{"])
+def test_braces_in_the_name_of_a_part_that_contradicts_an_exact_solution(name):
+    mesh = dolfinx.mesh.create_unit_square(COMM, 2, 2)
+    tags = tagged(mesh, lambda x, y: np.where(y < 1e-9, 1, 2))
+    domain = Domain.from_tags(mesh, tags, contact=1, **{name: 2})
+    conditions = {"contact": Contact(-10.0), name: Dirichlet(1.0)}
+    problem = Problem(f=0.0, exact=lambda x: 2.0 + 0.0 * x[0], conditions=conditions)
+    (said,) = doubts(Forms(problem, mesh, parts=domain.parts), domain)
+    assert name in said and said.partition(" is ")[2].startswith("1, but it asks for 2")
 
 
 @pytest.mark.parametrize(
