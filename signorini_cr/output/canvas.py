@@ -18,7 +18,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from .files import Where, disk_errors
-from .units import PLAIN, Units
+from .units import PLAIN, Units, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -235,7 +235,7 @@ def headline(title: str, what: str) -> str:
     """Return the problem's name, dollar signs and all, and what is seen of it."""
     if not title:
         return what
-    name = textwrap.fill(title, LONGEST).replace("$", r"\$")
+    name = literal(textwrap.fill(title, LONGEST))
     last = len(name) - name.rfind("\n") - 1
     return f"{name}:{' ' if last + len(what) <= LONGEST else chr(10)}{what}"
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ..arrays import FloatArray
 from ..errors import InputError
 from .canvas import BLUE, RED, draw_lines, fit, label_ends, legend, new_figure, short_numbers
-from .units import PLAIN, Units
+from .units import PLAIN, Units, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,7 +55,7 @@ def contact_page(
         if len(parts) > 1:
             name = f"part {rows['part'][0]}"
             if "name" in rows:
-                name = ", ".join(dict.fromkeys(map(str, rows["name"])))
+                name = literal(", ".join(dict.fromkeys(map(str, rows["name"]))))
             else:
                 column[0].set_title(name, fontsize=12)
             course = f"{name} {course}"
@@ -105,7 +105,9 @@ def _name_parts(axes: Axes, rows: Table) -> None:
         if length.sum() > LEAST_ROOM * len(name) * whole:
             middle = np.average(rows["arc_length"][here], weights=length)
             above = axes.get_xaxis_transform(), "offset points"
-            axes.annotate(name, (middle, 1.0), (0.0, 3.0), *above, ha="center", fontsize=12)
+            axes.annotate(
+                literal(name), (middle, 1.0), (0.0, 3.0), *above, ha="center", fontsize=12
+            )
 
 
 def _name_curves(axes: Axes, entries: dict[str, Any]) -> None:

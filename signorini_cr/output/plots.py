@@ -52,7 +52,7 @@ from .contactpage import contact_page
 from .files import Where
 from .raster import averaged, raster
 from .touching import contact_lines, in_words
-from .units import PLAIN
+from .units import PLAIN, literal
 from .units import Units as Units
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def _styles(domain: Domain, problem: Problem | None) -> dict[int, dict[str, Any]
     colors = itertools.cycle(OTHERS)
     for (name, part), color in zip(own, colors, strict=False):
         label = f"{name}: {kinds[name]}" if name in kinds else name
-        styles[part] = {"color": color, "linewidth": 3.5, "label": label.replace("$", r"\$")}
+        styles[part] = {"color": color, "linewidth": 3.5, "label": literal(label)}
     return styles
 
 
@@ -144,7 +144,7 @@ def plot_mesh(
         figure, axes, _ = plane_axes(points, ax=ax, units=units)
         for (name, cells_of), tint in zip(triangles.items(), itertools.cycle(TINTS)):
             if len(cells_of):
-                draw_cells(axes, cells_of, color=tint, label=name.replace("$", r"\$"))
+                draw_cells(axes, cells_of, color=tint, label=literal(name))
         draw_lines(axes, edges, color=GREY, linewidth=np.clip(30 / np.sqrt(cells), 0.15, 0.8))
         for part, style in _styles(domain, problem).items():
             if len(parts[part]):
@@ -315,7 +315,7 @@ def plot_convergence(
         style = dict(SERIES[key])
         rate = used[-1][key.replace("error", "rate")] if uniform and "error" in key else None
         if unit := measured.get(key, units.u):
-            style["label"] += " in " + unit.replace("$", r"\$")
+            style["label"] += " in " + literal(unit)
         if rate is not None:
             style["label"] += f",\nlast rate {rate:.2f}"
         axes.loglog(x, values, markersize=7, linewidth=2, **style)

@@ -28,7 +28,7 @@ from .canvas import (
 from .files import Where
 from .raster import averaged, raster
 from .touching import contact_lines, in_words
-from .units import PLAIN, Units
+from .units import PLAIN, Units, literal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,7 +136,7 @@ def plot_strip(
     figure = new_figure(9.3, rows * (max((width - 1.0) / wide, 0.9) + above) + 1.2)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     marks: dict[str, Line2D] = {}
-    time = units.after("time").replace("$", r"\$")
+    time = literal(units.after("time"))
     low, high = (pick(each.limits[i] for each in moments) for i, pick in enumerate((min, max)))
     for number, (each, axes) in enumerate(zip(moments, panels.flat, strict=False)):
         plane_axes(box, ax=axes, units=units)

@@ -10,6 +10,15 @@ GLUE = "\u00a0"
 """The space between a number and its unit."""
 
 
+def literal(words: str) -> str:
+    r"""Write a user's words for a picture so that they stay what they are.
+
+    Matplotlib sets what is between dollar signs as a formula, and leaves out of legends what begins
+    with an underscore, which a space of no width before it prevents.
+    """
+    return ("\u200b" if words.startswith("_") else "") + words.replace("$", r"\$")
+
+
 @dataclass(frozen=True)
 class Units:
     """Names and units; what is left out is not told. Nothing is converted.
@@ -52,7 +61,7 @@ class Units:
 
     def within(self, key: str) -> str:
         """Return the unit as it follows a name in a picture, " in m" for one."""
-        return self.told(key).replace("$", r"\$")
+        return literal(self.told(key))
 
     def told(self, key: str) -> str:
         """Return the unit as it follows a name in a text, " in m" for one."""
@@ -60,7 +69,7 @@ class Units:
 
     def name(self, key: str, usual: str = "") -> str:
         """Return the name as it precedes a symbol in a picture, with a space behind it."""
-        name = self.names.get(key, usual).replace("$", r"\$")
+        name = literal(self.names.get(key, usual))
         return f"{name} " if name else ""
 
 

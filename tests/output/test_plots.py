@@ -91,6 +91,27 @@ def test_the_mesh_tells_what_holds_on_parts_of_other_names():
         assert told == [name.replace("$", r"\$") for name in sides]
 
 
+def test_names_of_parts_are_no_formulas_on_any_picture(shared_tmp_path):
+    """Two pieces of Γ1, so that they are named below as well as above; all are in the legend."""
+    sides = ["w$x^^$", "$a_{$", "_b$", r"\$c\$d$"]
+    domain = Polygon(SQUARE.vertices, sides, names=sides).mesh(0.5, WORLD)
+    held = dict.fromkeys(sides[::2], Contact(-1.0)) | dict.fromkeys(sides[1::2], Dirichlet(0.0))
+    problem = Problem(f=-1.0, conditions=held)
+    units = plots.Units(x="$_", u="_$u", names={"u": "_$", "x": "$x_$"})
+    paths = [shared_tmp_path / name for name in ("mesh.png", "contact.png", "solution.png")]
+    mesh = plots.plot_mesh(domain, paths[0], "_$", units=units, problem=problem)
+    solution = solve(problem, domain)
+    contact = plots.plot_contact(solution, paths[1], "$^$", units=units)
+    plots.plot_solution(solution, paths[2], "$_$", units=units)
+    if WORLD.rank == 0:
+        told = [text.get_text() for text in mesh.legends[0].get_texts()]
+        assert len(told) == 4 and told[0] == r"w\$x^^\$: contact"
+        above = [text.get_text() for axes in contact.axes for text in axes.texts]
+        below = contact.legends[0].get_title().get_text()
+        for name in (r"w\$x^^\$", "\u200b_b\\$"):
+            assert name in above and f"{name} from" in below
+
+
 def test_the_mesh_tells_what_holds_on_parts_of_usual_names():
     """By their conditions, not by their names."""
     sides = ["contact", "neumann", "dirichlet", "neumann"]
