@@ -322,8 +322,8 @@ def plot_convergence(
         styles.append(style)
         last = int(np.argmax(x))
         ends.append((x[last], values[last]))
-        falls[key] = _power(x, values, rate, uniform)
-        if key == "bound_h1" and "error_h1" in keys:
+        falls[key] = _course(x, values, rate, uniform)
+        if (key == "bound_h1" and "error_h1" in keys) or not np.ptp(x):
             continue
         # A slope below the curve, touching it but for the factor
         order = (2 if key == "error_l2" else 1) * (1.0 if uniform else -0.5)
@@ -352,20 +352,28 @@ def plot_convergence(
     return axes.figure
 
 
-def _power(x: FloatArray, values: FloatArray, rate: float | None, uniform: bool) -> str:
-    """Say with which power of h or N the last two values fall."""
-    if rate is None:
-        rate = float(np.log(values[-1] / values[-2]) / np.log(x[-1] / x[-2]))
-    return f"${'h' if uniform else 'N'}^{{{rate:.2f}}}$"
+def _course(x: FloatArray, values: FloatArray, rate: float | None, uniform: bool) -> str:
+    """Say with which power of h or N the last two values fall, if they do and there is one."""
+    before, last = (float(value) for value in values[-2:])
+    if rate is None and x[-1] != x[-2]:
+        rate = float(np.log(last / before) / np.log(x[-1] / x[-2]))
+    fall = 0.0 if rate is None else round(rate if uniform else -rate, 2)
+    if 0.0 < fall < np.inf:
+        return f"falls like ${f'h^{{{fall:.2f}}}' if uniform else f'N^{{{-fall:.2f}}}'}$"
+    if last == before:
+        return "stays as it is"
+    return "falls" if last < before else "rises"
 
 
 def _message(falls: Mapping[str, str]) -> str:
     """Say what a picture of convergence shows."""
-    if "error_h1" in falls:
-        follows = falls.get("bound_h1") is not None
-        return f"the error falls like {falls['error_h1']}{', the bound with it' * follows}"
-    name, power = next(iter(falls.items()))
-    return f"the {'bound' if name == 'bound_h1' else 'error'} falls like {power}"
+    key, course = next(iter(falls.items()))
+    said = f"the {'bound' if key == 'bound_h1' else 'error'} {course}"
+    of_bound = falls.get("bound_h1") if key == "error_h1" else None
+    if of_bound is None:
+        return said
+    same = of_bound.split()[0] == course.split()[0]
+    return f"{said}, the bound {'with it' if same else of_bound}"
 
 
 def drawn(comm: MPI.Comm, draw: Callable[[], Figure | SubFigure]) -> Figure | SubFigure | None:

@@ -197,6 +197,39 @@ def test_the_title_of_convergence_says_how_the_error_falls(keys, sizes, says):
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize(
+    ("dofs", "rows", "says"),
+    [
+        ([25, 25, 25], {"bound_h1": [1.0, 1.0, 1.0]}, "the bound stays as it is"),
+        ([25, 25, 25], {"bound_h1": [1.0, 0.5, 0.25]}, "the bound falls"),
+        ([25, 50, 100], {"bound_h1": [1.0, 0.5, 1.0]}, "the bound rises"),
+        ([25, 50, 100], {"bound_h1": [1.0, 0.5, 0.49999]}, "the bound falls"),
+        ([25, 50, 100], {"error_l2": [1.0, 2.0, 2.0]}, "the error stays as it is"),
+        (
+            [25, 50, 100],
+            {"error_h1": [1.0, 1.0, 0.5], "bound_h1": [2.0, 1.0, 2.0]},
+            "the error falls like $N^{-1.00}$, the bound rises",
+        ),
+        (
+            [25, 50, 100],
+            {"error_h1": [1.0, 1.0, 2.0], "bound_h1": [2.0, 1.0, 3.0]},
+            "the error rises, the bound with it",
+        ),
+    ],
+)
+def test_the_title_of_convergence_has_a_power_where_there_is_one(dofs, rows, says, tmp_path):
+    """None of equal sizes, nor where nothing falls."""
+    records = [
+        {"h": 0.5, "dofs": n} | {key: rows.get(key, [None] * 3)[k] for key in plots.SERIES}
+        for k, n in enumerate(dofs)
+    ]
+    figure = plots.plot_convergence(records, tmp_path / "convergence.png")
+    assert figure.axes[0].get_title() == says
+    drawn = [text.get_text() for text in figure.axes[0].texts]
+    assert any("N^" in text for text in drawn) == (len(set(dofs)) > 1)
+
+
+@pytest.mark.serial
 def test_the_colours_are_told_apart_in_grey():
     def luminance(colour):
         c = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
