@@ -29,7 +29,11 @@ PRINTED = {
         "grow with the mesh is what multigrid is for.",
     ),
     "active": ("facets in contact", "Of the facets of Γ1, those in contact."),
-    "energy": ("J(u_h)", "J(u_h) = ½∫κ∇u_h·∇u_h − ∫f u_h − ∫g u_h, cell by cell."),
+    "energy": (
+        "J(u_h)",
+        "J(u_h) = ½∫κ∇u_h·∇u_h − ∫f u_h − ∫g u_h, cell by cell; a reaction c adds ½∫c u_h², and "
+        "b (u − u_ext) on the boundary ½∫b u_h² − ∫b u_ext u_h.",
+    ),
     "contact": ("their length", "Total length of the facets in contact."),
     "H1 error": (
         "‖∇_h(u − u_h)‖",

@@ -10,17 +10,21 @@ from inspect import signature
 from pathlib import Path
 
 import pytest
+import ufl
+from dolfinx.fem import assemble_scalar, form
 from helpers import HELD_ABOVE, ROOT
 from mpi4py import MPI
 
 import signorini_cr
-from signorini_cr import Contact, options, solve
+from signorini_cr import options, solve
 from signorini_cr.adaptive import adapt_to_run
 from signorini_cr.app.cli import main
 from signorini_cr.app.commandline import UsageError, _parser, read_arguments
 from signorini_cr.app.problemfile import load
 from signorini_cr.app.reference import ABOUT, ADAPTIVE, KEYS, MATERIAL, PART, QUANTITY, TYPES
+from signorini_cr.fem.conditions import Contact, Robin
 from signorini_cr.fem.problem import Material, Problem
+from signorini_cr.output.meanings import PRINTED
 from signorini_cr.output.sheets import SHEETS
 from signorini_cr.output.units import Units
 
@@ -147,6 +151,30 @@ def test_every_figure_is_in_the_reference(known, shared_tmp_path, capsys) -> Non
 
 
 @pytest.mark.serial
+def test_the_meaning_of_the_energy_has_all_its_terms() -> None:
+    """Each of them is more than rounding here, and together they are the figure."""
+    domain = HELD_ABOVE.mesh(0.5)
+    lossy = {"coefficient": 3.0, "external": 0.5}
+    sides = dict.fromkeys(("neumann", "dirichlet"), Robin(0.7, **lossy))
+    held = {"contact": Contact(-9.0, g=0.7, **lossy), **sides}
+    problem = Problem(f=1.1, reaction=2.0, coefficient=1.5, conditions=held)
+    solution = solve(problem, domain)
+    u = solution.u
+    terms = {
+        "½∫κ∇u_h·∇u_h": 0.75 * ufl.inner(ufl.grad(u), ufl.grad(u)) * ufl.dx,
+        "− ∫f u_h": -1.1 * u * ufl.dx,
+        "− ∫g u_h": -0.7 * u * ufl.ds,
+        "½∫c u_h²": u**2 * ufl.dx,
+        "½∫b u_h²": 1.5 * u**2 * ufl.ds,
+        "− ∫b u_ext u_h": -1.5 * u * ufl.ds,
+    }
+    values = [domain.mesh.comm.allreduce(assemble_scalar(form(each))) for each in terms.values()]
+    assert min(map(abs, values)) > 1e-5
+    assert sum(values) == pytest.approx(solution.energy, rel=1e-10)
+    for words in terms:
+        assert words in PRINTED["energy"][1] and words in (DOCS / "tutorial.md").read_text()
+
+
 def test_every_public_name_is_in_the_reference() -> None:
     text = (DOCS / "python.md").read_text(encoding="utf-8")
     told = set(re.findall(r"(?::: signorini_cr|`scr)\.(\w+)(?:\n|`)", text))
