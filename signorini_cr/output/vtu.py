@@ -109,7 +109,9 @@ def write_solution(solution: Solution, path: Where) -> None:
     }
     if certificate.indicators is not None:
         on_facets = np.zeros(len(contact.facets))
-        on_cells["indicator"] = np.append(np.sqrt(certificate.indicators), on_facets)
+        # where v differs from u_h by a constant, rounding decides on which side of 0 shares are
+        shares = np.sqrt(np.maximum(certificate.indicators, 0.0))
+        on_cells["indicator"] = np.append(shares, on_facets)
     shapes = [mesh.geometry.x[nodes] for nodes in at_corners(cell_nodes(mesh)[:, :corners])]
     _write(mesh.comm, Path(path), shapes, on_points, on_cells)
 

@@ -189,6 +189,20 @@ def test_readers_find_the_fields_of_the_solution(read, solution, shared_tmp_path
     assert force == pytest.approx(contact.force, rel=1e-12)
 
 
+def test_shares_below_0_by_rounding_are_0(shared_tmp_path):
+    """So they are where u_h is a constant beside v, on a coarse mesh."""
+    found = on_a_slope(2)
+    indicators = found.certificate.indicators
+    indicators[::2] = -1e-33
+    write_solution(found, shared_tmp_path / "solution.vtu")
+    shares = WORLD.bcast(
+        by_hand(shared_tmp_path / "solution.vtu").on_cells[TRIANGLE, "indicator"]
+        if WORLD.rank == 0
+        else None
+    )
+    assert np.array_equal(shares == 0.0, everyone(indicators) < 0.0)
+
+
 def test_one_rank_writes_what_all_ranks_write(shared_tmp_path):
     write_solution(on_a_slope(2), str(shared_tmp_path / "all.vtu"))
     alone = shared_tmp_path / f"alone-{WORLD.rank}.vtu"
