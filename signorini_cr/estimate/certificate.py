@@ -877,7 +877,7 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
     change += np.bincount(on_contact, more, minlength=len(which))
     steep = steep + np.bincount(on_contact, np.sqrt(loss[there]) * edge, minlength=len(which))
     change += 0.5 * steep**2
-    noise = 1e-14 * sums.indicators[which]
+    noise = 1e-14 * np.abs(sums.indicators[which])  # rounding may put shares below 0
     if sums.zeroth is not None:
         noise = noise + 2.0 * sums.zeroth[which]
     far, near = (

@@ -782,6 +782,18 @@ def test_three_dimensions():
         assert np.isclose(norm, certificate.parts[name], rtol=1e-9)
 
 
+@pytest.mark.parametrize("kappa", [0.3, 1.0, 3.7])
+@pytest.mark.parametrize("value", [1 / 3, 0.1 + 0.2, 7 / 9])
+def test_a_constant_has_a_bound_of_rounding(value, kappa):
+    """Shares of the bound are 0, or what rounding leaves of that on either side."""
+    polygon = Polygon(SQUARE.vertices, ("contact", "neumann", "dirichlet", "neumann"))
+    solution = solve(Problem(dirichlet=value, coefficient=kappa), polygon.mesh(1.0))
+    solution.u.x.array[:] = value
+    certificate = certify(solution)
+    assert certificate.reason is None and certificate.bound_h1 < 1e-12
+    assert certificate.energy == pytest.approx((0.0, 0.0), abs=1e-24)
+
+
 def test_refusals():
     domain = exact.S1.structured(8)
     cases = {
