@@ -552,6 +552,7 @@ def some_cells(seed):
     )
     kappa.mean = (kappa.low + kappa.high) / 2
     kappa.least, kappa.most = kappa.low, kappa.high
+    kappa.core, kappa.inner = (kappa.low, kappa.high), kappa.low
     rows = dict(
         zip(
             ("indicators", "steepness", "middle", "across"),
