@@ -790,12 +790,11 @@ def _cut_facets(
     # C with ‖e‖²_F at most C times the square of e's energy, which b has a share in
     of_gradients = trace_constant(cells, edge.side) ** 2 / kappa
     of_loss = np.divide(1.0, edge.loss, out=np.full(n, np.inf), where=edge.loss > 0.0)
-    importance = np.stack(
-        [
-            2.0 * edge.measure / np.sqrt(kappa) / goal,
-            4.0 * edge.measure * np.minimum(of_gradients, of_loss) / goal**2 * norms,
-        ]
-    )
+    importance = np.zeros((2, n))
+    with np.errstate(divide="ignore", over="ignore"):  # without a goal none is too small to be cut
+        importance[0] = 2.0 * edge.measure / np.sqrt(kappa) / goal
+        if norms:
+            importance[1] = 4.0 * edge.measure * np.minimum(of_gradients, of_loss) / goal**2
     room = 8 * cells.comm.allreduce(len(pieces.share)) + 1000
     return refine(
         pieces,
