@@ -16,6 +16,7 @@ from functools import cached_property
 from numbers import Real
 from os import PathLike
 from pathlib import Path
+from types import NoneType
 from typing import Any, NamedTuple
 
 import basix.ufl
@@ -41,7 +42,7 @@ from ..garbage import watch
 from ..rounding import counted
 from . import gmshmesh
 from .exchange import Exchange
-from .materials import Materials
+from .materials import Materials, tag_values
 from .materials import numbered as numbered_materials
 from .partition import by_position
 from .polygon import check_labels, check_loops, circle, coordinates, cut
@@ -265,6 +266,8 @@ class Domain:
         insist_on_kind("mesh", mesh, Mesh, "a dolfinx Mesh")
         insist_on_kind("facet_tags", facet_tags, MeshTags, "dolfinx MeshTags")
         insist_on_kind("parts", parts, Sequence, "a list of values")
+        insist_on_kind("cell_tags", cell_tags, (MeshTags, NoneType), "dolfinx MeshTags")
+        insist_on_kind("materials", materials, (Mapping, NoneType), "a dictionary by names")
         others = {**{str(value): value for value in parts}, **others}
         given = {"contact": contact, "dirichlet": dirichlet, "neumann": neumann, **others}
         inner = numbered(others)
@@ -307,13 +310,7 @@ def _wanted(
     wanted = {}
     for name, own in given.items():
         usual = [parts[name]] if own is None and name in needed else []
-        numbers = np.atleast_1d(np.asarray(usual if own is None else own))
-        known = np.iinfo(np.int32)
-        if numbers.size and not (
-            numbers.dtype.kind in "iu" and known.min <= numbers.min() <= numbers.max() <= known.max
-        ):
-            raise InputError(f"{name} is {own!r}: facet values are whole numbers of 32 bits")
-        wanted[name] = np.unique(numbers.astype(np.int32))
+        wanted[name] = tag_values(name, usual if own is None else own, "facet")
     for a, b in itertools.combinations(wanted, 2):
         if len(both := np.intersect1d(wanted[a], wanted[b])):
             raise InputError(

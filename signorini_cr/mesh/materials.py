@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx.mesh import Mesh, MeshTags
 
 from ..arrays import BoolArray, Int32Array
-from ..errors import InputError
+from ..errors import InputError, together
 
 NONE = 0
 """The number of cells that consist of nothing that has a name."""
@@ -63,30 +63,68 @@ class Materials:
         """
         if not wanted:
             return cls()
-        tdim = mesh.topology.dim
-        if tags is None or tags.dim != tdim:
-            found = "none" if tags is None else f"of dimension {tags.dim}"
-            raise InputError(f"materials need tags on cells, of dimension {tdim}; found {found}")
-        cells = mesh.topology.index_map(tdim)
-        values = np.zeros(cells.size_local + cells.num_ghosts, dtype=np.int32)
-        numbers, owner = numbered(list(wanted)), dict[int, str]()
+        of_cells = together(mesh.comm, _of_cells, mesh, tags, wanted)
+        numbers = numbered(list(wanted))
+        here = of_cells[: mesh.topology.index_map(mesh.topology.dim).size_local]
         for name, given in wanted.items():
-            own = [given] if isinstance(given, int) else list(given)
-            for value in own:
-                if value in owner:
-                    raise InputError(
-                        f"the cell value {value} stands for {owner[value]} and for {name}: a value"
-                        " can stand for one material only"
-                    )
-                owner[value] = name
-            chosen = tags.indices[np.isin(tags.values, own)]
-            values[chosen] = numbers[name]
-            count = np.count_nonzero(chosen < cells.size_local)
-            if not mesh.comm.allreduce(count):
-                there = sorted(set().union(*mesh.comm.allgather(set(tags.values.tolist()))))
+            if not mesh.comm.allreduce(np.count_nonzero(here == numbers[name])):
+                found = [] if tags is None else tags.values.tolist()
+                there = sorted(set().union(*mesh.comm.allgather(set(found))))
                 words = ", ".join(map(str, there)) or "none"
+                own = ", ".join(map(str, tag_values(name, given, "cell")))
                 raise InputError(
-                    f"no cell is tagged {name} (value {', '.join(map(str, own))}): the values there"
-                    f" are {words}"
+                    f"no cell is tagged {name} (value {own}): the values there are {words}"
                 )
-        return cls(numbers, values)
+        return cls(numbers, of_cells)
+
+
+def _of_cells(
+    mesh: Mesh, tags: MeshTags | None, wanted: Mapping[str, int | Sequence[int]]
+) -> Int32Array:
+    """Find the number of the material of each local cell, shape (cells,)."""
+    tdim = mesh.topology.dim
+    if tags is None or tags.dim != tdim:
+        found = "none" if tags is None else f"of dimension {tags.dim}"
+        raise InputError(f"materials need tags on cells, of dimension {tdim}; found {found}")
+    cells = mesh.topology.index_map(tdim)
+    values = np.zeros(cells.size_local + cells.num_ghosts, dtype=np.int32)
+    if len(strange := np.setdiff1d(tags.indices, np.arange(len(values)))):
+        raise InputError(
+            f"cell_tags has a value for cell {strange[-1]} of rank {mesh.comm.rank}, which has"
+            f" {len(values)} cells: tags of this mesh are needed"
+        )
+    owner = dict[int, str]()
+    for name, number in numbered(list(wanted)).items():
+        own = tag_values(name, wanted[name], "cell")
+        for value in map(int, own):
+            if value in owner:
+                raise InputError(
+                    f"the cell value {value} stands for {owner[value]} and for {name}: a value"
+                    " can stand for one material only"
+                )
+            owner[value] = name
+        values[tags.indices[np.isin(tags.values, own)]] = number
+    return values
+
+
+def tag_values(name: str, given: object, of: str) -> Int32Array:
+    """Take the value or values in a user's own tags that stand for something, each once, ascending.
+
+    Args:
+        name: What they stand for.
+        given: What the user says.
+        of: What the tags are on, "facet" or "cell".
+
+    Raises:
+        InputError: They are no whole numbers, or too large.
+    """
+    try:
+        numbers = np.atleast_1d(np.asarray(given))
+    except ValueError:  # lists of unlike lengths in a list
+        numbers = np.array([given], dtype=object)
+    known = np.iinfo(np.int32)
+    if numbers.size and not (
+        numbers.dtype.kind in "iu" and known.min <= numbers.min() <= numbers.max() <= known.max
+    ):
+        raise InputError(f"{name} is {given!r}: {of} values are whole numbers of 32 bits")
+    return np.unique(numbers.astype(np.int32))

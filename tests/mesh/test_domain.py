@@ -711,6 +711,44 @@ def test_own_facet_values_that_are_none(wrong) -> None:
     assert said == f"contact is {wrong!r}: facet values are whole numbers of 32 bits"
 
 
+def with_cell_tags(materials: object, *, beyond: int = 0, **more: object) -> Domain:
+    """Two layers, with the values 5 and 9 in the tags of cells; the last rank has more, perhaps."""
+    mesh, tags = tagged_rectangle(dolfinx.mesh.GhostMode.none)
+    size = mesh.topology.index_map(2).size_local
+    of_cells = np.where(dolfinx.mesh.compute_midpoints(mesh, 2, np.arange(size))[:, 1] > 0.5, 9, 5)
+    more_of_it = beyond if COMM.rank == COMM.size - 1 else 0
+    cells = np.arange(size + more_of_it, dtype=np.int32)
+    values = np.append(of_cells, [9] * more_of_it).astype(np.int32)
+    given = {"cell_tags": dolfinx.mesh.meshtags(mesh, 2, cells, values)} | more
+    return Domain.from_tags(mesh, tags, contact=7, dirichlet=5, materials=materials, **given)
+
+
+@pytest.mark.parametrize("value", [9, np.int32(9), np.int64(9), [9], (9,), np.array([9]), [[9]]])
+def test_own_cell_values_are_taken_as_those_of_facets(value) -> None:
+    domain = with_cell_tags({"rock": value})
+    size = domain.mesh.topology.index_map(2).size_local
+    y = dolfinx.mesh.compute_midpoints(domain.mesh, 2, np.arange(size))[:, 1]
+    assert np.array_equal(domain.materials.where("rock")[:size], y > 0.5)
+
+
+@pytest.mark.parametrize("wrong", [9.0, "9", None, True, 2**40, [9, 2.5], [[9], [5, 9]]])
+def test_own_cell_values_that_are_none(wrong) -> None:
+    said = fails_alike(with_cell_tags, {"rock": wrong})
+    assert said == f"rock is {wrong!r}: cell values are whole numbers of 32 bits"
+
+
+def test_own_cell_tags_that_are_none() -> None:
+    assert "materials is of the type list" in fails_alike(with_cell_tags, ["rock"])
+    assert "cell_tags is of the type str" in fails_alike(
+        lambda: with_cell_tags({"rock": 9}, cell_tags="x")
+    )
+
+
+def test_own_cell_tags_of_another_mesh_on_one_rank() -> None:
+    said = fails_alike(lambda: with_cell_tags({"rock": 9}, beyond=3))
+    assert f"of rank {COMM.size - 1}, which has" in said and "tags of this mesh" in said
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_own_meshes_that_are_folded(dim: int) -> None:
     """A vertex is drawn out of the mesh: some of its cells come to lie over others."""
