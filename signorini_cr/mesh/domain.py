@@ -45,7 +45,7 @@ from .exchange import Exchange
 from .materials import Materials, tag_values
 from .materials import numbered as numbered_materials
 from .partition import by_position
-from .polygon import check_labels, check_loops, circle, coordinates, cut
+from .polygon import check_labels, check_loops, circle, coordinates, cut, diameter
 from .valid import folded, too_thin
 
 CONTACT, DIRICHLET, NEUMANN = 1, 2, 3
@@ -583,7 +583,7 @@ class Polygon:
     @property
     def diameter(self) -> float:
         """Largest distance between two points."""
-        return max(float(np.hypot(*(self.vertices - x).T).max()) for x in self.vertices)
+        return diameter(self.vertices)
 
     def mesh(self, size: float, comm: MPI.Comm = MPI.COMM_WORLD) -> Domain:
         """Triangulate with facets of about the length `size`; collective.

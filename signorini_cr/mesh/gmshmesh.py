@@ -31,6 +31,7 @@ _UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
 _FAR = 1e3  # in parts of the extent: a polygon that is moved to the origin for gmsh
 _GROWTH = 0.3  # of the size, per length, away from short facets
+_ROUNDING = 1e-14  # what distances to boxes may be too long by, in parts
 _OPTIONS = {
     "General.Terminal": 0,
     "General.AbortOnError": 2,  # raise instead of going on
@@ -292,7 +293,36 @@ def _sizes(x: FloatArray, edges: IndexArray, facets: FloatArray) -> FloatArray:
     """
     h = np.full(len(x), np.inf)
     np.minimum.at(h, edges, facets[:, None])
-    return np.array([np.min(h + _GROWTH * np.hypot(*(x - p).T)) for p in x])
+    return _grown(x, h)
+
+
+def _grown(x: FloatArray, h: FloatArray) -> FloatArray:
+    """Compute min_j h_j + `_GROWTH` |x_i − x_j| at points, shape (n,).
+
+    The points are in a box, which is halved again and again, along its longer side, with as many
+    of them on either side. A point goes on with the boxes that may have less than it has found.
+
+    Args:
+        x: The points, shape (n, 2).
+        h: Their own, shape (n,).
+    """
+    of_box = np.resize(np.arange(len(x)), (1, 2 ** (len(x) - 1).bit_length()))  # some of them twice
+    point, box, found = np.arange(len(x)), np.zeros(len(x), dtype=np.intp), h.copy()
+    while True:
+        least = np.take_along_axis(of_box, h[of_box].argmin(axis=1)[:, None], axis=1)[box, 0]
+        from_there = h[least] + _GROWTH * np.hypot(*(x[least] - x[point]).T)
+        np.minimum.at(found, point, from_there)
+        if of_box.shape[1] == 1:
+            return found
+        inside = x[of_box]
+        low, high = inside.min(axis=1), inside.max(axis=1)
+        away = np.maximum(np.maximum(low[box] - x[point], x[point] - high[box]), 0.0)
+        some = (h[least] + _GROWTH * np.hypot(*away.T)) * (1 - _ROUNDING) < found[point]
+        point, box = np.repeat(point[some], 2), np.repeat(2 * box[some], 2)
+        box[1::2] += 1
+        along = (high - low).argmax(axis=1)[:, None, None]
+        order = np.take_along_axis(inside, along, axis=2)[:, :, 0].argsort(axis=1)
+        of_box = np.take_along_axis(of_box, order, axis=1).reshape(2 * len(of_box), -1)
 
 
 def _fitting(outline: FloatArray, lengths: FloatArray) -> str:

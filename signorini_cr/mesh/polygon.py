@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..errors import InputError, naming
@@ -140,6 +141,35 @@ def _turned(
     number = max(math.ceil(number - 1e-9), 1)
     angles = first + turn * np.arange(number) / number
     return center + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def diameter(points: FloatArray) -> float:
+    """Compute the largest distance between two points; they are opposite corners of their hull.
+
+    Corners are opposite where parallels touch the hull, one at each. Sides are turned through, and
+    what lies across the middle of a parallel side is found with its neighbours.
+
+    Args:
+        points: Shape (n, 2), not all the same.
+    """
+    away = points - points[0]
+    try:
+        hull = points[ConvexHull(away / np.abs(away).max()).vertices]  # counterclockwise
+    except QhullError:  # they lie on a line
+        longest = away[:, np.ptp(away, axis=0).argmax()]
+        hull = points[[longest.argmin(), longest.argmax()]]
+    sides = np.roll(hull, -1, axis=0) - hull
+    angle = np.unwrap(np.arctan2(sides[:, 1], sides[:, 0]))
+    turned = np.maximum.accumulate(np.concatenate([angle, angle + 2 * math.pi]))
+    opposite = np.searchsorted(turned, angle + math.pi)
+    corner = np.arange(len(hull))
+    return max(
+        float(
+            np.hypot(*(hull[(corner + a) % len(hull)] - hull[(opposite + b) % len(hull)]).T).max()
+        )
+        for a in (0, 1)
+        for b in (-1, 0, 1)
+    )
 
 
 def check_labels(labels: Sequence[str], edges: int, allowed: Sequence[str]) -> None:

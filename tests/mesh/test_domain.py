@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+import time
 from pathlib import Path
 
 import basix.ufl
@@ -14,10 +15,11 @@ from mpi4py import MPI
 
 from signorini_cr import Problem, Solver, solve, solve_adaptive, solve_in_time, solve_levels
 from signorini_cr.errors import InputError, NotConverged, on_root, raise_together
+from signorini_cr.mesh import gmshmesh
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, Polygon, read_gmsh
 from signorini_cr.mesh.families import structured
 from signorini_cr.mesh.partition import bisect
-from signorini_cr.mesh.polygon import check_loops
+from signorini_cr.mesh.polygon import check_loops, diameter
 from signorini_cr.mesh.valid import thinness
 
 COMM = MPI.COMM_WORLD
@@ -101,6 +103,51 @@ def test_a_size_beyond_the_domain_is_refused():
     assert counts(polygon.mesh(polygon.diameter)) == [1, 2, 1]
     message = fails_alike(polygon.mesh, 2.3)
     assert "size is 2.3, longer than the domain, whose diameter is 2.23607" in message
+
+
+@pytest.mark.parametrize("away", [0.0, 1e9])
+@pytest.mark.parametrize("kind", ["cloud", "ellipse", "sliver", "line", "lattice", "small"])
+def test_the_diameter_is_the_largest_of_all_distances(kind: str, away: float) -> None:
+    random = np.random.default_rng(1)
+    for count in range(2, 60):
+        t = np.sort(random.uniform(0.0, 2 * np.pi, count))
+        x = {
+            "cloud": random.standard_normal((count, 2)),
+            "ellipse": np.stack([np.cos(t), 0.3 * np.sin(t)], axis=1),
+            "sliver": np.stack([np.cos(t), np.cos(t) + 1e-13 * np.sin(t)], axis=1),
+            "line": np.stack([t, 0.37 * t], axis=1),
+            "lattice": np.stack([np.arange(count) // 7, np.arange(count) % 7], axis=1),
+            "small": 1e-150 * random.standard_normal((count, 2)),
+        }[kind]
+        x = x * (1.0 + away) + away
+        if np.ptp(x, axis=0).any():
+            largest = max(np.hypot(*(x - each).T).max() for each in x)
+            assert diameter(x) == pytest.approx(largest, rel=1e-15)
+
+
+def test_sizes_beside_short_edges_are_the_least_of_what_grows_from_all() -> None:
+    random = np.random.default_rng(2)
+    for count in (3, 4, 7, 64, 300):
+        x = random.standard_normal((count, 2)) * [1.0, 10.0 ** random.uniform(-6.0, 0.0)]
+        facets = 10.0 ** random.uniform(-4.0, 1.0, count)
+        at = np.arange(count)
+        edges = np.stack([at, np.roll(at, -1)], axis=1)
+        own = np.minimum(facets, np.roll(facets, 1))
+        distances = np.hypot(*(x[:, None] - x).transpose(2, 0, 1))
+        expected = (own + 0.3 * distances).min(axis=1)
+        assert np.array_equal(gmshmesh._sizes(x, edges, facets), expected)
+
+
+def test_thirty_thousand_edges_take_no_time_before_they_are_meshed() -> None:
+    """All on the hull, all with the size that grows from the one short edge."""
+    count, began = 30_000, time.perf_counter()
+    t, at = np.linspace(0.0, 2 * np.pi, count, endpoint=False), np.arange(count)
+    x = np.stack([np.cos(t), np.sin(t)], axis=1)
+    assert diameter(x) == pytest.approx(2.0, rel=1e-14)
+    facets = np.where(at == 0, 1e-6, 10.0)
+    sizes = gmshmesh._sizes(x, np.stack([at, np.roll(at, -1)], axis=1), facets)
+    assert sizes[count // 2] == pytest.approx(1e-6 + 0.3 * 2.0, rel=1e-6)
+    assert time.perf_counter() - began < 4.0  # twenty, where pairs are looked at
 
 
 @pytest.mark.parametrize(
