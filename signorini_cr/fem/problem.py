@@ -458,16 +458,16 @@ class Forms:
             if len(set(numbers)) == 1:
                 return base
             return self._on_cells(name, numbers, materials, own)
-        found = base
         for material, datum in own.items():
             if datum.ufl_shape != base.ufl_shape:
                 raise InputError(
                     f"materials: {name} of {material} has the shape {datum.ufl_shape}, but"
                     f" {base.ufl_shape} elsewhere"
                 )
-            there = self._on_cells(f"in {material}", [0.0, 1.0], materials, (material,))
-            found = _chosen(ufl.gt(there, 0.5), datum, found)
-        return found
+        if not own:
+            return base
+        number = self._on_cells(f"whose {name}", range(len(own) + 1), materials, own)
+        return _numbered(number, [base, *own.values()])
 
     def _as_tensor(self, datum: Expr) -> Expr:
         """Turn a scalar into the tensor that does the same."""
@@ -785,6 +785,16 @@ def _order(expression: Expr) -> int:
     """Count how often functions are differentiated in it."""
     below = max(map(_order, expression.ufl_operands), default=0)
     return below + isinstance(expression, ufl.differentiation.Derivative)
+
+
+def _numbered(number: Expr, data: Sequence[Expr], first: int = 0) -> Expr:
+    """Choose the datum with a number, counted from `first`, by halves: no deep expression."""
+    if len(data) == 1:
+        return data[0]
+    half = len(data) // 2
+    below = _numbered(number, data[:half], first)
+    above = _numbered(number, data[half:], first + half)
+    return _chosen(ufl.gt(number, first + half - 0.5), above, below)
 
 
 def _chosen(condition: Expr, first: Expr, second: Expr) -> Expr:

@@ -319,3 +319,22 @@ def test_materials_that_are_not_there():
         solve(Problem(materials={"rock": 3.0}), layers())
     with pytest.raises(InputError, match=r"coefficient: the value at \(.*\) is -1"):
         solve(Problem(materials={"rock": Material(coefficient=-1.0)}), layers())
+
+
+def test_as_many_materials_as_there_are_formulas():
+    """400, against one formula that holds their numbers."""
+    given = layers(16)
+    mesh, cells = given.mesh, given.mesh.topology.index_map(2)
+    number = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    at = np.arange(cells.size_local, dtype=np.int32)
+    numbers = ((at + cells.local_range[0]) % 400 + 1).astype(np.int32)
+    number.x.array[number.function_space.dofmap.list[at, 0]] = numbers
+    number.x.scatter_forward()
+    names = {f"m{i}": i for i in range(1, 401)}
+    tags = meshtags(mesh, 2, at, numbers)
+    domain = Domain.from_tags(mesh, given.tags, cell_tags=tags, materials=names)
+    own = {name: Material(f=lambda x, i=i: -1 - x[0] * i) for name, i in names.items()}
+    many = solve(Problem(obstacle=-0.1, materials=own), domain)
+    one = solve(Problem(obstacle=-0.1, f=lambda x: -1 - x[0] * number), domain)
+    assert many.energy == pytest.approx(one.energy, rel=1e-12)
+    assert many.certificate.parts == pytest.approx(one.certificate.parts, rel=1e-6, abs=1e-12)
