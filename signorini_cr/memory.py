@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import resource
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ LEAST_SPACE = 4e8
 FEWEST = 64
 """Files open at a time. MPI, which would end the process, takes 24 for itself and two ranks."""
 
+_ASKED = ("VmPeak", "VmHWM", "VmRSS")
 _PETSC_ERR_MEM = 55
 _WORDS = (
     "std::bad_alloc",
@@ -103,17 +105,17 @@ def _shown(size: float) -> str:
 
 def _status() -> dict[str, float]:
     """Ask the system what it knows of this process, in bytes."""
-    lines = _text(Path("/proc/self/status")).splitlines()
-    return {line.split(":")[0]: 1024.0 * int(line.split()[1]) for line in lines if " kB" in line}
+    facts = [line.split(":") for line in _lines(Path("/proc/self/status"))]
+    return {name: 1024.0 * int(fact[0].split()[0]) for name, *fact in facts if name in _ASKED}
 
 
 def _spare() -> float:
     """Find the memory, in bytes, left to the processes of this machine, or of this cgroup."""
     spare = [math.inf]
-    for line in _text(Path("/proc/meminfo")).splitlines():
+    for line in _lines(Path("/proc/meminfo")):
         if line.startswith("MemAvailable:"):
             spare.append(1024.0 * int(line.split()[1]))
-    for line in _text(Path("/proc/self/cgroup")).splitlines():
+    for line in _lines(Path("/proc/self/cgroup")):
         _, kinds, path = line.split(":", 2)
         if kinds and "memory" not in kinds.split(","):
             continue
@@ -131,16 +133,21 @@ def _spare() -> float:
 
 def _cached(group: Path) -> int:
     """Ask what a cgroup's processes have read or written and would give back."""
-    facts = dict(line.split() for line in _text(group / "memory.stat").splitlines())
+    facts = dict(line.split() for line in _lines(group / "memory.stat"))
     return sum(
         int(facts.get(f"total_{name}", facts.get(name, 0)))
         for name in ("inactive_file", "active_file")
     )
 
 
+def _lines(path: Path) -> list[str]:
+    """Read the lines of a file of the system's; what programs are called may hold other ends."""
+    return [line for line in _text(path).split("\n") if line]
+
+
 def _text(path: Path) -> str:
-    """Read a file of the system's; nothing where there is none."""
+    """Read a file of the system's, with names of any bytes; nothing where there is none."""
     try:
-        return path.read_text()
+        return os.fsdecode(path.read_bytes())
     except OSError:
         return ""

@@ -234,8 +234,20 @@ def test_memory_is_that_of_the_program_alone(monkeypatch: pytest.MonkeyPatch) ->
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
     assert 1e7 < float(done.stdout) < ballast.nbytes
     assert memory.most_memory() > ballast.nbytes
-    monkeypatch.setattr(Path, "read_text", lambda path: "")  # no such system
+    monkeypatch.setattr(Path, "read_bytes", lambda path: b"")  # no such system
     assert memory.most_memory() > ballast.nbytes
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", ["dam 5 kB.py", "lösungen_eis_ä.py", "a:b", "a\x0bVmHWM: 1 kB"])
+def test_a_program_may_have_any_name(name: str) -> None:
+    """The system keeps 15 bytes of it, wherever a character ends."""
+    program = (
+        "import sys\nfrom pathlib import Path\nfrom signorini_cr.memory import most_memory\n"
+        "Path('/proc/self/comm').write_bytes(sys.argv[1].encode())\nprint(most_memory())"
+    )
+    done = subprocess.run([sys.executable, "-c", program, name], capture_output=True, check=True)
+    assert float(done.stdout) > 1e7
 
 
 @pytest.mark.parametrize("former", [FILES, ["report.json", "levels.csv", "levels.md"]])
