@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -70,19 +71,40 @@ def insist_on_function(name: str, value: object) -> None:
         raise InputError(f"{name} is of the type {type(value).__name__}: a function is needed")
 
 
-def insist_on_count(name: str, value: object) -> None:
+def to_float(name: str, value: Any, needed: str = "a number") -> float:
+    """Turn a real number of any kind into a float; refuse what is none.
+
+    Others compute in a precision of their own, or NumPy does not know them.
+
+    Args:
+        name: What the argument is called.
+        value: What was given for it.
+        needed: What it may be, in words.
+    """
+    insist_on_kind(name, value, Real, needed)
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError(f"{name} is larger than {sys.float_info.max:.2g}, the most") from None
+
+
+def insist_on_count(name: str, value: Any) -> int:
     """Refuse what is no whole number of 1 or more.
 
     Args:
         name: What the argument is called.
         value: What was given for it.
+
+    Returns:
+        That, as Python's own number.
     """
     insist_on_kind(name, value, Integral, "a whole number")
-    if isinstance(value, Integral) and value < 1:
+    if value < 1:
         raise InputError(f"{name} is {value}; it must be 1 or more")
+    return int(value)
 
 
-def insist_on_number(name: str, value: Any, least: float, strict: bool = False) -> None:
+def insist_on_number(name: str, value: Any, least: float, strict: bool = False) -> float:
     """Refuse what is no number, or below another one.
 
     Args:
@@ -90,11 +112,15 @@ def insist_on_number(name: str, value: Any, least: float, strict: bool = False) 
         value: What was given for it.
         least: What it must not be below.
         strict: Whether that one itself is refused, too.
+
+    Returns:
+        That, as a float.
     """
-    insist_on_kind(name, value, Real, "a number")
-    if not (value > least if strict else value >= least):
+    number = to_float(name, value)
+    if not (number > least if strict else number >= least):
         needed = f"above {least:g}" if strict else f"{least:g} or more"
         raise InputError(f"{name} is {value}; it must be {needed}")
+    return number
 
 
 def on_root(comm: MPI.Comm, function: Callable[..., T], *args: object) -> T:

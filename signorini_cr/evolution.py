@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
-from numbers import Integral, Real
+from numbers import Integral
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -27,7 +27,7 @@ from .data.diffusion import diffusion
 from .data.loads import VolumeMoments, chi
 from .data.quadrature import Rule, Volume
 from .diffusion import Diffusion
-from .errors import InputError, insist_on_count, insist_on_kind, raise_together
+from .errors import InputError, insist_on_count, insist_on_kind, raise_together, to_float
 from .fem.conditions import Data
 from .fem.problem import Problem, as_expression, carry
 from .fem.snapshot import Snapshot
@@ -360,10 +360,10 @@ def solve_in_time(
         NotConverged: A step was not solved, or would not fit into ``max_time``; or the mesh would
             not fit into the memory there is.
     """
-    _check_steps(end, steps, done, scheme, time)
+    end, steps, done = _checked_steps(end, steps, done, scheme, time)
     check_arguments(problem, domain)
     problem = problem.called_once()  # though a scheme may take a second solver
-    own = _capacities(problem, capacity)
+    capacity, own = _capacities(problem, capacity)
     if problem.exact is not None and problem.f is None:
         raise InputError("f: a problem in time derives none from exact, which tells no ∂u/∂t")
     if domain.mesh.topology.dim != 2:
@@ -440,12 +440,14 @@ class _Stepper:
             self._solver.close()
 
 
-def _check_steps(end: float, steps: int, done: int, scheme: str, time: object) -> None:
-    """Insist on times and on a scheme that there can be."""
-    insist_on_kind("end", end, Real, "a number")
+def _checked_steps(
+    end: float, steps: int, done: int, scheme: str, time: object
+) -> tuple[float, int, int]:
+    """Insist on times and on a scheme that there can be, and return the times."""
+    end = to_float("end", end)
     if not 0.0 < end < np.inf:
         raise InputError(f"end is {end}; it must be a time after 0")
-    insist_on_count("steps", steps)
+    steps = insist_on_count("steps", steps)
     insist_on_kind("done", done, Integral, "a whole number")
     if not 0 <= done <= steps:
         raise InputError(f"done is {done}; it must be the number of a step, or 0")
@@ -459,23 +461,30 @@ def _check_steps(end: float, steps: int, done: int, scheme: str, time: object) -
         raise InputError(
             f"time is {time!r}; it must be a dolfinx Constant, a float64, which data hold"
         )
+    return end, steps, int(done)
 
 
 def _is_clock(time: object) -> bool:
     """Tell whether something has a time that can be set."""
     value = np.asarray(getattr(time, "value", None))
-    return value.shape == () and np.issubdtype(value.dtype, np.floating)
+    return value.shape == () and value.dtype == np.float64
 
 
-def _capacities(problem: Problem, usual: float) -> dict[str, float]:
-    """Take the capacities of materials that have their own, by name; all of them are above 0."""
-    given = {name: each.capacity for name, each in problem.materials.items()}
-    own = {name: each for name, each in given.items() if each is not None}
-    for name, each in {"": usual, **own}.items():
-        if not (isinstance(each, Real) and 0.0 < each < np.inf):
-            of = f" of {name}" if name else ""
-            raise InputError(f"capacity{of} is {each!r}; it must be a number above 0")
-    return own
+def _capacities(problem: Problem, usual: float) -> tuple[float, dict[str, float]]:
+    """Take the usual capacity, and materials' own by name; all of them are above 0."""
+
+    def checked(name: str, value: object) -> float:
+        number = to_float(name, value, "a number above 0")
+        if not 0.0 < number < np.inf:
+            raise InputError(f"{name} is {number}; it must be a number above 0")
+        return number
+
+    own = {
+        name: checked(f"capacity of {name}", each.capacity)
+        for name, each in problem.materials.items()
+        if each.capacity is not None
+    }
+    return checked("capacity", usual), own
 
 
 def _reactions(problem: Problem, domain: Domain) -> dict[str, Expr]:

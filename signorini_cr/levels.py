@@ -94,7 +94,7 @@ def solve_levels(
             the memory there is, or into ``max_time``.
     """
     check_arguments(problem, domain)
-    insist_on_count("levels", levels)
+    levels = insist_on_count("levels", levels)
     if levels > 1:
         check_refinable(domain.mesh)
 

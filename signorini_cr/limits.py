@@ -41,7 +41,7 @@ class Limits:
             InputError: That is no time.
         """
         if max_time is not None:
-            insist_on_number("max_time", max_time, 0.0, strict=True)
+            max_time = insist_on_number("max_time", max_time, 0.0, strict=True)
         self._max_time = max_time
         self._began = time.perf_counter()
         self._passed = 0.0

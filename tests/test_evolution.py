@@ -1,6 +1,8 @@
 """Problems in time: orders of the schemes, contact against a dense solver, certificates, ranks."""
 
 from dataclasses import replace
+from fractions import Fraction
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -359,7 +361,8 @@ def test_what_goes_on_for_long_stands_still():
         ({"end": 1e-320}, "end is 1e-320; 2 steps would be too short"),
         ({"scheme": "crank"}, "one of euler, bdf2"),
         ({"capacity": -1.0}, "capacity is -1.0; it must be a number above 0"),
-        ({"capacity": lambda x: x[0]}, "capacity is <function .*>; it must be a number above 0"),
+        ({"capacity": lambda x: x[0]}, "capacity is of the type function: a number above 0 is"),
+        ({"capacity": 10**400}, r"capacity is larger than 1\.8e\+308"),
         ({"levels": 0}, "levels is 0"),
         ({"time": 0.5}, "time is 0.5; it must be a dolfinx Constant"),
     ],
@@ -372,6 +375,37 @@ def test_what_makes_no_sense_is_refused(wrong, said):
     problem = Problem(exact=lambda x: x[0], conditions=waves(0.0).conditions)
     with pytest.raises(InputError, match="f: a problem in time derives none from exact"):
         next(solve_in_time(problem, domain, end=1.0, steps=1))
+
+
+@pytest.mark.parametrize("end", [np.float32(0.7), np.float16(0.7), Fraction(7, 10), np.int8(2)])
+def test_times_are_floats_whatever_they_are_given_as(end) -> None:
+    domain = SQUARE.mesh(0.5)
+    problem, given = waves(clock(domain)), {"steps": np.uint8(255), "max_time": Fraction(10**4)}
+    steps = solve_in_time(problem, domain, end=end, **given)
+    assert [t for t, _ in islice(steps, 3)] == [float(end) * n / 255 for n in (1, 2, 3)]
+    steps = solve_in_time(problem, domain, end=end, steps=np.int8(127))
+    assert next(steps)[0] == float(end) * 1 / 127
+
+
+@pytest.mark.parametrize("capacity", [np.float32(0.1), Fraction(1, 3), np.uint8(100)])
+def test_a_capacity_counts_as_a_float(capacity) -> None:
+    """Of the problem, and of a material beside another one."""
+    given = replace(SQUARE, materials={"left": SQUARE.vertices * [0.5, 1.0]})
+    for domain in (SQUARE.mesh(0.5), given.mesh(0.5)):
+        found = []
+        for each in (capacity, float(capacity)):
+            own = {"left": Material(capacity=2 * each)} if domain.materials.numbers else {}
+            problem = Problem(f=-1.0, conditions=HELD_ABOVE, materials=own)
+            *_, (_, last) = solve_in_time(problem, domain, end=0.7, steps=2, capacity=each)
+            found.append(last.u.x.array.tolist())
+        assert found[0] == found[1]
+
+
+def test_a_clock_of_another_precision_is_refused() -> None:
+    domain = SQUARE.mesh(0.5)
+    low = fem.Constant(domain.mesh, np.float32(0.0))
+    with pytest.raises(InputError, match="it must be a dolfinx Constant, a float64"):
+        next(solve_in_time(waves(low), domain, end=1.0, steps=1, time=low))
 
 
 def test_bounds_that_come_to_contradict_one_another_are_refused():

@@ -155,6 +155,7 @@ class Problem:
             degree = getattr(self, name)
             if not isinstance(degree, int | np.integer) or degree < 0:
                 raise InputError(f"{name} is {degree!r}; it must be a whole number, 0 or more")
+            object.__setattr__(self, name, int(degree))
 
     def called_once(self) -> Problem:
         """Make the same problem, whose functions are called once for a mesh."""

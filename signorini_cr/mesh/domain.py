@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from numbers import Real
 from os import PathLike
 from pathlib import Path
 from types import NoneType
@@ -37,7 +36,15 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes, coordinate_map
-from ..errors import InputError, insist_on_kind, naming, on_root, raise_together, together
+from ..errors import (
+    InputError,
+    insist_on_kind,
+    naming,
+    on_root,
+    raise_together,
+    to_float,
+    together,
+)
 from ..garbage import watch
 from ..rounding import counted
 from . import gmshmesh
@@ -600,7 +607,7 @@ class Polygon:
                 of the names or, without names, none is contact or Dirichlet, or gmsh can't make
                 the mesh.
         """
-        insist_on_kind("size", size, Real, "a positive number")
+        size = to_float("size", size, "a positive number")
         insist_on_kind("comm", comm, MPI.Comm, "a communicator of MPI")
         together(comm, self._insist_on_size, size)
         self.check_parts()
@@ -608,13 +615,13 @@ class Polygon:
         names = itertools.chain(self.boundary, *(hole.boundary for hole in self.holes))
         labels = np.array([self.parts[name] for name in names], dtype=np.int32)
         numbers = numbered_materials(list(self.materials))
-        what = loops, labels, float(size), self.materials, numbers
+        what = loops, labels, size, self.materials, numbers
         return _distribute(comm, self.parts, numbers, gmshmesh.triangulate, *what)
 
     def _insist_on_size(self, size: float) -> None:
         """Refuse a length that no facet can have."""
         if not (np.isfinite(size) and size > 0):
-            raise InputError(f"size is {size}: a positive number is needed")
+            raise InputError(f"size is {size:g}: a positive number is needed")
         if size > self.diameter * (1 + 1e-9):
             raise InputError(
                 f"size is {size:g}, longer than the domain, whose diameter is {self.diameter:g}"

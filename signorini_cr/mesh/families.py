@@ -6,13 +6,11 @@ so that they are the same whatever the number of ranks.
 
 from __future__ import annotations
 
-from numbers import Real
-
 import numpy as np
 from mpi4py import MPI
 
 from ..arrays import FloatArray, Int32Array, Int64Array
-from ..errors import InputError, insist_on_kind
+from ..errors import InputError, insist_on_kind, to_float
 from .domain import Domain, Polygon, _distribute
 from .gmshmesh import Triangulation
 from .polygon import inside
@@ -50,19 +48,20 @@ def structured(
         InputError: The polygon doesn't consist of such squares, or a number is out of range.
     """
     insist_on_kind("polygon", polygon, Polygon, "a Polygon")
-    insist_on_kind("n", n, Real, "a number of squares")
-    if n < 1:
+    number = to_float("n", n, "a number of squares")
+    if not 1.0 <= number < np.inf:
         raise InputError(f"n is {n}: a mesh has 1 square or more per unit length")
+    shift, jitter = to_float("shift", shift), to_float("jitter", jitter)
     if not abs(shift) < 0.5 or not 0.0 <= jitter < 0.25:
         raise InputError(
             f"shift is {shift} and jitter {jitter}: less than 0.5 and 0.25 keep triangles upright"
         )
     if polygon.materials:
         raise InputError("squares do not follow the edges of materials; Polygon.mesh does")
-    return _distribute(comm, polygon.parts, {}, _squares, polygon, n, shift, jitter, seed)
+    return _distribute(comm, polygon.parts, {}, _squares, polygon, number, shift, jitter, seed)
 
 
-def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -> Triangulation:
+def _squares(polygon: Polygon, n: float, shift: float, jitter: float, seed: int) -> Triangulation:
     polygon.check_parts()
     starts, ends, labels = _edges(polygon)
     low, high = polygon.vertices.min(axis=0), polygon.vertices.max(axis=0)
@@ -71,7 +70,7 @@ def _squares(polygon: Polygon, n: int, shift: float, jitter: float, seed: int) -
     flat = np.isclose(starts, ends, rtol=0, atol=1e-12).any(axis=1)
     if not (np.allclose(grid, np.rint(grid), atol=1e-9) and flat.all()):
         raise InputError(
-            f"the polygon's edges don't lie on squares of side 1/{n}: give a polygon of upright "
+            f"the polygon's edges don't lie on squares of side 1/{n:g}: give a polygon of upright "
             "and level edges, and an n that its vertices fit"
         )
     points, triangles = _grid(*number)
@@ -145,7 +144,7 @@ def _moves(
     facets: Int64Array,
     along: FloatArray,
     polygon: Polygon,
-    n: int,
+    n: float,
     jitter: float,
     seed: int,
 ) -> FloatArray:

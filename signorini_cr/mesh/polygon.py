@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from ..arrays import BoolArray, FloatArray, IndexArray
-from ..errors import InputError, naming
+from ..errors import InputError, naming, to_float
 
 FARTHEST = 1e100
 """Largest coordinate: areas, and products of them, stay finite."""
@@ -94,7 +94,8 @@ def cut(
 
 def circle(center: Sequence[float], radius: float, size: float) -> FloatArray:
     """Cut a circle into facets like those of `cut`; their ends, shape (n, 2)."""
-    if not (np.isfinite(radius) and radius > 0):
+    radius = to_float("the radius", radius)
+    if not 0.0 < radius < math.inf:
         raise InputError(f"the radius is {radius}: a positive number is needed")
     return _turned(_one(center), radius, 0.0, 2 * math.pi, size)
 
@@ -133,7 +134,8 @@ def _turned(
     center: FloatArray, radius: float, first: float, turn: float, size: float
 ) -> FloatArray:
     """Compute points at equal angles from `first` on, as many as there are to be facets."""
-    if not size > 0:
+    size = to_float("size", size)
+    if not size > 0.0:
         raise InputError(f"size is {size}: a positive number is needed")
     number = abs(turn) * max(radius / size, 1 / TURN)
     if number > MOST_FACETS:

@@ -3,6 +3,7 @@
 import itertools
 import sys
 import time
+from fractions import Fraction
 from pathlib import Path
 
 import basix.ufl
@@ -427,6 +428,28 @@ def test_a_name_that_no_edge_has_is_refused():
 @pytest.mark.parametrize("size", [0, -1, np.nan, np.inf, 1e-12, 1e-4])
 def test_bad_sizes(size: float):
     assert f"size is {size}" in fails_alike(Polygon(RECTANGLE, LABELS).mesh, size)
+
+
+@pytest.mark.parametrize("size", [Fraction(1, 2), np.float32(0.5), np.float16(0.5)])
+def test_sizes_may_be_numbers_of_any_kind(size) -> None:
+    polygon = Polygon(RECTANGLE, LABELS)
+    assert np.array_equal(polygon.mesh(size).mesh.geometry.x, polygon.mesh(0.5).mesh.geometry.x)
+    for radius in (Fraction(1, 3), np.float32(1 / 3)):
+        given = Polygon.circle((0, 0), radius, "contact", size).vertices
+        usual = Polygon.circle((0, 0), float(radius), "contact", 0.5).vertices
+        assert np.array_equal(given, usual)
+    arcs = [Polygon.with_arcs(RECTANGLE, LABELS, {2: (0, 2)}, each) for each in (size, 0.5)]
+    assert np.array_equal(arcs[0].vertices, arcs[1].vertices)
+    squares = structured(polygon, 4 * size, shift=size / 4, jitter=size / 8)
+    usual = structured(polygon, 2, shift=0.125, jitter=0.0625)
+    assert np.array_equal(squares.mesh.geometry.x, usual.mesh.geometry.x)
+
+
+@pytest.mark.parametrize("size", [10**400, Fraction(10) ** 400])
+def test_a_size_that_is_no_float_is_refused(size) -> None:
+    assert "size is larger than 1.8e+308" in fails_alike(Polygon(RECTANGLE, LABELS).mesh, size)
+    with pytest.raises(InputError, match="the radius is of the type str: a number is needed"):
+        Polygon.circle((0, 0), "1", "contact", 0.5)
 
 
 def test_a_gmsh_session_of_the_users_own_goes_on():

@@ -272,6 +272,7 @@ def test_data_on_another_mesh_are_refused(key):
 def test_degrees_that_there_are_none_of(name, degree):
     with pytest.raises(InputError, match=f"{name} is {degree!r}"):
         Problem(**{name: degree})
+    assert type(getattr(Problem(**{name: np.int8(4)}), name)) is int
 
 
 @pytest.mark.parametrize("element", ["CR", "P1"])
