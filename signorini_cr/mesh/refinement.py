@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from .. import compat
 from ..arrays import FloatArray, Int32Array, Int64Array
-from ..errors import InputError
+from ..errors import InputError, together
 from .domain import Domain, Refinement
 from .shared import shared_sum
 
@@ -99,22 +99,44 @@ def refine_marked(domain: Domain, marked_cells: npt.ArrayLike) -> tuple[Domain, 
 
     Args:
         domain: Straight-sided triangles; ghost cells are left behind.
-        marked_cells: Local indices of this rank's cells, or a truth value for each of them.
+        marked_cells: Local indices of this rank's cells, or a truth value for each of them. What
+            is said of ghost cells does not count.
 
     Returns:
         The fine domain, without ghost cells, and the parent of every fine cell, both local
         indices.
 
     Raises:
-        InputError: The mesh does not consist of straight-sided triangles.
+        InputError: The mesh does not consist of straight-sided triangles, or has no such cells.
     """
     mesh = _prepared(domain.mesh)
-    owned = mesh.topology.index_map(2).size_local
-    marked = np.asarray(marked_cells)
-    marked = np.flatnonzero(marked) if marked.dtype == bool else marked.astype(np.int32)
-    marked = marked[(marked >= 0) & (marked < owned)]
+    marked = together(mesh.comm, _marked, mesh, marked_cells)
     edges = np.unique(_table(mesh.topology.connectivity(2, 1))[marked]).astype(np.int32)
     return refine_edges(domain, edges)
+
+
+def _marked(mesh: Mesh, marked_cells: npt.ArrayLike) -> Int64Array:
+    """Find the marked cells that this rank owns, ascending."""
+    cells, marked = mesh.topology.index_map(2), np.asarray(marked_cells)
+    owned, there = cells.size_local, _count(cells)
+    if marked.dtype == bool:
+        if marked.shape not in ((owned,), (there,)):
+            raise InputError(
+                f"marked_cells has truth values of the shape {marked.shape}; rank"
+                f" {mesh.comm.rank} has {owned} cells"
+            )
+        return np.flatnonzero(marked[:owned])
+    if marked.size and marked.dtype.kind not in "iu":
+        raise InputError(
+            f"marked_cells has values of the type {marked.dtype}; indices of cells are needed, or"
+            " truth values"
+        )
+    if len(wrong := marked[(marked < 0) | (marked >= there)]):
+        raise InputError(
+            f"marked_cells: there is no cell {wrong[0]} on rank {mesh.comm.rank}, which has"
+            f" {owned} cells"
+        )
+    return np.unique(marked[marked < owned]).astype(np.int64)
 
 
 def refine_edges(domain: Domain, edges: Int32Array) -> tuple[Domain, Int32Array]:

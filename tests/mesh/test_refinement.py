@@ -354,3 +354,29 @@ def test_marked_refinement_is_local():
         domain, _ = refine_marked(domain, near(domain.mesh, (0, 0)))
         sizes.append(domain.mesh.topology.index_map(2).size_global)
     assert np.diff(sizes)[3:].max() < 60
+
+
+@pytest.mark.parametrize(
+    ("marks", "said"),
+    [
+        ([9999], "marked_cells: there is no cell 9999 on rank"),
+        ([0, -1], "marked_cells: there is no cell -1 on rank"),
+        ([2**32], "marked_cells: there is no cell 4294967296 on rank"),
+        ([0.7], "marked_cells has values of the type float64"),
+        (["0"], "marked_cells has values of the type <U1"),
+        ([True], r"marked_cells has truth values of the shape \(1,\)"),
+    ],
+)
+def test_marks_of_cells_that_are_not_there_are_refused_on_all_ranks(marks, said) -> None:
+    domain = SHAPES["rectangle"].mesh(0.4)
+    with pytest.raises(InputError, match=said):
+        refine_marked(domain, marks if COMM.rank == COMM.size - 1 else [])
+
+
+def test_marks_of_ghost_cells_do_not_count() -> None:
+    domain = own(dolfinx.mesh.GhostMode.shared_facet, 3)
+    cells = domain.mesh.topology.index_map(2)
+    there = np.arange(cells.size_local + cells.num_ghosts)
+    for marks in (there[cells.size_local :], there >= cells.size_local):
+        fine, _ = refine_marked(domain, marks)
+        assert fine.mesh.topology.index_map(2).size_global == cells.size_global
