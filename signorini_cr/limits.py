@@ -66,7 +66,7 @@ class Limits:
             dofs = 2 * dofs + 3 * 4**k * topology.index_map(topology.dim).size_global
         if restart is not None:
             insist_on_kind("restart", restart, Restart, "a Restart")
-            number, dofs = len(restart.added), restart.u[0][1].size
+            number, dofs = len(restart.added), comm.bcast(restart.u[0][1].size)
         _refuse(number, dofs, shortage(comm, BYTES * dofs / comm.size))
 
     def admit(self, solution: Solved, dofs: int, runs: float = 1.0) -> None:

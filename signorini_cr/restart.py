@@ -128,6 +128,7 @@ class Restart:
             if places is None:
                 refined: Refined = (*refine(domain), None)
             else:
+                places = _of_all(places, domain.mesh.comm)
                 refined = balance(*refine_edges(domain, _edges_at(domain.mesh, places)))
             yield refined
             domain = refined[0]
@@ -138,7 +139,7 @@ class Restart:
         Raises:
             AnotherMesh: The mesh is another one.
         """
-        at, values = self.u[number]
+        at, values = (_of_all(each, V.mesh.comm) for each in self.u[number])
         if V.dofmap.index_map.size_global == len(at) > len(np.unique(at)):
             raise AnotherMesh(
                 "nodes of P1 at the same place, as on the two faces of a slit, can't be told apart"
@@ -229,6 +230,12 @@ def _edges_at(mesh: Mesh, places: Places) -> Int32Array:
     """Find the edges of this rank's cells whose places are among some; collective."""
     edges, _, _, mine = _sides(mesh)
     return np.unique(edges[np.isin(mine, places)]).astype(np.int32)
+
+
+def _of_all(values: npt.NDArray, comm: MPI.Comm) -> npt.NDArray:
+    """Give all ranks what `_gathered` has left on rank 0, unless they have read it; collective."""
+    found: npt.NDArray = comm.bcast(values) if comm.allreduce(not len(values), MPI.LOR) else values
+    return found
 
 
 def _gathered(values: npt.NDArray, comm: MPI.Comm) -> npt.NDArray:

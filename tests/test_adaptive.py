@@ -1,11 +1,14 @@
 """Adaptive refinement: marks, stopping rules, and the rate a corner takes from uniform meshes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 import ufl
+from helpers import HELD_ABOVE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -18,12 +21,14 @@ from signorini_cr import (
     exact,
     solve,
     solve_adaptive,
+    solve_in_time,
     solve_levels,
 )
 from signorini_cr.adaptive import mark
 from signorini_cr.fem.space import facet_measures
 from signorini_cr.mesh.domain import PARTS
 from signorini_cr.mesh.families import structured
+from signorini_cr.restart import Restart
 
 pytestmark = pytest.mark.slow
 
@@ -221,3 +226,29 @@ def test_cells_that_rounding_would_spoil_end_the_sequence():
     assert caught.value.level == len(solutions) > 10
     h = solution.domain.mesh.h(2, np.arange(solution.level.data.cells.number, dtype=np.int32))
     assert 1e-12 < WORLD.allreduce(float(h.min()), op=MPI.MIN) < 1e-10
+
+
+@pytest.mark.parametrize("read", [False, True])
+@pytest.mark.parametrize("way", ["levels", "adaptive", "time"])
+def test_all_ranks_go_on_from_what_was_taken_to_one_or_read_on_all(way: str, read: bool) -> None:
+    domain, problem = HELD_ABOVE.mesh(0.3), Problem(f=-1.0, obstacle=-0.05)
+
+    def solutions(**more: Any) -> list[Solution]:
+        if way == "levels":
+            return [*solve_levels(problem, domain, 3, **more)]
+        if way == "adaptive":
+            return [*solve_adaptive(problem, domain, levels=3, **more)]
+        return [each for _, each in solve_in_time(problem, domain, end=0.3, steps=3, **more)]
+
+    first, second, third = solutions()
+    if way == "time":
+        restart = Restart.of_steps([second, first])
+    else:
+        restart = Restart.of(second, Restart.of(first, None, way == "adaptive"), way == "adaptive")
+    if read:
+        restart = WORLD.bcast(replace(restart, space=None))
+    more = {"done": 2} if way == "time" else {}
+    again, last = solutions(restart=restart, **more)
+    assert again.iterations.newton <= 1
+    assert again.energy == pytest.approx(second.energy, rel=1e-9)
+    assert (last.dofs, last.energy) == (third.dofs, pytest.approx(third.energy, rel=1e-9))
