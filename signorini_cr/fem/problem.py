@@ -217,7 +217,12 @@ def as_expression(data: Data, x: Expr, called: str = "data", in_cells: bool = Fa
 def _expression(data: Data, x: Expr, called: str, in_cells: bool = False) -> Expr:
     """Do what `as_expression` does on this rank."""
     try:
-        found = ufl.as_ufl(data(x) if callable(data) and not isinstance(data, Expr) else data)
+        given = data(x) if callable(data) and not isinstance(data, Expr) else data
+        if isinstance(given, np.ndarray) and given.shape == ():
+            given = float(given)
+        found = ufl.as_ufl(given)
+        if isinstance(found, ufl.classes.Condition):
+            raise ValueError("it is a condition, of which ufl.conditional(it, 1, 0) makes a number")
         for each in unique_pre_traversal(found):
             for kind, words in _NO_DATA.items():
                 if isinstance(each, kind) and (in_cells or kind is not GeometricFacetQuantity):

@@ -223,6 +223,11 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
         solve(Problem(f=-1.0, coefficient=value), HELD_ABOVE.mesh(0.2))
 
 
+def test_arrays_of_one_number_are_numbers():
+    number, array = (solve(Problem(f=f), HELD_ABOVE.mesh(0.5)) for f in (-3.0, np.array(-3.0)))
+    assert array.energy == number.energy < 0.0
+
+
 @pytest.mark.parametrize(
     ("data", "said"),
     [
@@ -235,6 +240,7 @@ def test_a_coefficient_that_is_not_positive_is_refused(value):
             {"conditions": {"contact": Contact(0.0, upper=lambda x: "y")}},
             r"^conditions\['contact'\].upper: <function .* does not give",
         ),
+        ({"f": lambda x: ufl.lt(x[0], 0.5)}, "it is a condition, of which ufl.conditional"),
         ({"f": 1j}, "1j does not give a number or a UFL expression .it holds a complex number"),
         ({"obstacle": lambda x: 2j * x[0]}, "it holds a complex number"),
         ({"f": lambda x: ufl.avg(x[0])}, "it holds values of one side of a facet"),
