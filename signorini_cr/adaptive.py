@@ -252,13 +252,13 @@ def _by_shares(
     if not 0.0 < fraction <= 1.0:
         raise InputError(f"fraction is {fraction}; it must be above 0 and not above 1")
     if levels is not None:
-        insist_on_count("levels", levels)
-    insist_on_number("tolerance", tolerance, 0.0)
-    insist_on_number("max_dofs", max_dofs, 1.0)
+        levels = insist_on_count("levels", levels)
+    tolerance = insist_on_number("tolerance", tolerance, 0.0)
+    most = insist_on_number("max_dofs", max_dofs, 1.0)
 
     def step(solution: Solution, shares: Shares) -> Refined | None:
         last = levels is not None and solution.level.number + 1 >= levels
-        if last or shares.bound <= tolerance or solution.dofs >= max_dofs:
+        if last or shares.bound <= tolerance or solution.dofs >= most:
             return None
         comm = solution.domain.mesh.comm
         if shares.rounded(comm):
@@ -279,7 +279,7 @@ def _by_shares(
         fine, parent_cell = refine_marked(solution.domain, marked)
         facets = fine.mesh.topology.index_map(fine.mesh.topology.dim - 1).size_global
         dofs = facets * solution.u.function_space.dofmap.index_map_bs
-        if dofs > max_dofs:
+        if dofs > most:
             return None
         limits.admit(solution, dofs, runs)
         return balance(fine, parent_cell)

@@ -344,13 +344,16 @@ def _values(
         parts: The values of our own.
 
     Raises:
-        InputError: A tag of one of the parts is on a facet inside.
+        InputError: A tag of one of the parts is on a facet inside, or on none of the mesh.
     """
     fdim = mesh.topology.dim - 1
     values = np.full(_count(mesh, fdim), REST, dtype=np.int32)
     inside = np.ones(len(values), dtype=bool)
     inside[exterior] = False
     complaint = None
+    last = int(facet_tags.indices.max(initial=-1))
+    if last >= len(values):
+        complaint = f"facet {last} is tagged, of {len(values)} facets: tags of this mesh are needed"
     owned = mesh.topology.index_map(fdim).size_local
     for name, numbers in wanted.items():
         chosen = facet_tags.indices[np.isin(facet_tags.values, numbers)]

@@ -819,6 +819,16 @@ def test_own_cell_tags_of_another_mesh_on_one_rank() -> None:
     assert f"of rank {COMM.size - 1}, which has" in said and "tags of this mesh" in said
 
 
+def test_own_facet_tags_of_another_mesh_on_one_rank() -> None:
+    mesh = dolfinx.mesh.create_unit_square(COMM, 4, 4)
+    facets = dolfinx.mesh.locate_entities_boundary(mesh, 1, lambda x: x[1] < 1e-9)
+    if COMM.rank == COMM.size - 1:
+        facets = np.append(facets, 9999).astype(np.int32)
+    tags = dolfinx.mesh.meshtags(mesh, 1, facets, np.ones(len(facets), dtype=np.int32))
+    said = fails_alike(lambda: Domain.from_tags(mesh, tags, contact=1))
+    assert "facet 9999 is tagged" in said and "tags of this mesh are needed" in said
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_own_meshes_that_are_folded(dim: int) -> None:
     """A vertex is drawn out of the mesh: some of its cells come to lie over others."""
