@@ -163,7 +163,7 @@ class _Solution:
         said = self._first(
             gap[0] < -SAME * height - gap[1],
             x,
-            lambda u, bound: f"u is {u:.6g}, {off} the obstacle, {bound:.6g}",
+            lambda u, obstacle: f"u is {u:.6g}, {off} the obstacle, {obstacle:.6g}",
             (sign * u[0], u[1]),
             (sign * alpha[0], alpha[1]),
         )
