@@ -759,7 +759,7 @@ def out(x: Range, room: float = EPS) -> Range:
     """Make room for rounding; what is 0 stays so, and other numbers keep their signs."""
     try:
         with np.errstate(under="raise"):
-            low, high = x[0] - room * np.abs(x[0]), x[1] + room * np.abs(x[1])
+            return _wider(*x, room)
     except FloatingPointError:
         less, more = (np.where(end == 0, 0.0, room * np.abs(end) + TINY) for end in x)
         low, high = x[0] - less, x[1] + more
@@ -767,6 +767,12 @@ def out(x: Range, room: float = EPS) -> Range:
             np.where(x[0] > 0, np.maximum(low, 0.0), low),
             np.where(x[1] < 0, np.minimum(high, 0.0), high),
         )
+        return np.fmax(low, -np.inf), np.fmin(high, np.inf)
+
+
+def _wider(low: FloatArray, high: FloatArray, room: float = EPS) -> Range:
+    """Make the same room, but for numbers below all."""
+    low, high = low - room * np.abs(low), high + room * np.abs(high)
     return np.fmax(low, -np.inf), np.fmin(high, np.inf)  # of a number and NaN it is the number
 
 
@@ -790,26 +796,28 @@ def _mul(x: Range, y: Range) -> Range:
     a, b, c, d = x[0] * y[0], x[0] * y[1], x[1] * y[0], x[1] * y[1]
     low, high = np.fmin(np.fmin(a, b), np.fmin(c, d)), np.fmax(np.fmax(a, b), np.fmax(c, d))
     zero = np.isnan(low)  # 0 times what has no bound
-    return out((np.where(zero, 0.0, low), np.where(zero, 0.0, high)))
+    return _wider(np.where(zero, 0.0, low), np.where(zero, 0.0, high))
 
 
 def square_of(low: FloatArray, high: FloatArray) -> Range:
     """Enclose a square."""
+    around = (low < 0) & (high > 0)
     try:
         with np.errstate(under="raise"):
             a, b = low * low, high * high
+            return _wider(np.where(around, 0.0, np.minimum(a, b)), np.maximum(a, b))
     except FloatingPointError:
-        size = np.minimum(np.abs(low), np.abs(high)), np.maximum(np.abs(low), np.abs(high))
+        a, b = np.abs(low), np.abs(high)
+        size = np.minimum(a, b), np.maximum(a, b)
         least, most = mul(size, size)
-        return np.where((low < 0) & (high > 0), 0.0, least), most
-    return out((np.where((low < 0) & (high > 0), 0.0, np.minimum(a, b)), np.maximum(a, b)))
+        return np.where(around, 0.0, least), most
 
 
 def _scaled(factor: float, x: Range) -> Range:
     low, high = x if factor >= 0 else (x[1], x[0])
     try:
         with np.errstate(under="raise"):
-            return out((factor * low, factor * high))
+            return _wider(factor * low, factor * high)
     except FloatingPointError:
         number = np.array(factor)
         return mul((number, number), x)
