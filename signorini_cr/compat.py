@@ -15,7 +15,9 @@ from dolfinx import cpp, fem
 from dolfinx.mesh import CellType, Mesh, create_submesh
 from mpi4py import MPI
 from ufl import exprequals
+from ufl.algebra import Abs
 from ufl.core.expr import Expr
+from ufl.core.operator import Operator
 
 from .arrays import FloatArray, Int32Array, Int64Array
 from .garbage import watch
@@ -53,6 +55,18 @@ def _are_equal(one: Expr, other: Expr) -> bool:
 
 if hasattr(exprequals, "hash_total"):  # what it counted went with the old way
     Expr.__eq__ = _are_equal
+
+
+def _take_operand(absolute: Abs, operand: Any) -> None:
+    """Initialize an absolute value, unless it is that which it was asked of.
+
+    UFL's takes |x| for ||x||, and then makes it its own operand: what goes through it has no end.
+    """
+    if absolute is not operand:
+        Operator.__init__(absolute, (operand,))
+
+
+Abs.__init__ = _take_operand
 
 
 def cell_nodes(mesh: Mesh) -> Int32Array:

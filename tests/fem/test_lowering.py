@@ -53,6 +53,16 @@ def test_what_is_used_twice_is_worked_on_once() -> None:
     assert _size(by_components(_nested(MANY))) < 8 * MANY
 
 
+def test_sizes_of_sizes_are_sizes() -> None:
+    """UFL takes |x| for ||x||, which must not become a part of itself."""
+    x = X[0]
+    point = np.array([[-0.3, 0.2, 0.0]])
+    for size in (abs(abs(x)), abs(1 * abs(x)), abs(abs(abs(x)))):
+        assert not any(e in e.ufl_operands for e in unique_pre_traversal(size))
+        assert evaluate(by_components(size), point)[0] == 0.3
+    assert _size(simplified(-ufl.div(ufl.grad(abs(abs(x)) ** 3)))) < 40
+
+
 def test_formulas_made_twice_are_equal() -> None:
     """UFL's sets and dicts ask for it, for all that is in a form."""
     one, two, other = _nested(MANY), _nested(MANY), _nested(MANY, 7.5)
