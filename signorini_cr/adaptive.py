@@ -40,6 +40,8 @@ and where a problem is symmetric, cells are twins but for that."""
 HALVINGS = 40
 """Steps of the bisection for the value that separates marks: they leave 1e-12 of the largest."""
 
+SOLVED = 1e-8
+"""Part of (2|J|)^{1/2} that a solver leaves which ends at a residual of 10⁻⁸ of the load."""
 NOTHING = 0.1
 """Part of the rounding in a bound that is nothing beside it: cells' shares that are all noise come
 to 0.07 of it at most, and to cut what is left once more adds more rounding than it takes away."""
@@ -108,13 +110,17 @@ class Shares(NamedTuple):
     Attributes:
         bound: Of the broken error (1.6).
         indicators: What this rank's cells hold of its square, shape (cells,).
-        rounding: What it has beyond all its parts, in the norm of the energy: rounding in the
-            certificate's own sums, which grows with the number of cells. 0 where it is not known.
+        of_energy: The same bound in the norm of the energy.
+        rounding: What this one has for rounding in the certificate's own sums, which grows with the
+            number of cells. 0 where it is not known.
+        left: What the solver may leave of u_h in that norm, by the energy's size; 0 likewise.
     """
 
     bound: float
     indicators: FloatArray
-    rounding: float
+    of_energy: float = np.inf
+    rounding: float = 0.0
+    left: float = 0.0
 
     @classmethod
     def of(cls, solution: Solution) -> Shares:
@@ -129,23 +135,30 @@ class Shares(NamedTuple):
                 f"adaptive refinement goes by the certified bound, and there is none: "
                 f"{certificate.reason}"
             )
-        rounding = 0.0
-        if isinstance(certificate, Certificate):  # that of another physics may tell no parts
-            bound = certificate.bound_energy_norm or 0.0
-            rounding = max(bound - sum(certificate.parts.values()), 0.0)
-        return cls(certificate.bound_h1, certificate.indicators, rounding)
+        if not isinstance(certificate, Certificate):  # another physics may know no more
+            return cls(certificate.bound_h1, certificate.indicators)
+        energy = max(map(abs, certificate.energy or (0.0,)))
+        return cls(
+            certificate.bound_h1,
+            certificate.indicators,
+            np.inf if certificate.bound_energy_norm is None else certificate.bound_energy_norm,
+            certificate.rounding,
+            SOLVED * float(np.sqrt(2.0 * energy)),
+        )
 
     def rounded(self, comm: MPI.Comm) -> bool:
         """Tell whether refinement has nothing to reduce but rounding; collective.
 
-        That is so where all cells together hold less than a hundredth of its square, and where they
-        hold nothing, so that none can be marked.
+        Or what the solver leaves. That is so where all cells together hold less than a hundredth of
+        the square of the one, or than the square of the other, and no more than twice of both is
+        all that the bound has.
 
         Args:
             comm: The ranks that take part.
         """
         held = comm.allreduce(float(np.sum(self.indicators)))
-        return self.bound > 0.0 and not held > (NOTHING * self.rounding) ** 2
+        nothing = max(NOTHING * self.rounding, self.left)
+        return held <= nothing**2 and 0.0 < self.of_energy <= 2.0 * (self.rounding + self.left)
 
 
 class Tried(NamedTuple):
@@ -202,7 +215,7 @@ def adapt_to_run(
     step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction, runs=RUNS)
     refined = [*meshes]
     while True:
-        total, last = Shares(0.0, np.zeros(1), 0.0), None
+        total, last = Shares(0.0, np.zeros(1), of_energy=0.0), None
         steps = run(refined)
         insist_on_kind("what run returns", steps, Iterable, "pairs of a time and a solution")
         for _, last in steps:
@@ -210,7 +223,7 @@ def adapt_to_run(
             total = Shares(
                 max(total.bound, shares.bound),
                 total.indicators + shares.indicators,
-                float(np.hypot(total.rounding, shares.rounding)),
+                *(float(np.hypot(*both)) for both in zip(total[2:], shares[2:], strict=True)),
             )
         if last is None:
             raise InputError("the run has no steps")
@@ -271,6 +284,8 @@ def _by_shares(
                 solution.level.number,
             )
         marked = mark(shares.indicators, fraction, comm)
+        if not comm.allreduce(bool(marked.any()), op=MPI.LOR):  # all is what no cell has a share in
+            marked[:] = True
         if _smallest(solution.domain, marked) < RESOLUTION:
             raise NotConverged(
                 "cells have become so small that rounding spoils their shape",

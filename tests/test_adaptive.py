@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ufl
-from helpers import HELD_ABOVE
+from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -119,6 +119,38 @@ def test_nothing_but_rounding_ends_the_search_for_a_mesh():
     assert next(search).rounded
     with pytest.raises(NotConverged, match="what is left of it is rounding"):
         next(search)
+
+
+def test_a_bound_that_is_more_than_cells_hold_is_no_rounding():
+    """What κ does between points, and loads that no point sees, are parts that meshes reduce."""
+
+    def tensor(x):
+        return ufl.as_matrix([[1 + 0.3 * ufl.sin(4 * x[0]), 0], [0, 1]])
+
+    def spot(x):
+        r2 = (x[0] - 0.4371) ** 2 + (x[1] - 0.4129) ** 2
+        return ufl.conditional(ufl.lt(r2, 1e-16), 1e4, 0.0)
+
+    held = ["contact", "dirichlet", "neumann", "dirichlet"]
+    flowing = Problem(coefficient=tensor, dirichlet=lambda x: -x[1], g=-1.0)
+    for problem, labels in (
+        (flowing, held),
+        (Problem(f=spot), ["contact", *["dirichlet"] * 3]),
+    ):
+        domain = Polygon(SQUARE.vertices, labels).mesh(0.5)
+        bounds = [s.certificate.bound_h1 for s in solve_adaptive(problem, domain, levels=4)]
+        assert len(bounds) == 4 and bounds[-1] < 0.2 * bounds[0]
+
+
+def test_a_line_that_no_point_sees_is_found():
+    """Only what quadrature may have missed marks cells; where these are few, the bound falls."""
+
+    def f(x):
+        return ufl.conditional(ufl.lt(abs(x[0] + 0.3 * x[1] - 0.4371), 1e-12), 1e4, 0.0)
+
+    domain = Polygon(SQUARE.vertices, ["contact", *["dirichlet"] * 3]).mesh(0.5)
+    bounds = [s.certificate.bound_h1 for s in solve_adaptive(Problem(f=f), domain, levels=6)]
+    assert bounds[-1] < 0.3 * bounds[0]
 
 
 def test_refinement_ends_where_rounding_is_all_of_an_affine_solution():

@@ -63,6 +63,7 @@ class Certificate:
             (companion), the contact term's square root (contact), the data oscillation of f
             (load), of g (neumann), of u_D and α (boundary), and what the solver left (solver).
         indicators: Square of each cell's share, shape (cells,), owned cells.
+        rounding: What `bound_energy_norm` has for rounding in its own sums.
         reason: Why figures are missing.
         seconds: Wall time.
     """
@@ -73,6 +74,7 @@ class Certificate:
     energy: tuple[float, float] | None = None
     parts: dict[str, float] = field(default_factory=dict)
     indicators: FloatArray | None = None
+    rounding: float = 0.0
     reason: str | None = None
     seconds: float = 0.0
     made: Made | None = None  # told of nowhere: bounds of quantities go on from it, users don't
@@ -602,6 +604,7 @@ def _added_up(known: _Known, v: Companion, sums: Sums) -> Certificate:
             "solver": float(known.left + known.carried),
         },
         indicators=sums.indicators,
+        rounding=1.5 * rounding,
         made=_made(known, v, ball, lift),
     )
 
@@ -816,10 +819,12 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
             steep = np.sqrt(np.maximum(sums.steepness[block], 0.0))
             change += float(means @ missed[block] + by_slope @ steep)
             square += float(rough @ rough)
+            sums.indicators[block] += rough**2
         if v.cusps is not None:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
     at, sizes = segments.beyond()
-    on_edge = np.sum(sizes**2 / pick(kappa.low, at))
+    on_edge = np.sum(shares := sizes**2 / pick(kappa.low, at))
+    np.add.at(sums.indicators, at, shares)
     change += segments.change(v.vertices, v.bumps, v.thirds)
     square, on_edge, of_loss, change = cells.total(
         square, on_edge, np.sum(segments.beyond_loss), change

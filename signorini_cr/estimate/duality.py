@@ -143,10 +143,11 @@ class DualityGap:
         """Begin the cells' shares with p and b."""
         sums, totals = self.sums, self.sums.totals
         square = found.pp + found.bb
-        sums.indicators[block], sums.steepness[block] = square, found.vv
+        own = square + 0.5 * (found.near + found.far)  # the bound has the roots of both by half
+        sums.indicators[block], sums.steepness[block] = own, found.vv
         if sums.fields is not None:
-            for row, own in enumerate((square + 2.0 * found.pb, found.near, square)):
-                sums.fields[row, block] = own
+            for row, each in enumerate((square + 2.0 * found.pb, found.near, own)):
+                sums.fields[row, block] = each
         sums.middle[block] = found.near + (square + 2.0 * found.pb)
         sums.across[block] = found.far + (square - 2.0 * found.pb)
         totals.flux += float(np.sum(found.pp))

@@ -709,7 +709,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     thirds, bubbles = rng.normal(size=len(bumps)), rng.normal(size=number)
     cusps = SimpleNamespace(at=at, means=means)
     v = SimpleNamespace(vertices=vertices, bumps=bumps, thirds=thirds, bubbles=bubbles, cusps=cusps)
-    sums = SimpleNamespace(steepness=steepness)
+    sums = SimpleNamespace(steepness=steepness, indicators=np.zeros(cells.number))
     c = SimpleNamespace(low=np.array(reaction), high=np.array(reaction))
     known = SimpleNamespace(
         level=level, cells=cells, kappa=kappa, certain=certain, segments=segments, c=c, size=0.0
@@ -747,6 +747,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
         assert (loose, change) == (0.0, 0.0)
     else:
         assert np.isclose(loose, expected) and np.isclose(change, energy)
+    assert np.isclose(sums.indicators.sum(), squares + of_edge**2)  # cells have shares of it
 
 
 def test_the_smallest_field_of_a_given_divergence(monkeypatch):
