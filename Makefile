@@ -82,11 +82,12 @@ mutants:
 	$(run) python3 tests/mutants.py vi --count 100
 	$(run) python3 tests/mutants.py multigrid --count 100
 
-# What depends on how a mesh is shared out, on more ranks than that.
+# What depends on how a mesh is shared out, on more ranks than that; slow tests with the first of
+# their parameters alone where FIRST=--first
 ranks: ranks-3 ranks-4
 
 ranks-3 ranks-4: ranks-%:
-	$(run) $(limit) mpirun -n $* python3 -m pytest -m ranks -k 'not rates'
+	$(run) $(limit) mpirun -n $* python3 -m pytest $(FIRST) -m ranks -k 'not rates'
 
 # What is left for others, read by others: meshio, VTK, PyVista, Jupyter; -p fails without one.
 readers:

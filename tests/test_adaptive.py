@@ -42,7 +42,7 @@ def run(example, size=4, **limits):
 THROUGH = Polygon([[0, 0], [1, 0], [1, 1], [0, 1]], ["contact", "neumann", "dirichlet", "neumann"])
 """What flows from above to the contact below."""
 
-MOST = {"S1": 4000, "B": 4000, "D": 10_000, "I": 1500}
+MOST = {"S1": 4000, "B": 4000, "D": 10_000, "I": 700}
 
 
 @pytest.fixture(scope="module")
