@@ -137,7 +137,7 @@ def test_energy_where_cubics_meet_a_flux(n, height, pressure):
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
 def test_bound_is_above_the_error_and_near_it(name, jitter):
     example = getattr(exact, name)
-    levels = 2 if name == "I" else 3  # its load has kinks without end, and takes as long as the rest
+    levels = 2 if name == "I" else 3  # whose load has kinks without end
     for solution in solve_levels(example.problem, example.structured(8, jitter=jitter), levels):
         certificate = certify(solution)
         effectivity = certificate.bound_h1 / solution.errors[0]
