@@ -340,11 +340,20 @@ def allowance(
 
 def may_be_singular(expression: Any) -> bool:
     """Tell whether an operator in the expression can take something finite to infinity."""
-    return any(
-        isinstance(e, classes.Division | classes.Ln)
-        or (isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1]))
-        for e in traversal.unique_pre_traversal(expression)
-    )
+    return bool(_inverted(expression))
+
+
+def _inverted(expression: Any) -> list[Any]:
+    """List what operators of an expression take to infinity where it is 0."""
+    found = []
+    for e in traversal.unique_pre_traversal(expression):
+        if isinstance(e, classes.Division):
+            found.append(e.ufl_operands[1])
+        elif isinstance(e, classes.Ln) or (
+            isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1])
+        ):
+            found.append(e.ufl_operands[0])
+    return found
 
 
 def _is_positive(e: Any) -> bool:
@@ -412,14 +421,7 @@ def singular_points(expression: Any, corners: FloatArray) -> list[FloatArray]:
 
 def _divisors(expression: Any) -> list[Any]:
     """List what an expression is singular at the roots of: no products, and no powers."""
-    left = []
-    for e in traversal.unique_pre_traversal(expression):
-        if isinstance(e, classes.Division):
-            left.append(e.ufl_operands[1])
-        elif isinstance(e, classes.Ln) or (
-            isinstance(e, classes.Power) and not _is_positive(e.ufl_operands[1])
-        ):
-            left.append(e.ufl_operands[0])
+    left = _inverted(expression)
     found: dict[Any, bool] = {}  # and whether it has roots of its own
     while left:
         e = left.pop()

@@ -77,8 +77,7 @@ class Sums:
             where there are none.
         apart: c‖v − u_h‖²_T, shape (cells,); or None.
         fields: ∫_T |p + b|², how far that may be off, and what p and b have of the cells' shares,
-            shape (3, cells); None
-            where no κ is another one on strips along the cells' sides.
+            shape (3, cells); None where no κ is another one on strips along the cells' sides.
         totals: All cells' together.
     """
 
