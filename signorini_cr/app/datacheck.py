@@ -14,6 +14,7 @@ from ..arrays import BoolArray, FloatArray, Int32Array
 from ..data.admissible import shown
 from ..errors import InputError
 from ..mesh.domain import Domain
+from ..mesh.shared import bounding_box
 from .expressions import Expression
 from .reference import ABOVE, EXPRESSIONS, Key
 
@@ -135,9 +136,7 @@ def _digits(domain: Domain) -> int:
 
     Those of the domain's extent, but for what far from the origin is rounding.
     """
-    x, far = domain.mesh.geometry.x, np.inf
-    ends = domain.mesh.comm.allgather((x.min(axis=0, initial=far), x.max(axis=0, initial=-far)))
-    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+    low, high = bounding_box(domain.mesh)
     extent, farthest = float((high - low).max()), float(np.maximum(-low, high).max())
     return min(11 - math.ceil(math.log10(extent)), 14 - math.ceil(math.log10(farthest)))
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..fem.conditions import Condition, as_factor
 from ..fem.space import facet_measures
 from ..mesh.domain import Domain
+from ..mesh.shared import bounding_box
 from ..rounding import counted
 from .problemfile import ProblemFile
 from .reference import EXPRESSIONS, KINDS
@@ -85,10 +86,8 @@ def folded(rows: Mapping[str, str]) -> str:
 
 def _extent(domain: Domain) -> str:
     """Say how many cells there are, and where; collective."""
-    mesh, comm = domain.mesh, domain.mesh.comm
-    x = mesh.geometry.x[:, : mesh.geometry.dim]
-    low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
-    high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
+    mesh = domain.mesh
+    low, high = (end[: mesh.geometry.dim] for end in bounding_box(mesh))
     extent = " × ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True))
     number = mesh.topology.index_map(mesh.topology.dim).size_global
     return f"{counted(number, 'cell')} in {extent}"

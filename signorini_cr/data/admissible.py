@@ -33,6 +33,7 @@ from ..fem.problem import Forms
 from ..fem.space import facet_entities, function_space, ghosted_vector
 from ..garbage import release
 from ..mesh.domain import Domain
+from ..mesh.shared import bounding_box
 
 if TYPE_CHECKING:
     from .quadrature import Tensor, Trace
@@ -233,10 +234,7 @@ class Precision:
     @classmethod
     def of(cls, mesh: Mesh) -> Precision:
         """Look at the mesh; collective."""
-        x = mesh.geometry.x[:, : mesh.geometry.dim]
-        ends = (x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf))
-        lows, highs = zip(*mesh.comm.allgather(ends), strict=True)
-        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        low, high = bounding_box(mesh)
         rounding = 4 * EPS * float(max(np.abs(low).max(), np.abs(high).max()))
         return cls(max(2 * rounding, COORDINATES * float(np.linalg.norm(high - low))), rounding)
 

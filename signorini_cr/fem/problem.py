@@ -36,6 +36,7 @@ from ..hints import meant
 from ..jit import compiled
 from ..mesh.domain import PARTS, Domain, Parts, named
 from ..mesh.materials import Materials
+from ..mesh.shared import bounding_box
 from .conditions import (
     Condition,
     Contact,
@@ -361,9 +362,7 @@ def _lattice(mesh: Mesh) -> FloatArray:
     Returns:
         Shape (5^d, 3).
     """
-    x, far = mesh.geometry.x, np.inf
-    ends = mesh.comm.allgather((x.min(axis=0, initial=far), x.max(axis=0, initial=-far)))
-    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+    low, high = bounding_box(mesh)
     # where no symmetry of the data is likely to be
     parts = np.array([0.01, 0.27, 0.52, 0.74, 0.98])
     axes = [parts if b > a else parts[:1] for a, b in zip(low, high, strict=True)]

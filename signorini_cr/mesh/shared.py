@@ -20,6 +20,14 @@ KEPT = 8
 _exchanges: WeakKeyDictionary[Mesh, OrderedDict[tuple[Any, int], _Exchange]] = WeakKeyDictionary()
 
 
+def bounding_box(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
+    """Find the least and the largest coordinates of a mesh, shapes (3,); collective."""
+    x = mesh.geometry.x
+    ends = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+    lows, highs = zip(*mesh.comm.allgather(ends), strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
 def ghosted(
     comm: MPI.Comm, index_map: Any, array: FloatArray | None = None, block: int = 1
 ) -> PETSc.Vec:
