@@ -90,11 +90,13 @@ class Solver:
 
         Raises:
             InputError: As for `solve_levels`.
+            NotConverged: The last mesh would not fit into the memory there is.
         """
         check_arguments(problem, domain)
         known, more = _given(levels, domain)
         if more > 0:
             check_refinable(domain.mesh)
+            Limits().begin(domain, "CR", None, 1 + more)
         physics = Diffusion(problem, domain.mesh, "CR", domain.parts, domain.materials)
         self.physics, self._domain = physics, domain
         physics.check(domain)

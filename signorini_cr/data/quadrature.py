@@ -206,21 +206,45 @@ def _same(a: Expr, b: Expr) -> bool:
     return bool(a == b) or as_number(simplified(a - b)) == 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class Between:
+    """Bounds of κ on each cell, or of its eigenvalues, shape (cells,), or () where κ is a number.
+
+    Attributes:
+        core: Lower and upper bound but for strips along the cells' sides.
+        lowest: Lower bound, strips included.
+        high: Upper bound, strips included.
+        low: What stands for the lower bound where fields are weighed by 1/κ: less than in `core`
+            where there are strips with another κ, and more than in these.
+    """
+
+    core: Range
+    lowest: FloatArray
+    high: FloatArray
+    low: FloatArray
+
+    @classmethod
+    def all_over(cls, low: FloatArray, high: FloatArray) -> Between:
+        """Take what holds in strips as it does elsewhere."""
+        return cls((low, high), low, high, low)
+
+    @classmethod
+    def with_strips(
+        cls, core: Range, part: FloatArray, lowest: FloatArray, high: FloatArray
+    ) -> Between:
+        """Take what does not; for the strips' part of each cell see `Coefficient.strips`."""
+        return cls(core, lowest, high, _with_strips(core[0], part, lowest))
+
+
 class Coefficient:
     """κ on each cell; of a tensor what it is where lengths are measured by `Tensor.stretch`.
 
     Attributes:
         mean: κ_T, shape (cells,), or () where κ is a number.
-        low: What stands for κ's lower bound where fields are weighed by 1/κ, same shape; less than
-            in `core` where there are strips with another κ, and more than in these.
-        high: Upper bound of κ, same shape.
-        least: The same as low for κ's eigenvalues with lengths as they are.
-        most: Upper bound of these.
-        lowest: Lower bound of κ, strips included.
-        floor: The same of the eigenvalues.
-        core: Bounds of κ but for strips along the cells' sides.
-        inner: Lower bound of the eigenvalues but for these strips.
-        strips: Their part of each cell, shape (cells,); None where there are none on any rank.
+        bounds: Of κ.
+        eigenvalues: Of its eigenvalues with lengths as they are; of a scalar the same.
+        strips: Part of each cell that its strips along the sides have, shape (cells,); None where
+            there are none on any rank.
         tensor: The same where it is a tensor that varies within cells; else None.
         spread: θ, (1 − θ) κ_T ≤ κ ≤ (1 + θ) κ_T, for that tensor, shape (cells,).
         rough: ϱ, where that tensor is within ϱ κ_T of a quadratic polynomial, shape (cells,).
@@ -239,10 +263,6 @@ class Coefficient:
     tensor: Tensor | None = None
     spread: FloatArray
     rough: FloatArray
-    lowest: FloatArray
-    floor: FloatArray
-    core: Range
-    inner: FloatArray
     strips: FloatArray | None = None
 
     def __init__(self, kappa: Volume | Tensor, cells: Cells):
@@ -250,16 +270,15 @@ class Coefficient:
         self.reason: str | None = None
         self.values: FloatArray | None = None
         if isinstance(kappa, Tensor):
-            self._of_tensor(kappa, cells)
+            self.bounds, self.eigenvalues = self._of_tensor(kappa, cells)
         else:
-            self._of_scalar(kappa, cells)
-            self.least, self.most = self.low, self.high
-            self.floor, self.inner = self.lowest, self.core[0]
-        if self.strips is not None:
-            own = bool((self.strips > 0.0).any())
-            self.strips = self.strips if cells.comm.allreduce(own, op=MPI.LOR) else None
+            self.bounds = self.eigenvalues = self._of_scalar(kappa, cells)
         # The same way on all ranks
-        self.smallest = min(cells.comm.allgather(float(np.min(self.floor, initial=np.inf))))
+        strips = self.strips is not None and bool((self.strips > 0.0).any())
+        if not cells.comm.allreduce(strips, op=MPI.LOR):
+            self.strips = None
+        smallest = float(np.min(self.eigenvalues.lowest, initial=np.inf))
+        self.smallest = min(cells.comm.allgather(smallest))
         reasons = [reason for reason in cells.comm.allgather(self.reason) if reason]
         self.reason = reasons[0] if reasons else None
         if self.reason is None and not self.smallest > 0:
@@ -270,65 +289,76 @@ class Coefficient:
         """True if κ varies within cells, on some rank."""
         return self.values is not None or self.tensor is not None
 
-    def _of_tensor(self, kappa: Tensor, cells: Cells) -> None:
+    def _of_tensor(self, kappa: Tensor, cells: Cells) -> tuple[Between, Between]:
+        """Bound κ where lengths are stretched, and its eigenvalues; collective."""
         means = kappa.means(cells.domain)
-        eigenvalues = np.linalg.eigvalsh(means)
-        self.mean = self.low = self.high = np.exp(np.log(eigenvalues).mean(axis=1))
-        self.lowest, self.core = self.mean, (self.mean, self.mean)
-        self.least, self.most = eigenvalues[:, 0], eigenvalues[:, -1]
-        self.floor = self.inner = self.least
-        off = np.zeros((means[0].size if len(means) else cells.tdim**2, len(means)))
-        self.strips, low, high = np.zeros(len(means)), off.copy(), off.copy()
-        for i, (entry, mean) in enumerate(
-            zip(kappa.entries, means.reshape(-1, len(off)).T, strict=True)
-        ):
+        eigenvalues = np.linalg.eigvalsh(means).astype(np.float64, copy=False)
+        least, most = eigenvalues[:, 0], eigenvalues[:, -1]
+        self.mean = np.exp(np.log(eigenvalues).mean(axis=1))
+        off, part, low, high = self._entries(kappa, means, cells)
+        if any(cells.comm.allgather(self.reason)):
+            return Between.all_over(self.mean, self.mean), Between.all_over(least, most)
+        self.strips, there = part, part > 0.0
+        theta = self._by_mean(np.maximum(off, 0.0), cells)
+        varies = bool((off > _steady(means)).any() or there.any())
+        if cells.comm.allreduce(varies, op=MPI.LOR):
+            self.tensor, self.rule, self.spread = kappa, kappa.fine, theta
+            kappa.prepare(kappa.fine)  # here, as a rank without cells never asks for values
+            self.rough = np.fmin(self._roughness(kappa, cells), theta)
+        else:
+            theta = np.zeros_like(theta)
+        if (theta >= 1.0).any():
+            self.reason = "the coefficient is a tensor that varies too much within a cell"
+        inner, outer = 1.0 - theta, 1.0 + theta
+        first, last = _eigenvalues_between(low, high)
+        lowest = np.where(there, np.minimum(first, inner * least), inner * least)
+        highest = np.where(there, np.maximum(last, outer * most), outer * most)
+        own = Between.with_strips((inner * least, outer * most), part, lowest, highest)
+        # with lengths stretched, where it is all the same κ_T
+        lowest = self.mean * np.where(there, np.minimum(lowest / most, inner), inner)
+        highest = self.mean * np.where(there, np.maximum(highest / least, outer), outer)
+        core = self.mean * inner, self.mean * outer
+        return Between.with_strips(core, part, lowest, highest), own
+
+    def _entries(
+        self, kappa: Tensor, means: FloatArray, cells: Cells
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Bound a tensor's entries on each cell, or say why that can't be done; collective.
+
+        Returns:
+            How far they are from their means but for strips, what part of the cell these have, and
+            bounds on all of it; shapes (d², cells), but for the part's (cells,).
+        """
+        low, high, off = np.zeros((3, cells.tdim**2, len(means)))
+        strips = np.zeros(len(means))
+        of_entries = means.reshape(-1, cells.tdim**2).T
+        for i, (entry, mean) in enumerate(zip(kappa.entries, of_entries, strict=True)):
             found = ranges_on(entry, Pieces.of_cells(cells), cells)
             if found is None:
                 self.reason = NO_RANGE
                 break
             (inner, outer), (part, low[i], high[i]) = found
             off[i] = np.maximum(outer - mean, mean - inner)
-            self.strips += part
-        least = STEADY * np.abs(means).max(axis=(1, 2), initial=0.0)
+            strips += part
         for difference in kappa.skew:
             between = range_of(difference, cells)
-            if between is None or (np.maximum(-between[0], between[1]) > least).any():
+            if between is None or (np.maximum(-between[0], between[1]) > _steady(means)).any():
                 self.reason = "the coefficient is a tensor that could not be shown to be symmetric"
                 break
-        if any(cells.comm.allgather(self.reason)):
-            return
-        theta = self._by_mean(np.maximum(off, 0.0), cells)
-        varies = bool((off > least).any() or (self.strips > 0.0).any())
-        if cells.comm.allreduce(varies, op=MPI.LOR):
-            self.tensor, self.rule, self.spread = kappa, kappa.fine, theta
-            kappa.prepare(kappa.fine)  # here, as a rank without cells never asks for values
-            deviations = [Deviation(entry) for entry in kappa.entries]
+        return off, strips, low, high
 
-            def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
-                at = Enclosure(boxes)
-                # v's gradient may be quadratic on triangles, and is affine or constant else
-                largest = 36.0 if cells.tdim == 2 else (cells.tdim + 1) ** 2
-                each = (deviation(at, half, largest=largest) for deviation in deviations)
-                return np.stack([quadratic for quadratic, _ in each])
+    def _roughness(self, kappa: Tensor, cells: Cells) -> FloatArray:
+        """Bound how far a tensor is from quadratic polynomials, in parts of κ_T, shape (cells,)."""
+        deviations = [Deviation(entry) for entry in kappa.entries]
 
-            rough = self._by_mean(errors_on(Pieces.of_cells(cells), errors, cells), cells)
-            self.rough = np.fmin(rough, theta)
-        else:
-            theta = np.zeros_like(theta)
-        if (theta >= 1.0).any():
-            self.reason = "the coefficient is a tensor that varies too much within a cell"
-        self.core = (1.0 - theta) * self.mean, (1.0 + theta) * self.mean
-        self.inner, outer = (1.0 - theta) * self.least, (1.0 + theta) * self.most
-        first, last = _eigenvalues_between(low, high)
-        there = self.strips > 0.0
-        self.floor = np.where(there, np.minimum(first, self.inner), self.inner)
-        most = np.where(there, np.maximum(last, outer), outer)
-        # with lengths stretched, where it is all the same κ_T
-        self.lowest = np.where(there, np.minimum(self.floor / self.most, 1.0 - theta), 1.0 - theta)
-        self.high = np.where(there, np.maximum(most / self.least, 1.0 + theta), 1.0 + theta)
-        self.lowest, self.high = self.lowest * self.mean, self.high * self.mean
-        self.low = _with_strips(self.core[0], self.strips, self.lowest)
-        self.least, self.most = _with_strips(self.inner, self.strips, self.floor), most
+        def errors(boxes: Boxes, half: FloatArray) -> FloatArray:
+            at = Enclosure(boxes)
+            # v's gradient may be quadratic on triangles, and is affine or constant else
+            largest = 36.0 if cells.tdim == 2 else (cells.tdim + 1) ** 2
+            each = (deviation(at, half, largest=largest) for deviation in deviations)
+            return np.stack([quadratic for quadratic, _ in each])
+
+        return self._by_mean(errors_on(Pieces.of_cells(cells), errors, cells), cells)
 
     def _by_mean(self, sizes: FloatArray, cells: Cells) -> FloatArray:
         """Bound |κ_T^{-1/2} E κ_T^{-1/2}|, E with entries of such sizes, shape (cells,)."""
@@ -344,28 +374,28 @@ class Coefficient:
         found = stretch[:, None] @ self.tensor.at(cells.domain, self.rule, block) @ stretch[:, None]
         return found.transpose(1, 0, 2, 3) - self.mean[block, None, None] * np.eye(cells.tdim)
 
-    def _of_scalar(self, kappa: Volume, cells: Cells) -> None:
+    def _of_scalar(self, kappa: Volume, cells: Cells) -> Between:
+        """Bound κ; collective."""
         fine = kappa.exact_for(KAPPA_DEGREE)
         self.rule = fine.rule
         if kappa.number is not None:
-            self.mean = self.low = self.high = self.lowest = np.array(kappa.number)
-            self.core = self.mean, self.mean
+            self.mean = np.array(kappa.number, dtype=np.float64)
+            return Between.all_over(self.mean, self.mean)
+        self.deviation = kappa.deviation
+        found = ranges_on(kappa.expression, Pieces.of_cells(cells), cells)
+        values = kappa.at(cells)
+        self.mean = values @ kappa.rule.weights
+        if found is None:
+            self.reason = NO_RANGE
+            bounds = Between.all_over(self.mean, self.mean)
         else:
-            self.deviation = kappa.deviation
-            found = ranges_on(kappa.expression, Pieces.of_cells(cells), cells)
-            values = kappa.at(cells)
-            self.mean = values @ kappa.rule.weights
-            if found is None:
-                self.reason = NO_RANGE
-                self.core, self.lowest, self.high = (self.mean, self.mean), self.mean, self.mean
-                self.low = self.mean
-            else:
-                self.core, (self.strips, self.lowest, self.high) = found
-                self.low = _with_strips(self.core[0], self.strips, self.lowest)
-            varies = bool((self.high - self.lowest > STEADY * np.abs(self.mean)).any())
-            if cells.comm.allreduce(varies, op=MPI.LOR):  # or the bound would depend on the ranks
-                values = values if fine is kappa else fine.at(cells)
-                self.values = np.ascontiguousarray(values.T)
+            core, (self.strips, lowest, high) = found
+            bounds = Between.with_strips(core, self.strips, lowest, high)
+        varies = bool((bounds.high - bounds.lowest > STEADY * np.abs(self.mean)).any())
+        if cells.comm.allreduce(varies, op=MPI.LOR):  # or the bound would depend on the ranks
+            values = values if fine is kappa else fine.at(cells)
+            self.values = np.ascontiguousarray(values.T)
+        return bounds
 
     def enclose(self, cells: Cells, steepness: FloatArray, excess: FloatArray, size: float) -> None:
         """Enclose a κ that varies within cells; collective.
@@ -445,6 +475,11 @@ class Coefficient:
             top = np.abs(of_four @ (1.0 - values * q)) + r * (np.abs(of_four) @ np.abs(q))
             tau = (top.max(axis=0) + r * np.abs(coefficients).max(axis=0)) * (1 + 1e-10)
             return np.where(tau < 1.0, 2.0 * tau / (1.0 - tau), np.inf)
+
+
+def _steady(means: FloatArray) -> FloatArray:
+    """Say how much of a tensor's entries counts as rounding, from means (cells, d, d), (cells,)."""
+    return np.asarray(STEADY * np.abs(means).max(axis=(1, 2), initial=0.0))
 
 
 def _with_strips(core: FloatArray, part: FloatArray, lowest: FloatArray) -> FloatArray:

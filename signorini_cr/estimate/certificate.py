@@ -403,10 +403,10 @@ def _balanced(known: _Known) -> tuple[float, float]:
     cells, flux, kappa, c = known.cells, known.flux, known.kappa, known.c.low
     if flux.taken_up is not None and not c.ndim:
         return 0.0, 0.0
-    left = unbalanced(known.level, cells, flux.unbalanced, kappa.least, known.size, c)
-    carried = balance(cells, flux, kappa.low, known.size, left)
+    left = unbalanced(known.level, cells, flux.unbalanced, kappa.eigenvalues.low, known.size, c)
+    carried = balance(cells, flux, kappa.bounds.low, known.size, left)
     if carried:
-        left = unbalanced(known.level, cells, flux.unbalanced, kappa.least, known.size, c)
+        left = unbalanced(known.level, cells, flux.unbalanced, kappa.eigenvalues.low, known.size, c)
     return left, carried
 
 
@@ -425,7 +425,9 @@ def _carried_to_contact(
     """
     left, flux.carried = 0.0, np.zeros_like(flux.contact)
     for amounts, signed in ((flux.unbalanced, True), (missed, False)):
-        norm, change = carried_to_contact(cells, flux, amounts, kappa.least, contact, c, signed)
+        norm, change = carried_to_contact(
+            cells, flux, amounts, kappa.eigenvalues.low, contact, c, signed
+        )
         left += norm
         flux.carried += change
     enough = bool((flux.carried <= flux.contact).all())
@@ -476,7 +478,7 @@ def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[_Way]:
     data = diffusion(known.level.data)
     u_D, alpha = (OnParts.of(sampled, cells) for sampled in (data.u_D, data.alpha))
     plain = data.forms.of_one is None
-    highest = max(cells.comm.allgather(kappa.most.max(initial=1e-300)))
+    highest = max(cells.comm.allgather(kappa.eigenvalues.high.max(initial=1e-300)))
     goal = LIFT_SHARE * known.size / np.sqrt(highest)
     functional = _functional(known, plain)
     for on_obstacle in (False, True):
@@ -506,7 +508,7 @@ def _integrated(known: _Known, v: Companion) -> Sums:
     sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
     if v.cusps is not None:
         sums.totals.energy_slack += v.cusps.add(
-            cells, known.w, load, kappa.low, flux, known.c.low, (v.excess, v.bumps), sums
+            cells, known.w, load, kappa.bounds.low, flux, known.c.low, (v.excess, v.bumps), sums
         )
     np.add.at(sums.indicators, v.boundary.alpha.side.cells, v.contact)
     return sums
@@ -560,10 +562,10 @@ def _best(ways: Iterator[_Way]) -> Certificate:
 def _functional(known: _Known, plain: bool) -> Functional:
     """Say what v is to make small; plain tells that there are gradients only, on all ranks."""
     cells, kappa, segments = known.cells, known.kappa, known.segments
-    steady = kappa.high - kappa.low <= STEADY * kappa.mean
+    steady = kappa.bounds.high - kappa.bounds.low <= STEADY * kappa.mean
     if reacts(known.c.high):  # next to a c that is large there u is like no power of the distance
         steady &= known.c.high == known.c.low
-        steady &= known.c.high * cells.diameter2 <= kappa.low
+        steady &= known.c.high * cells.diameter2 <= kappa.bounds.low
     lossy = segments.usual > 0.0
     side = segments.facets.picked(lossy)
     loss = segments.usual[lossy] * measures(cells, side)
@@ -681,8 +683,8 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         level=known.level,
         w=known.w,
         kappa=known.kappa.mean,
-        least=known.kappa.least,
-        most=known.kappa.most,
+        least=known.kappa.eigenvalues.low,
+        most=known.kappa.eigenvalues.high,
         stretch=known.cells.stretch,
         hats=certain.load.hats,
         segments=segments,
@@ -769,7 +771,7 @@ def _rounding(
     largest = None if flux.beyond is None else flux.beyond.largest(cells)
     total, size, stiff, some = 0.0, 0.0, 0.0, bool(flux.excess.any())
     for block in blocks(cells.number):
-        low, high = pick(kappa.low, block), pick(kappa.high, block)
+        low, high = pick(kappa.bounds.low, block), pick(kappa.bounds.high, block)
         size = max(size, float(cells.diameter2[block].max(initial=0.0)))
         stiff = max(stiff, float(np.max(high, initial=0.0)))
         values = np.maximum(w[:, block].max(axis=0), -w[:, block].min(axis=0))
@@ -784,7 +786,7 @@ def _rounding(
         if largest is not None:
             square += trace * largest[block] ** 2 / low
         if cells.stretch is not None:  # it is as good as κ's eigenvalues are near to one another
-            square *= (kappa.most[block] / kappa.least[block]) ** 2
+            square *= (kappa.eigenvalues.high[block] / kappa.eigenvalues.low[block]) ** 2
         total += float(np.sum(square))
     own = total, cells.number, float(cells.volume.sum()), some
     total, number, volume, there = cells.total(*own)
@@ -808,9 +810,13 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
     if certain.missed is not None and certain.rough is not None:
         missed = certain.missed
         for block in blocks(cells.number):
-            by_slope = rough = mean_to_norm(cells, kappa.low, NOTHING, block) * certain.rough[block]
+            by_slope = rough = (
+                mean_to_norm(cells, kappa.bounds.low, NOTHING, block) * certain.rough[block]
+            )
             if reacts(known.c.low):
-                rough = mean_to_norm(cells, kappa.low, known.c.low, block) * certain.rough[block]
+                rough = (
+                    mean_to_norm(cells, kappa.bounds.low, known.c.low, block) * certain.rough[block]
+                )
             means = np.abs(sum_rows(v.vertices[cells.vertices[:, block]])) / (cells.tdim + 1)
             if cells.tdim == 2:
                 means += sum_rows(np.abs(v.bumps[cells.facets[:, block]])) / 3
@@ -823,7 +829,7 @@ def _hidden(known: _Known, v: Companion, sums: Sums) -> tuple[float, float]:
         if v.cusps is not None:
             change += float(np.abs(v.cusps.means) @ missed[v.cusps.at])
     at, sizes = segments.beyond()
-    on_edge = np.sum(shares := sizes**2 / pick(kappa.low, at))
+    on_edge = np.sum(shares := sizes**2 / pick(kappa.bounds.low, at))
     np.add.at(sums.indicators, at, shares)
     change += segments.change(v.vertices, v.bumps, v.thirds)
     square, on_edge, of_loss, change = cells.total(
@@ -844,7 +850,9 @@ def _of_means(known: _Known) -> float:
     if not _misses(cells, certain, segments):
         return 0.0
     missed = _missed(cells, certain, segments)
-    return unbalanced(known.level, cells, missed, known.kappa.least, known.size, known.c.low)
+    return unbalanced(
+        known.level, cells, missed, known.kappa.eigenvalues.low, known.size, known.c.low
+    )
 
 
 def _missed(cells: Cells, certain: Certain, segments: Segments) -> FloatArray:
@@ -866,7 +874,7 @@ def _lifted(known: _Known, v: Companion, sums: Sums) -> tuple[float, float, floa
         return 0.0, 0.0, 0.0, 0.0
     cells, kappa = known.cells, known.kappa
     which, place = np.unique(at, return_inverse=True)
-    high = kappa.most[which] if kappa.most.ndim else kappa.most
+    high = kappa.eigenvalues.high[which] if kappa.eigenvalues.high.ndim else kappa.eigenvalues.high
     steep, area = np.sqrt(high) * np.bincount(place, slope), np.bincount(place, size)
     before = np.sqrt(np.maximum(sums.steepness[which], 0.0))
     with np.errstate(invalid="ignore"):  # infinite where v has a reason for no bound

@@ -85,7 +85,7 @@ def improve(
         reaction: c, shape (cells,) or ().
     """
     rise = None if load.hats is None else 12.0 * load.hats
-    taken = taken_up(cells, load, kappa.low, slice(None), reaction)
+    taken = taken_up(cells, load, kappa.bounds.low, slice(None), reaction)
     if rise is not None and taken is not None:
         rise = np.where(taken, 0.0, rise)
     given, held = np.zeros((2, len(cells.exterior)))

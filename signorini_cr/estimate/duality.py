@@ -181,8 +181,8 @@ class DualityGap:
         left = load.variance if self.flux.beyond is None else load.rest
         assert left is not None and load.variance is not None
         square = poincare(cells.tdim) ** 2 * cells.diameter2[block] * volume * left[block]
-        share = square / pick(self.kappa.low, block)
-        taken = taken_up(cells, load, self.kappa.low, block, reaction)
+        share = square / pick(self.kappa.bounds.low, block)
+        taken = taken_up(cells, load, self.kappa.bounds.low, block, reaction)
         if taken is not None and sums.zeroth is not None:
             whole = volume * load.variance[block]
             np.divide(whole, pick(reaction, block), out=share, where=taken)
@@ -320,7 +320,7 @@ class DualityGap:
         cells, kappa, flux, sums = self.cells, self.kappa, self.flux, self.sums
         jump = apart(cells, self.w, edge, self.v.vertices, self.v.bumps)
         at, sizes = edge.oscillation(flux.beyond is not None)
-        low = pick(kappa.low, at)
+        low = pick(kappa.bounds.low, at)
         squares = sizes**2 / low
         sums.indicators[at] += squares
         sums.totals.neumann = float(np.sum(squares))
@@ -388,7 +388,7 @@ class DualityGap:
             return np.zeros(len(at))
         square = cells.diameter2[at] * cells.volume[at] * load.variance[at]
         size: FloatArray = poincare(cells.tdim) * np.sqrt(square)
-        taken = taken_up(cells, load, self.kappa.low, at, self.reaction)
+        taken = taken_up(cells, load, self.kappa.bounds.low, at, self.reaction)
         return size if taken is None else np.where(taken, 0.0, size)
 
     def _add_edge_products(self, edge: Segments, jump: FloatArray) -> None:
@@ -466,17 +466,20 @@ def of_gradients(kappa: Coefficient, sums: Sums) -> FloatArray:
 
     On strips along the sides of T, κ may be less than elsewhere: little of p + b and of σ is there.
     """
-    found = np.maximum(sums.middle, 0.0) / kappa.inner
+    found = np.maximum(sums.middle, 0.0) / kappa.eigenvalues.core[0]
     if sums.fields is None or kappa.strips is None:
         return found
     own, missed, square = np.maximum(sums.fields, 0.0)
     rest = np.maximum(sums.indicators - square, 0.0)
-    there = 1.0 / kappa.inner + 36.0 * kappa.strips * kappa.inner / kappa.floor**2
-    inner = kappa.inner.copy()
+    there = (
+        1.0 / kappa.eigenvalues.core[0]
+        + 36.0 * kappa.strips * kappa.eigenvalues.core[0] / kappa.eigenvalues.lowest**2
+    )
+    inner = kappa.eigenvalues.core[0].copy()
     if kappa.cut is not None:  # along the jump, maybe, and then integrals have what is in strips
         cut = kappa.cut.pieces.parent
-        inner[cut] = kappa.floor[cut]
-    apart = np.sqrt(own / inner + missed / kappa.floor) + np.sqrt(rest * there)
+        inner[cut] = kappa.eigenvalues.lowest[cut]
+    apart = np.sqrt(own / inner + missed / kappa.eigenvalues.lowest) + np.sqrt(rest * there)
     return np.where(kappa.strips > 0.0, apart**2, found)
 
 
@@ -496,10 +499,10 @@ def _twist(
         P: Fluxes of y − κ_T∇u_h out of them.
         W: u_h at their vertices.
     """
-    mean, low, high = (pick(k, where) for k in (kappa.mean, *kappa.core))
+    mean, low, high = (pick(k, where) for k in (kappa.mean, *kappa.bounds.core))
     spread = np.maximum(1 / low - 1 / mean, 1 / mean - 1 / high)
     if kappa.strips is not None:
-        spread = spread + 36.0 * pick(kappa.strips, where) / pick(kappa.lowest, where)
+        spread = spread + 36.0 * pick(kappa.strips, where) / pick(kappa.bounds.lowest, where)
     steep = np.sqrt(np.maximum(dot_rows(W, cells.apply(W, where)), 0.0))
     return spread * (np.sqrt(np.maximum(field_squares(cells, P, where), 0.0)) + mean * steep)
 
@@ -642,8 +645,8 @@ def _of_tensor(
     energy = rough * mean * volume * steep[0]
     if kappa.strips is not None:
         part = _QUADRATIC[d] * kappa.strips[block] * volume
-        of_y = part * yy / kappa.lowest[block]
-        of_v, of_other = part * kappa.high[block] * steep
+        of_y = part * yy / kappa.bounds.lowest[block]
+        of_v, of_other = part * kappa.bounds.high[block] * steep
         far, near = far + 4.0 * (of_y + of_v), near + 4.0 * (of_y + of_other)
         energy = energy + 0.5 * of_v
     return volume * vv, far, near, energy
@@ -723,12 +726,13 @@ def _tensor_within(
         steep += weight * (slope**2).sum(axis=1)
         off += weight * tensor
     pull = volume * np.einsum("ink,nk->in", gradients, total)
-    missed, strips = 2.0 * kappa.rough[block] * k, 0.0
+    missed = 2.0 * kappa.rough[block] * k
+    strips: FloatArray = np.zeros_like(missed)
     if kappa.strips is not None:
-        strips = _QUADRATIC[cells.tdim] * kappa.strips[block] * kappa.high[block]
+        strips = _QUADRATIC[cells.tdim] * kappa.strips[block] * kappa.bounds.high[block]
     mean = k + missed + strips + np.linalg.norm(off, axis=(1, 2))
     unsure = (missed + strips) * volume * np.sqrt(steep)
-    return pull, unsure, np.fmin(mean, pick(kappa.high, block))
+    return pull, unsure, np.fmin(mean, pick(kappa.bounds.high, block))
 
 
 def _with_slack(rows: FloatArray, errors: FloatArray, d: int, largest: int) -> FloatArray:

@@ -66,8 +66,8 @@ class Loss:
         cells = self.data.cells
         edges, squares = self.data.losing(w)
         goal = size**2 / np.sqrt(kappa.smallest)  # as they are a part of J
-        return Segments.joined(edges, cells, w, kappa.low, size), tuple(
-            Segments.of(each, cells, kappa.low, goal, norms=False) for each in squares
+        return Segments.joined(edges, cells, w, kappa.bounds.low, size), tuple(
+            Segments.of(each, cells, kappa.bounds.low, goal, norms=False) for each in squares
         )
 
 

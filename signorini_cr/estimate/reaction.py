@@ -66,7 +66,7 @@ class Reaction:
             kappa: The coefficient.
             size: About how large the bound will be.
         """
-        data, cells, low = self.data, self.data.cells, kappa.low
+        data, cells, low = self.data, self.data.cells, kappa.bounds.low
         if not self.varies:
             found = Certain.of(data.compiled.f, data.of_f, cells, low, size, self.low)
             load = self._less(data.moments.with_source(found.load), w)

@@ -20,6 +20,7 @@ from signorini_cr import (
     Neumann,
     Polygon,
     Problem,
+    Solver,
     limits,
     memory,
     solve,
@@ -460,6 +461,14 @@ def test_so_is_a_first_level(element: str, dim: int, monkeypatch) -> None:
         with pytest.raises(NotConverged, match=f"its {count} degrees of freedom") as caught:
             next(solve_levels(problem, domain, 2, element, restart=start))
         assert caught.value.level == number
+
+
+def test_so_are_meshes_of_a_solver() -> None:
+    """Of 20 meshes: 10^13 dofs, which no machine holds; none of them is begun."""
+    domain = rectangle(0.5)
+    with pytest.raises(NotConverged, match="degrees of freedom would take about") as caught:
+        Solver(Problem(f=-3.0, obstacle=-0.2), domain, levels=20)
+    assert caught.value.level == 19
 
 
 @pytest.mark.serial

@@ -809,6 +809,18 @@ def test_refusals():
         assert words in certificate.reason
 
 
+@pytest.mark.parametrize("tensor", [False, True])
+def test_a_coefficient_without_bounds_in_one_corner_has_none_on_all_ranks(tensor):
+    """There it is infinite, which only the rank that has the corner sees."""
+
+    def kappa(x):
+        own = 1 + ((x[0] - 1) ** 2 + (x[1] - 1) ** 2) ** -0.125
+        return ufl.as_matrix([[own, 0], [0, 2]]) if tensor else own
+
+    certificate = certify(solve(Problem(f=1.0, coefficient=kappa), exact.S1.structured(8)))
+    assert certificate.bound_h1 is None and "no computable upper" in certificate.reason
+
+
 @pytest.mark.parametrize(
     "expression",
     [

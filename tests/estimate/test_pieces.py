@@ -14,7 +14,7 @@ from mpi4py import MPI
 from signorini_cr import Polygon, Problem, solve, solve_levels
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
-from signorini_cr.data.quadrature import OnParts
+from signorini_cr.data.quadrature import Between, OnParts
 from signorini_cr.data.triangles import Triangles
 from signorini_cr.estimate import (
     certificate,
@@ -547,12 +547,9 @@ def some_cells(seed):
     domain = square(2, comm=MPI.COMM_SELF)
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     rng = np.random.default_rng(seed)
-    kappa = SimpleNamespace(
-        strips=None, low=rng.uniform(0.5, 1, cells.number), high=rng.uniform(1, 3, cells.number)
-    )
-    kappa.mean = (kappa.low + kappa.high) / 2
-    kappa.least, kappa.most = kappa.low, kappa.high
-    kappa.core, kappa.inner = (kappa.low, kappa.high), kappa.low
+    low, high = rng.uniform(0.5, 1, cells.number), rng.uniform(1, 3, cells.number)
+    bounds = Between.all_over(low, high)
+    kappa = SimpleNamespace(strips=None, mean=(low + high) / 2, bounds=bounds, eigenvalues=bounds)
     rows = dict(
         zip(
             ("indicators", "steepness", "middle", "across"),
@@ -598,7 +595,7 @@ def test_what_a_lifting_changes(known, reaction):
     found = certificate._lifted(known_data, v, sums)
     square_, change, far, near = 0.0, 0.0, 0.0, 0.0
     for cell, which in ((1, [0]), (4, [1, 2])):
-        steep = np.sqrt(kappa.high[cell]) * slope[which].sum()
+        steep = np.sqrt(kappa.bounds.high[cell]) * slope[which].sum()
         volume = cells.volume[cell]
         norm = np.sqrt(volume) * np.sqrt(
             load.mean[cell] ** 2 + (0.0 if variance is None else variance[cell])
@@ -631,16 +628,16 @@ def test_rounding():
     """As large as values times the hat functions' gradients, as c^{1/2} u_h and as h‖f‖."""
     cells, rng, kappa, _ = some_cells(2)
     none = SimpleNamespace(beyond=None, excess=np.zeros(1))
-    kappa.smallest = float(kappa.low.min())
+    kappa.smallest = float(kappa.bounds.low.min())
     for sign, c in ((1, 0.0), (-1, 0.0), (1, 7.0)):
         w = sign * np.array([[3.0], [1.0], [2.0]]) * np.ones(cells.number)
         load = SimpleNamespace(mean=np.zeros(cells.number), variance=None)
         of_hats = -2 * cells.stiffness.sum(axis=0)
         found = certificate._rounding(cells, kappa, np.array(c), w, load, none)
-        expected = np.sqrt(np.sum((kappa.high * of_hats + c * cells.volume) * 9.0))
+        expected = np.sqrt(np.sum((kappa.bounds.high * of_hats + c * cells.volume) * 9.0))
         assert np.isclose(found, 64 * 2.0**-52 * expected, atol=0.0)
     load = SimpleNamespace(mean=-np.ones(cells.number), variance=np.full(cells.number, 4.0))
-    expected = cells.lengths.max(axis=0) * cells.volume * 9.0 / kappa.low
+    expected = cells.lengths.max(axis=0) * cells.volume * 9.0 / kappa.bounds.low
     found = certificate._rounding(cells, kappa, np.array(5.0), 0 * w, load, none)
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
     load.mean[:], load.variance = 1e-200, None  # whose square is no number
@@ -649,7 +646,7 @@ def test_rounding():
     assert certificate._rounding(cells, kappa, np.array(0.0), 0 * w, load, none) == 0.0
     heights = rng.normal(size=len(cells.exterior))
     fluxes = SimpleNamespace(beyond=Beyond(heights, None), excess=np.zeros(1))
-    expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.low
+    expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.bounds.low
     found = certificate._rounding(cells, kappa, np.array(5.0), 0 * w, load, fluxes)
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
 
@@ -695,8 +692,9 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     rng = np.random.default_rng(4)
     n, number = len(edge.measure), cells.number
     low = rng.uniform(0.5, 1, number)
-    kappa = SimpleNamespace(low=low, least=low)
-    segments = Segments.of(edge, cells, kappa.low, 1.0)
+    bounds = Between.all_over(low, low)
+    kappa = SimpleNamespace(bounds=bounds, eigenvalues=bounds)
+    segments = Segments.of(edge, cells, kappa.bounds.low, 1.0)
     missed, rough = (rng.uniform(size=n) * of_g for _ in range(2))
     segments = replace(segments, missed=missed, rough=rough)
     zero = np.zeros(number)
@@ -720,7 +718,7 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
     total, squares, energy = zero.copy(), 0.0, 0.0
     if of_f:
         total += of_cells[0]
-        left = poincare / np.sqrt(kappa.low) * of_cells[1]
+        left = poincare / np.sqrt(kappa.bounds.low) * of_cells[1]
         taken_up = np.inf if reaction == 0.0 else reaction**-0.5 * of_cells[1]
         squares = np.sum(np.minimum(left, taken_up) ** 2)
         mean = np.abs(vertices[cells.vertices].mean(axis=0))
@@ -738,8 +736,8 @@ def test_what_quadrature_misses(of_f, of_g, reaction):
         energy += (abs(a + b) / 2 + bump) * missed[facet]
         swing = abs(a - b) + 2 * bump + 0.1 * abs(thirds[cells.facets[local, cell]])
         energy += swing * np.sqrt(edge.measure[facet]) * rough[facet]
-    of_edge = np.sqrt(sum(value**2 / kappa.low[cell] for cell, value in by_cell.items()))
-    in_all = unbalanced(level, cells, total, kappa.low, 0.0)
+    of_edge = np.sqrt(sum(value**2 / kappa.bounds.low[cell] for cell, value in by_cell.items()))
+    in_all = unbalanced(level, cells, total, kappa.bounds.low, 0.0)
     if reaction:
         in_all = min(in_all, np.sqrt(np.sum(total**2 / cells.volume) / reaction))
     expected = np.sqrt(squares) + of_edge + in_all
@@ -958,7 +956,9 @@ def test_twist():
     everywhere = slice(0, cells.number)
     field = np.sqrt(field_squares(cells, P, everywhere))
     slope = np.sqrt((w * cells.apply(w, everywhere)).sum(axis=0))
-    spread = np.maximum(1 / kappa.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.high)
+    spread = np.maximum(
+        1 / kappa.bounds.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.bounds.high
+    )
     found = duality._twist(cells, kappa, everywhere, P, w)
     assert np.allclose(found, spread * (field + kappa.mean * slope))
 
@@ -1316,7 +1316,7 @@ def test_what_oscillates_on_thin_cells():
     at = ((kappa.mean, weight, hat) for hat, weight in zip(points, weights, strict=True))
     pp, bb, pb, *_ = duality._at_points(cells, kappa.mean, slice(0, number), fluxes, v, w, at)
     norm = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702
-    norm = norm * np.sqrt(cells.volume * load.rest / kappa.low)
+    norm = norm * np.sqrt(cells.volume * load.rest / kappa.bounds.low)
     near, far = (np.sqrt(pp + bb + 2 * sign * pb) for sign in (1, -1))
     assert np.allclose(sums.middle, (near + norm) ** 2)
     assert np.allclose(sums.across, (far + norm) ** 2)
@@ -1342,7 +1342,7 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     level = solve(Problem(f=1.0, g=g), square(2, sides, MPI.COMM_SELF)).level
     data = diffusion(level.data)
     cells, _, kappa, sums = some_cells(16)
-    edge = Segments.of(data.edges[0], data.cells, kappa.low, 1.0)
+    edge = Segments.of(data.edges[0], data.cells, kappa.bounds.low, 1.0)
     before = {name: getattr(sums, name).copy() for name in ("indicators", "middle", "across")}
     fluxes = SimpleNamespace(beyond=Beyond(np.zeros(len(cells.exterior)), None))
     none, w = np.zeros(len(cells.exterior)), np.zeros((3, cells.number))
@@ -1353,7 +1353,7 @@ def test_what_oscillates_on_the_edges_of_thin_cells():
     at, sizes = edge.oscillation(True)
     assert sums.totals.loose == 0.0 and len(at) == 4 and sizes.min() > 1e-3
     norms = np.zeros(cells.number)
-    norms[at] = sizes / np.sqrt(kappa.low[at])
+    norms[at] = sizes / np.sqrt(kappa.bounds.low[at])
     assert (
         np.isclose(sums.totals.neumann, np.sum(norms**2))
         and sums.totals.load == sums.totals.neumann

@@ -16,7 +16,7 @@ from signorini_cr import Domain, InputError, Polygon, Problem, solve
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Certain, Known, Segments, VolumeMoments
 from signorini_cr.data.pieces import Pieces
-from signorini_cr.data.quadrature import OnParts
+from signorini_cr.data.quadrature import Between, OnParts
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate, cusps, duality, flux, force, pairing, weights
 from signorini_cr.estimate.beyond import Beyond
@@ -596,10 +596,10 @@ def test_signs_that_are_certain():
 
 
 def random_kappa(rng, number):
+    low, high = rng.uniform(0.5, 1, number), rng.uniform(1, 3, number)
     kappa = SimpleNamespace(values=None, cut=None, tensor=None, varies=False, strips=None)
-    kappa.low, kappa.high = rng.uniform(0.5, 1, number), rng.uniform(1, 3, number)
-    kappa.core = kappa.low, kappa.high
-    kappa.mean = kappa.low + rng.uniform(0.02, 0.98, number) * (kappa.high - kappa.low)
+    kappa.bounds = Between.all_over(low, high)
+    kappa.mean = low + rng.uniform(0.02, 0.98, number) * (high - low)
     return kappa
 
 
@@ -627,7 +627,7 @@ def test_the_gap_with_a_reaction(bent):
     pp, bb, pb = (at.integral(each.sum(axis=2)) for each in (field**2 / k, k * off**2, field * off))
     rest = f - (f @ at.weights)[:, None]
     norm, h2 = at.integral(rest**2), cells.lengths.max(axis=0)
-    by_slope = h2 / 3.8317059702**2 * norm / kappa.low
+    by_slope = h2 / 3.8317059702**2 * norm / kappa.bounds.low
     by_c = np.divide(norm, c, out=np.full(number, np.inf), where=c > 0)
     share, taken = np.minimum(by_slope, by_c), by_c < by_slope
     assert 3 < taken.sum() < number - 3
@@ -927,8 +927,10 @@ def test_what_v_is_to_make_small(plain):
     loss = np.array([0.0, 0.01, 0.02, 50.0, 60.0, 0.0])
     edge, shed = replace(edge, loss=loss, low=kappa), rng.normal(size=n) * (loss > 0)
     varies = np.arange(cells.number) % 3 == 0
-    of_cells = SimpleNamespace(low=kappa, mean=kappa * (1 + 1e-3 * varies))
-    of_cells.high = kappa * (1 + 2e-3 * varies)
+    of_cells = SimpleNamespace(
+        mean=kappa * (1 + 1e-3 * varies),
+        bounds=Between.all_over(kappa, kappa * (1 + 2e-3 * varies)),
+    )
     # cells where c varies, or is more than κ/h², are not steady either
     reacts = np.arange(cells.number) % 5 * (not plain)
     low, high = (
@@ -981,7 +983,7 @@ def test_the_gap_on_sides(reacts):
     n, where = len(edge.loss), edge.facets.cells
     loss = np.array([0.0, 0.01, 0.02, 50.0, 60.0, 0.0])
     shed = rng.normal(size=n) * (loss > 0)
-    edge = replace(edge, loss=loss, low=kappa.low)
+    edge = replace(edge, loss=loss, low=kappa.bounds.low)
     excess, w = rng.normal(size=(2, 3, number))
     _, made = made_up(cells, 23)
     variance = rng.uniform(size=number)
@@ -999,7 +1001,7 @@ def test_the_gap_on_sides(reacts):
     rest -= (rest @ on.weights)[:, None]
     h = np.sqrt(cells.lengths.max(axis=0)[where])
     c = h / 3.8317059702
-    strong = loss * on.length / at.area[where] * c * (c + h) > kappa.low[where]
+    strong = loss * on.length / at.area[where] * c * (c + h) > kappa.bounds.low[where]
     assert np.array_equal(strong, loss > 1.0)
     inverse = np.divide(1.0, loss, out=np.zeros(n), where=loss > 0)
     apart = loss * on.integral(jump**2)
@@ -1009,13 +1011,15 @@ def test_the_gap_on_sides(reacts):
     potential /= (2 * at.area * kappa.mean)[where, None]
     of_p, of_b = (on.integral(rest * each) for each in (potential, jump))
     cell, sizes = edge.oscillation(False)
-    square_ = sizes**2 / kappa.low[cell]
+    square_ = sizes**2 / kappa.bounds.low[cell]
     norm = cells.lengths.max(axis=0) ** 0.5 / 3.8317059702 * np.sqrt(at.area * variance)
     if reacts:
-        norm[at.area * variance * kappa.low < reaction * norm**2] = 0.0
+        norm[at.area * variance * kappa.bounds.low < reaction * norm**2] = 0.0
         assert 0 < np.sum(norm[cell] == 0.0) < len(cell)
-    more = (2 * norm[cell] * sizes + sizes**2) / kappa.low[cell]
-    spread = np.maximum(1 / kappa.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.high)
+    more = (2 * norm[cell] * sizes + sizes**2) / kappa.bounds.low[cell]
+    spread = np.maximum(
+        1 / kappa.bounds.low - 1 / kappa.mean, 1 / kappa.mean - 1 / kappa.bounds.high
+    )
     field = np.sqrt(at.integral((at.field(excess) ** 2).sum(axis=2)))
     slope = np.sqrt(at.integral((at.affine(w)[1] ** 2).sum(axis=2)))
     slack = sizes * (spread * (field + kappa.mean * slope))[cell]
