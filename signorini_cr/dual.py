@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from dolfinx import fem
@@ -40,15 +42,18 @@ class Dual:
         return self.level.physics.element
 
 
-def solved(dual: Problem, level: Level) -> Dual:
-    """Solve a problem without contact; collective.
+@contextmanager
+def solved(dual: Problem, level: Level) -> Iterator[Dual]:
+    """Solve a problem without contact, for a block that makes use of the solution; collective.
 
-    What is certain about its solution is so for whatever comes of it. Whoever has no
-    more use for its level tidies it.
+    What is certain about it is so for whatever comes of the solve.
 
     Args:
         dual: The problem.
         level: The meshes.
+
+    Yields:
+        The solution; what its certificate takes beside it goes with the block.
     """
     coarsest = level.meshes[0].domain
     physics = Diffusion(dual, coarsest.mesh, "CR", coarsest.parts, coarsest.materials)
@@ -61,12 +66,13 @@ def solved(dual: Problem, level: Level) -> Dual:
     u.x.scatter_forward()
     u.x.array[:] += system.offset
     release(load, found)
-    return Dual(level, u)
+    try:
+        yield Dual(level, u)
+    finally:
+        level.tidy()
 
 
 def certified(dual: Problem, level: Level) -> Certificate:
     """Solve it and say what is certain, with a companion in P1 where that will do; collective."""
-    z = solved(dual, level)
-    certificate = certify(z, sweeps=0)
-    z.level.tidy()
-    return certificate
+    with solved(dual, level) as z:
+        return certify(z, sweeps=0)

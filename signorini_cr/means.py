@@ -95,16 +95,13 @@ def _bounded(
         raise InputError(f"{NO_MEAN}: {AFLOAT}")
     cells = made.cells()
     _insist_on_extent(cells, place)
-    z = solved(
-        _dual(forms, place, 1.0 if weight is None else scalar(weight, forms, level.domain)), level
-    )
-    dual = certify(z, sweeps=0)
-    if dual.energy is None or dual.bound_companion is None:
-        z.level.tidy()
-        _insist_on_weight(dual.reason)
-    assert dual.energy is not None and dual.bound_companion is not None
-    known = _paired(z, made, cells, place, bound * dual.bound_companion)
-    z.level.tidy()
+    psi = 1.0 if weight is None else scalar(weight, forms, level.domain)
+    with solved(_dual(forms, place, psi), level) as z:
+        dual = certify(z, sweeps=0)
+        if dual.energy is None or dual.bound_companion is None:
+            _insist_on_weight(dual.reason)
+        assert dual.energy is not None and dual.bound_companion is not None
+        known = _paired(z, made, cells, place, bound * dual.bound_companion)
     # with the energy norm, that of the functional is the dual solution's, its square −2 J(z)
     norm = np.sqrt(max(-2.0 * dual.energy[0], 0.0))
     shifts = [

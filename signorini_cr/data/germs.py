@@ -23,7 +23,18 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import at_points
 from ..fem.pointwise import Unknown
 from ..fem.simplified import bits
-from .jets import SERIES, Boxes, Enclosure, Range, mul, out, power_series, square_of
+from .jets import (
+    SERIES,
+    Boxes,
+    Enclosure,
+    Range,
+    Truth,
+    decided,
+    mul,
+    out,
+    power_series,
+    square_of,
+)
 
 SECTORS = 16
 """Sectors that the directions from a point into a triangle are divided into."""
@@ -106,7 +117,7 @@ class _Germs:
         if isinstance(e, classes.Indexed):
             return self._component(*operands)
         if isinstance(e, classes.Conditional):
-            holds, fails = self._truth(operands[0])
+            holds, fails = decided(operands[0], self._compared)
             return self._choice(holds, fails, self(operands[1]), self(operands[2]))
         if isinstance(e, classes.Power):
             exponent = self(operands[1])
@@ -246,24 +257,14 @@ class _Germs:
         low, high = self._sign(a, b)
         return high > 0, low < 0
 
-    def _truth(self, e: Any) -> tuple[BoolArray, BoolArray]:
-        """Tell where a condition can hold, and where it can fail, but for null sets."""
-        if isinstance(e, classes.NotCondition):
-            return self._truth(e.ufl_operands[0])[::-1]
-        if isinstance(e, classes.AndCondition | classes.OrCondition):
-            (holds, fails), (also, nor) = (self._truth(operand) for operand in e.ufl_operands)
-            if isinstance(e, classes.AndCondition):
-                return holds & also, fails | nor
-            return holds | also, fails & nor
-        if isinstance(e, classes.GT | classes.GE | classes.LT | classes.LE):
-            left, right = e.ufl_operands
-            if isinstance(e, classes.LT | classes.LE):
-                left, right = right, left
-            low, high = self._sign(self(left), self(right))
-            strict = isinstance(e, classes.GT | classes.LT)
-            zero = (low == 0) & (high == 0)
-            return (high > 0) | (zero & (not strict)), (low < 0) | (zero & strict)
-        raise Unknown(type(e).__name__)
+    def _compared(self, e: Any, left: Any, right: Any) -> Truth:
+        """Tell where a comparison can hold, and where it can fail, but for null sets."""
+        if isinstance(e, classes.EQ | classes.NE):
+            raise Unknown(type(e).__name__)
+        low, high = self._sign(self(left), self(right))
+        strict = isinstance(e, classes.GT | classes.LT)
+        zero = (low == 0) & (high == 0)
+        return (high > 0) | (zero & (not strict)), (low < 0) | (zero & strict)
 
     def _choice(self, first: BoolArray, second: BoolArray, a: Germ, b: Germ) -> Germ:
         """Choose a where only the first can be, b where only the second, else the hull of both."""

@@ -628,18 +628,9 @@ class Enclosure:
 
     def truth(self, e: Any) -> Truth:
         """Tell where in the boxes a condition can hold and can fail, but for null sets."""
-        if isinstance(e, classes.NotCondition):
-            return self.truth(e.ufl_operands[0])[::-1]
-        if isinstance(e, classes.AndCondition | classes.OrCondition):
-            (holds, fails), (also, nor) = (self.truth(operand) for operand in e.ufl_operands)
-            if isinstance(e, classes.AndCondition):
-                return holds & also, fails | nor
-            return holds | also, fails & nor
-        if not isinstance(e, _COMPARISONS):
-            raise Unknown(type(e).__name__)
-        left, right = e.ufl_operands
-        if isinstance(e, classes.LT | classes.LE):
-            left, right = right, left
+        return decided(e, self._compared)
+
+    def _compared(self, e: Any, left: Any, right: Any) -> Truth:
         low, high, thin = self._difference(self(left), self(right))
         if self.boxes.corners is not None and self.boxes.along is None and self.order >= 2:
             low, high = self._by_slopes(low, high, left, right)
@@ -1060,6 +1051,31 @@ _KNOWN = (
 """Kinds of expressions that need no lowering."""
 _ORDERED = (classes.GT, classes.GE, classes.LT, classes.LE)
 _COMPARISONS = (*_ORDERED, classes.EQ, classes.NE)
+
+
+def decided(e: Any, compare: Callable[[Any, Any, Any], Truth]) -> Truth:
+    """Tell where a condition can hold, and where it can fail, by what is known of comparisons.
+
+    Args:
+        e: The condition.
+        compare: Tells it of a comparison, with its two sides, what is to be larger first.
+
+    Raises:
+        Unknown: It is made of something else.
+    """
+    if isinstance(e, classes.NotCondition):
+        return decided(e.ufl_operands[0], compare)[::-1]
+    if isinstance(e, classes.AndCondition | classes.OrCondition):
+        (holds, fails), (also, nor) = (decided(operand, compare) for operand in e.ufl_operands)
+        if isinstance(e, classes.AndCondition):
+            return holds & also, fails | nor
+        return holds | also, fails & nor
+    if not isinstance(e, _COMPARISONS):
+        raise Unknown(type(e).__name__)
+    left, right = e.ufl_operands
+    if isinstance(e, classes.LT | classes.LE):
+        left, right = right, left
+    return compare(e, left, right)
 
 
 # ---- conditionals that are continuous
