@@ -284,7 +284,35 @@ def _shown(value: Any) -> str:
     return repr(value) if plain or (isinstance(value, tuple) and not value) else "…"
 
 
+def modules() -> str:
+    """What each module is for, street by street, in Markdown."""
+    lines = ["# Module by module", "", ABOUT_MODULES, ""]
+    folders = [PACKAGE, *sorted(path.parent for path in PACKAGE.glob("*/__init__.py"))]
+    for folder in folders:
+        lines += [f"## {folder.name}" if folder != PACKAGE else "## Beside the streets", ""]
+        if folder != PACKAGE:
+            lines += [" ".join(_docstring(folder / "__init__.py").split()), ""]
+        lines += ["| module | |", "|---|---|"]
+        for path in sorted(folder.glob("*.py")):
+            if path.stem != "__init__":
+                first = " ".join(_docstring(path).split("\n\n")[0].split())
+                lines.append(f"| `{path.stem}` | {first.replace('|', chr(92) + '|')} |")
+        lines.append("")
+    return "\n".join(lines) + MADE.format("the modules' docstrings")
+
+
+PACKAGE = Path(signorini_cr.__file__).parent
+ABOUT_MODULES = """\
+What each file of the package is for, in the words it begins with. `ARCHITECTURE.md`, beside the
+README, draws the streets, and says where a change goes."""
+
+
+def _docstring(path: Path) -> str:
+    return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+
+
 PAGES = {
+    "modules.md": modules,
     "problem-file.md": page,
     "command.md": command,
     "figures.md": figures,
