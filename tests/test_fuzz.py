@@ -3,6 +3,7 @@
     container/run python3 tests/test_fuzz.py --expressions 100000 --files 20000 --problems 3000
 
 draws as many as one likes and prints how they ended; under pytest there are few, always the same.
+Under mpirun each problem is solved by all ranks together, and by each alone.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import time
 import tomllib
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,11 @@ from mpi4py import MPI
 
 from signorini_cr.app import cli, problemfile
 from signorini_cr.app.expressions import parse
-from signorini_cr.errors import InputError, NotConverged
+from signorini_cr.errors import InputError, NotConverged, fail_together
 from signorini_cr.fem.pointwise import evaluate
 from signorini_cr.fem.simplified import simplified
+from signorini_cr.solution import Solution
 
-pytestmark = pytest.mark.serial
 few = settings(
     derandomize=True, database=None, deadline=None, max_examples=60,
     suppress_health_check=list(HealthCheck),
@@ -215,6 +216,7 @@ def check_expression(text: str) -> None:
             ENDS["values that rounding decides"] += 1
 
 
+@pytest.mark.serial
 @few
 @example("-(sin((atan2(1, 1_000)) ** (-(3))))")
 @given(expressions)
@@ -222,6 +224,7 @@ def test_expressions_mean_what_python_means(text: str) -> None:
     check_expression(text)
 
 
+@pytest.mark.serial
 @few
 @given(damaged(expressions))
 def test_damaged_expressions_are_read_or_refused(text: str) -> None:
@@ -250,6 +253,7 @@ def check_ufl(text: str) -> None:
             assert close or not np.allclose(near, value, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.serial
 @few
 @given(expressions)
 def test_ufl_agrees_with_numpy(text: str) -> None:
@@ -291,6 +295,7 @@ def check_tower(text: str) -> None:
     ENDS["towers"] += 1
 
 
+@pytest.mark.serial
 @settings(few, max_examples=20)
 @given(towers())
 def test_functions_of_functions_are_differentiated(text: str) -> None:
@@ -449,12 +454,14 @@ def solve_file(path: Path) -> None:
     shutil.rmtree(out, ignore_errors=True)
 
 
+@pytest.mark.serial
 @settings(few, max_examples=8)
 @given(tables())
 def test_problem_files_are_solved_or_refused(text: str) -> None:
     look_at_file(text, 1)
 
 
+@pytest.mark.serial
 @pytest.mark.slow
 @few
 @given(damaged(st.sampled_from(SOURCES), WORDS))
@@ -462,6 +469,7 @@ def test_damaged_problem_files_are_read_or_refused(text: str) -> None:
     check_file(text)
 
 
+@pytest.mark.serial
 @few
 @given(tables())
 def test_changed_problem_files_are_read_or_refused(text: str) -> None:
@@ -585,7 +593,38 @@ FEATURES: dict[str, Callable[[dict[str, Any], st.DrawFn, float], None]] = {
 
 
 def check_problem(text: str) -> None:
-    """Solved, with figures of three meshes that do not contradict one another; or refused.
+    """Solved or refused, by all ranks that there are; and by one alone as by several."""
+    comm, error, solved = MPI.COMM_WORLD, None, None
+    try:
+        solved = solve_problem(text, comm)
+        alone = solve_problem(text, MPI.COMM_SELF) if comm.size > 1 else None
+        if alone is not None:
+            assert (solved is None) == (not alone)
+            compare(solved or [], alone)
+    except Exception as caught:
+        error = caught
+    fail_together(comm, error)  # or hypothesis would go on with another problem on some ranks
+
+
+def compare(solved: Sequence[Solution], alone: Sequence[Solution]) -> None:
+    """Figures on several ranks are those on one, as long as meshes are the same."""
+    for one, other in zip(solved, alone, strict=True):
+        if one.dofs != other.dofs:
+            ENDS["meshes that differ between ranks"] += 1
+            return
+        sizes = [abs(one.energy), abs(other.energy), *np.abs(one.certificate.energy or 0.0)]
+        assert abs(one.energy - other.energy) <= 1e-8 * max(sizes), (one.energy, other.energy)
+        force = max(abs(one.contact.force), abs(other.contact.force))
+        assert abs(one.contact.force - other.contact.force) <= 1e-6 * force + 1e-9
+        bounds = one.certificate.bound_h1, other.certificate.bound_h1
+        assert (bounds[0] is None) == (bounds[1] is None), bounds
+        if bounds[0] is not None and bounds[1] is not None:
+            assert abs(bounds[0] - bounds[1]) <= 0.03 * bounds[1] + 1e-12, bounds
+        ENDS["solutions as on one rank"] += 1
+
+
+def solve_problem(text: str, comm: MPI.Comm) -> list[Solution] | None:
+    """Solve, with figures of three meshes that do not contradict one another; None if refused.
 
     The energy lies in every mesh's bracket, so that any two of them overlap. In time each step is
     a problem of its own.
@@ -593,12 +632,12 @@ def check_problem(text: str) -> None:
     path = Path(scratch().name) / "case.toml"
     path.write_text(text)
     try:
-        file = problemfile.load(path, MPI.COMM_SELF)
-        domain = file.mesh(MPI.COMM_SELF)
-        cells = domain.mesh.topology.index_map(2).size_local
+        file = problemfile.load(path, comm)
+        domain = file.mesh(comm)
+        cells = domain.mesh.topology.index_map(2).size_global
         if cells > 4000:
             ENDS["problems left out, too many cells"] += 1
-            return
+            return None
         file.check(domain)
         if file.time is None:
             solutions = list(file.solutions(domain))
@@ -607,11 +646,11 @@ def check_problem(text: str) -> None:
     except InputError as error:
         assert str(error)
         ENDS["problems refused"] += 1
-        return
+        return None
     except NotConverged as error:
         assert error.reason
         ENDS["problems not converged"] += 1
-        return
+        return None
     ENDS["problems solved"] += 1
     table = tomllib.loads(text)
     for name in table.keys() & {"material", "boundary", "time"} | table["domain"].keys() & {
@@ -624,7 +663,9 @@ def check_problem(text: str) -> None:
         kkt = solution.contact.kkt
         force = max(abs(solution.contact.force), 1e-12)
         assert kkt.min_gap >= -1e-9 and kkt.residual <= 1e-7, kkt
-        pressure = np.abs(solution.contact.pressure).max(initial=1e-12)
+        pressure = comm.allreduce(
+            float(np.abs(solution.contact.pressure).max(initial=1e-12)), op=MPI.MAX
+        )
         assert kkt.min_pressure >= -1e-6 * pressure, (kkt, force)
         certificate = solution.certificate
         if certificate.bound_h1 is None:
@@ -638,6 +679,7 @@ def check_problem(text: str) -> None:
             lowest, highest = max(lowest, low), min(highest, high)
         assert lowest <= highest + slack, "the brackets of two meshes do not overlap"
         ENDS["bounds"] += 1
+    return solutions
 
 
 @pytest.mark.slow
@@ -669,7 +711,7 @@ def main() -> None:
             if number:
                 long = settings(few, derandomize=False, max_examples=number)
                 seed(arguments.seed)(long(given(strategy)(check)))()
-    for end, count in sorted(ENDS.items()):
+    for end, count in sorted(ENDS.items() if MPI.COMM_WORLD.rank == 0 else []):
         print(f"{count:8d} {end}")
 
 

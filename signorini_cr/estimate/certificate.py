@@ -518,8 +518,8 @@ def _complete(known: _Known, v: Companion, sums: Sums) -> None:
     """Add to what was integrated over cells what facets, ℓ, and c and b that vary have of it."""
     cells, kappa, segments, totals = known.cells, known.kappa, known.segments, sums.totals
     load, c = known.certain.load, known.c
-    gap = DualityGap(cells, kappa, known.w, load, known.flux, v, c.low, c.high, sums)
-    gap.add_edge(segments)
+    duality = DualityGap(cells, kappa, known.w, load, known.flux, v, c.low, c.high, sums)
+    duality.add_edge(segments)
     totals.lift, more_energy, totals.lift_far, totals.lift_near = _lifted(known, v, sums)
     on_edge = on_facet(cells, segments.side, segments.hats, v.vertices, v.bumps, v.thirds)
     lost, unsure = half(known.squares)
