@@ -17,8 +17,11 @@ from dolfinx.mesh import (
 from mpi4py import MPI
 
 from signorini_cr import Contact, Domain, InputError, Neumann, Problem, solve_adaptive, solve_levels
+from signorini_cr.data.consistency import doubts
+from signorini_cr.fem.problem import Forms
 from signorini_cr.fem.space import facet_entities
 from signorini_cr.restart import Restart
+from signorini_cr.verification.exact import S1
 
 COMM = MPI.COMM_WORLD
 OUTSIDE, UNDER, OVER = 1, 2, 3
@@ -93,6 +96,25 @@ def test_faces_of_a_slit_are_told_apart_by_a_restart(adaptive: bool) -> None:
     kept = restart.function(again.u.function_space, 0).x.array
     assert again.u.x.array == pytest.approx(kept, abs=1e-8)
     assert again.energy == pytest.approx(whole[-1].energy, rel=1e-10)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-9, 1e9])
+def test_a_slit_through_which_nothing_flows_is_told(scale: float) -> None:
+    """Not so one that has data, nor a boundary with the outside behind it."""
+
+    def said(*values: float) -> list[str]:
+        domain = slit(4)
+        domain.mesh.geometry.x[:] *= scale
+        conditions = dict(zip((UNDER, OVER), map(Neumann, values), strict=True))
+        problem = Problem(f=-1.0, conditions=conditions)
+        return doubts(Forms(problem, domain.mesh, parts=domain.parts), domain)
+
+    (both,), (one,) = said(0.0, 0.0), said(0.0, 1.0)
+    at = f"({0.75 * scale:.10g}, {scale:.10g})"
+    assert f"on both sides of 4 facets of its boundary, as at {at}: a slit" in both
+    assert "on both sides of 2 facets" in one and said(1.0, 1.0) == []
+    whole = S1.structured(4)
+    assert doubts(Forms(Problem(f=-1.0), whole.mesh, parts=whole.parts), whole) == []
 
 
 def test_vertices_on_a_slit_are_not_told_apart() -> None:

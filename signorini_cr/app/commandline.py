@@ -29,8 +29,8 @@ PETSC_NOTE = (
 EXIT_NOTE = (
     "Exit status: 0 solved, every level converged; 2 bad input, nothing written; 3 not converged,"
     " stopped by a limit, or out of memory or, after the first level, disk; 130 interrupted; 143,"
-    " or 129 where a terminal is closed, terminated. Report and tables of a level, or step, are"
-    " kept as soon as it is finished, whatever ends the run then."
+    " or 129 where a terminal is closed, or 152 by a limit of CPU time, terminated. Report and"
+    " tables of a level, or step, are kept as soon as it is finished, whatever ends the run then."
 )
 
 

@@ -57,6 +57,7 @@ class Run:
         domain: The coarsest mesh.
         problem: What is told of it, by name.
         kept: Records of what is safe in the folder.
+        former: What there is in it of former runs.
     """
 
     args: argparse.Namespace
@@ -67,6 +68,7 @@ class Run:
     domain: Domain
     problem: dict[str, str]
     kept: list[output.Record]
+    former: Sequence[str]
 
     @property
     def element(self) -> str:
@@ -143,6 +145,7 @@ class Run:
                 resumable=True,
                 moments=moments,
                 tell=self.screen.warn,
+                former=self.former,
             )
             if self.args.html:
                 names.append(self._write_page(report))

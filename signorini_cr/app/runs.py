@@ -53,7 +53,8 @@ def solve_case(
     case, domain = read_case(args, screen, comm)
     problem = statement(case, domain)
     screen.line(f"{folded(problem)}\n")
-    run = Run(args, screen, comm, folder, case, domain, problem, kept)
+    former = output.of_former_runs(folder, comm)
+    run = Run(args, screen, comm, folder, case, domain, problem, kept, former)
     if case.time is None:
         _solve_levels(run)
     else:
@@ -98,8 +99,8 @@ def _solve_levels(run: Run) -> None:
             report = run.report([*kept, record])
             with naming("--out"):
                 restart = Restart.of(solution, restart, run.case.mode == "adaptive")
-                write = partial(output.write_levels, run.folder, report, solution, restart, said)
-                keep(write, kept, [record])
+                facts = report, solution, restart, said, run.former
+                keep(partial(output.write_levels, run.folder, *facts), kept, [record])
             finest = solution
             if screen.verbose:
                 taken = solution.iterations.preconditioner

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: an end in good order, at a moment when it does no harm."""
+"""Ctrl-C, SIGTERM, SIGHUP and SIGXCPU: an end in good order, at a moment when it does no harm."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-ENDING = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-"""Signals that ask for an end; the last comes where a terminal is closed."""
+ENDING = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGXCPU
+"""Signals that ask for an end; SIGHUP where a terminal is closed, SIGXCPU after a limit of time."""
 
 
 @contextmanager

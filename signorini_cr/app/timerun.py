@@ -108,7 +108,7 @@ class Search:
 
         def write() -> None:
             with naming("--out"):
-                series.write_search(run.folder, report, restart, self._said, run.comm)
+                series.write_search(run.folder, report, restart, self._said, run.former, run.comm)
 
         keep(write, run.kept, [record])
         self.tried = tried
@@ -249,7 +249,13 @@ class Steps:
             facts["search" if search.cut_short is None else "levels"] = search.tried
         with naming("--out"):
             series.write_steps(
-                run.folder, self._report([]), last[0], self._restart, facts, self._moments
+                run.folder,
+                self._report([]),
+                last[0],
+                self._restart,
+                facts,
+                self._moments,
+                run.former,
             )
         if not self._done:  # meshes that were tried, so far
             run.kept.clear()

@@ -1,4 +1,4 @@
-"""Data to think over: an exact solution that is none, a flux on no facet, κ that jumps in cells."""
+"""Data to think over: an exact solution that is none, a flux on no facet, a slit, κ that jumps."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import ufl
-from dolfinx.mesh import compute_midpoints
+from dolfinx.geometry import bb_tree, compute_collisions_points
+from dolfinx.mesh import Mesh, compute_midpoints
 from mpi4py import MPI
 
-from ..arrays import BoolArray, FloatArray, Int32Array
+from ..arrays import BoolArray, FloatArray, Int32Array, summed
 from ..compat import cell_nodes
 from ..fem.conditions import Condition, as_number
 from ..fem.pointwise import evaluate
 from ..fem.problem import Forms
 from ..fem.space import facet_entities, facet_measures, facet_normals
-from ..mesh.domain import Domain
+from ..mesh.domain import Domain, exterior_facets
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
 
 Values = tuple[FloatArray, FloatArray]
@@ -28,6 +29,10 @@ SAME = 1e-6
 
 JUMP = 2.0
 """A factor by which κ may jump inside of a cell: the bound is not the sharper for another mesh."""
+
+BEYOND, INSIDE = 1e-6, 1e-9
+"""Distance behind a facet at which a cell is looked for, in the facet's size, and what a point may
+be outside of a cell, in that one's."""
 
 HALVINGS = 30
 """So many, and the halves of a cell's edge are shorter than what makes κ change by that factor,
@@ -54,7 +59,7 @@ def doubts(forms: Forms, domain: Domain) -> list[str]:
         said = _Solution(forms, domain).complaint()
         if said is not None:
             found.append(f"exact.u: {said}: it is not the solution, and errors say how far from it")
-    return found + _jumps(forms, domain)
+    return found + _slits(forms, domain) + _jumps(forms, domain)
 
 
 def _nowhere(condition: Condition, forms: Forms) -> str:
@@ -67,6 +72,54 @@ def _nowhere(condition: Condition, forms: Forms) -> str:
         f"no edge is labelled {condition.part}; parts with a section of their own take"
         f" boundary.NAME.{condition.names()[0]}"
     )
+
+
+def _slits(forms: Forms, domain: Domain) -> list[str]:
+    """Say that there are cells behind facets through which nothing flows; collective."""
+    mesh = domain.mesh
+    facets: list[Int32Array] = [np.empty(0, dtype=np.int32)]
+    for condition in forms.conditions:
+        closed = condition.flux is None or as_number(condition.flux) == 0.0
+        if closed and condition.fixed is None and condition.loss is None and not condition.bounds:
+            facets.append(domain.facets(condition.number))
+    own: Int32Array = np.concatenate(facets)
+    corners, normals = facet_measures(mesh, own)[0], facet_normals(mesh, facet_entities(mesh, own))
+    sizes = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
+    middles = corners.mean(axis=1)
+    behind = mesh.comm.allgather(middles + BEYOND * sizes[:, None] * normals)
+    start = sum(map(len, behind[: mesh.comm.rank]))
+    occupied = summed(mesh.comm, _inside_of(mesh, np.concatenate(behind)).astype(np.float64)) > 0.0
+    slit = np.flatnonzero(occupied[start : start + len(own)])
+    number = mesh.comm.allreduce(len(slit))
+    at = [place(x, mesh) for x in middles[slit]]
+    where = first(mesh.comm, [(each, shown(each)) for each in at])
+    if where is None:
+        return []
+    return [
+        f"domain: there are cells on both sides of {number} facets of its boundary, as at {where}:"
+        " a slit, through which nothing flows; parts of a mesh that are to be one share their"
+        " nodes, as after gmsh's fragment"
+    ]
+
+
+def _inside_of(mesh: Mesh, x: FloatArray) -> BoolArray:
+    """Tell which points, shape (n, 3), are in cells at the boundary that this rank has."""
+    found = np.zeros(len(x), dtype=bool)
+    cells = np.unique(facet_entities(mesh, exterior_facets(mesh))[:, 0])
+    if not len(cells) or not len(x):
+        return found
+    # DOLFINx's own test of cells takes all that is nearer than a fixed length
+    candidates = compute_collisions_points(
+        bb_tree(mesh, mesh.topology.dim, padding=0.0, entities=cells), x
+    )
+    which = np.repeat(np.arange(len(x)), np.diff(candidates.offsets))
+    d = mesh.topology.dim
+    corners = mesh.geometry.x[cell_nodes(mesh)[candidates.array], :d]
+    edges = (corners[:, 1:] - corners[:, :1]).swapaxes(1, 2)
+    hats = np.linalg.solve(edges, (x[which, :d] - corners[:, 0])[..., None])[..., 0]
+    least = np.minimum(hats.min(axis=1, initial=1.0), 1.0 - hats.sum(axis=1))
+    found[which[least >= -INSIDE]] = True
+    return found
 
 
 def _jumps(forms: Forms, domain: Domain) -> list[str]:

@@ -6,7 +6,7 @@ import fcntl
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def check_writable(
 def write_files(
     folder: Where,
     writers: Mapping[str, Writer],
-    removed: Iterable[str] = (),
+    removed: Sequence[str] = (),
     comm: MPI.Comm = MPI.COMM_WORLD,
     begins: bool = False,
 ) -> list[str]:
@@ -88,7 +88,8 @@ def write_files(
             vouches for the others: it goes before any of `removed` and comes last, so that
             wherever it is found, there is nothing of a former run beside it. Another may leave
             its file out.
-        removed: Names that shall not be there afterwards unless they were written.
+        removed: Names that shall not be there afterwards unless they were written; the last of
+            them goes just before the first file comes.
         comm: The ranks that take part; all must call.
         begins: Whether these are the first of a run: all that is there is another one's then, and
             the file that vouches goes before any is replaced.
@@ -109,14 +110,17 @@ def write_files(
 
     def publish() -> list[str]:
         first, *others = written = [name for name in writers if (stage / name).exists()]
-        obsolete = [path / name for name in set(removed) - set(written)]
+        obsolete = [path / name for name in removed if name not in written]
         with disk_errors(path):
             if begins or any(map(os.path.lexists, obsolete)):
                 (path / first).unlink(missing_ok=True)
-                for each in obsolete:
-                    each.unlink(missing_ok=True)
-            for name in (*others, first):
+            for each in obsolete[:-1]:
+                each.unlink(missing_ok=True)
+            for name in others:
                 os.replace(stage / name, path / name)
+            for each in obsolete[-1:]:
+                each.unlink(missing_ok=True)
+            os.replace(stage / first, path / first)
         held.close()  # before another rank looks
         return written
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
+import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -68,9 +69,9 @@ FILES = (
     checkpoint.MOMENTS,
     CHECKED,
 )
-"""All that `write_output` may leave in a folder; what a run does not give is taken away."""
+"""All that runs may leave in a folder, but for fields of steps in time."""
 FIELDS = "step_*.vtu"
-"""Those of steps in time, which are taken away likewise."""
+"""Those; their numbers have five digits or more."""
 
 MOST_CELLS = 4000
 """Of a mesh that is drawn, if there is a coarser one."""
@@ -226,6 +227,7 @@ def write_levels(
     solution: Solution,
     restart: Restart,
     said: Record,
+    former: Sequence[str],
 ) -> list[str]:
     """Write what costs little, so that it outlives whatever ends the run; collective.
 
@@ -233,12 +235,12 @@ def write_levels(
     Fields and pictures of a former run are removed.
 
     Args:
-        folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
-            touched.
+        folder: Made if it is not there.
         report: From `make_report`.
         solution: The finest level so far.
         restart: From there.
         said: What the run was told to solve; nothing but what JSON knows.
+        former: What `of_former_runs` has found before this run wrote anything.
 
     Returns:
         The names of the files written.
@@ -247,18 +249,37 @@ def write_levels(
         InputError: The folder can't be written to.
     """
     comm = solution.domain.mesh.comm
-    writers = _texts(report, solution)
     facts = {"said": said, "levels": report["levels"]}
-    writers[checkpoint.NAME] = lambda path: checkpoint.write_checkpoint(path, restart, facts, comm)
-    begins = len(report["levels"]) == 1
-    write_files(folder, writers, of_former_runs(folder, comm), comm, begins)
+    texts = _texts(report, solution)
+    # next to the first, so that what a run leaves that is ended on the way is known as a run's
+    writers = {
+        REPORT: texts.pop(REPORT),
+        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
+        **texts,
+    }
+    write_files(folder, writers, former, comm, begins=len(report["levels"]) == 1)
     return list(writers)
 
 
-def of_former_runs(folder: Where, comm: MPI.Comm) -> set[str]:
-    """Find the names of what runs leave, in time or not; collective."""
-    found = on_root(comm, lambda: [path.name for path in Path(folder).glob(FIELDS)])
-    return {*FILES, *found}
+def of_former_runs(folder: Where, comm: MPI.Comm) -> tuple[str, ...]:
+    """Find the names of what a run may have left in a folder, in time or not; collective.
+
+    Returns:
+        Nothing where neither a report nor a file to resume from tells of a run: what is called as
+        its files are is somebody else's. The latter is the last, as by it the others are known.
+    """
+
+    def look() -> list[str]:
+        path = Path(folder)
+        if not any((path / name).exists() for name in (REPORT, checkpoint.NAME)):
+            return []
+        fields = [each.name for each in path.glob(FIELDS) if _FIELD.fullmatch(each.name)]
+        return [*(name for name in FILES if name != checkpoint.NAME), *fields, checkpoint.NAME]
+
+    return tuple(on_root(comm, look))
+
+
+_FIELD = re.compile(r"step_[0-9]{5,}\.vtu")
 
 
 def write_output(
@@ -269,15 +290,15 @@ def write_output(
     resumable: bool = False,
     moments: Sequence[Moment] = (),
     tell: Callable[[str], object] = warnings.warn,
+    former: Sequence[str] | None = None,
 ) -> list[str]:
     """Write everything a run leaves behind, whole or not at all; collective.
 
     A picture that Matplotlib fails to draw is left out.
 
     Args:
-        folder: Made if it is not there. Of what is in it, only files with names of `FILES` are
-            touched: those that this run does not give (the `convergence.png` of a former run)
-            are removed.
+        folder: Made if it is not there. What a former run has left and this one does not give, as
+            its `convergence.png`, is removed.
         report: From `make_report`.
         solution: The finest level: contact.csv, the field and the pictures are of this one.
         pictures: Whether to draw. There are none of three-dimensional domains, and none where
@@ -285,6 +306,7 @@ def write_output(
         resumable: Whether what `write_levels` has left for a run that is resumed is of this one.
         moments: Of a run in time, for the strip; what `series.write_step` has left is of this one.
         tell: Called on all ranks with what a user should know.
+        former: As for `write_levels`; None to look now.
 
     Returns:
         The names of the files written.
@@ -320,8 +342,11 @@ def write_output(
     kept = {checkpoint.NAME} if resumable else set()
     if moments:
         kept |= {"times.csv", "series.pvd", checkpoint.MOMENTS}
-    removed = (set(FILES) if moments else of_former_runs(folder, comm)) - kept
-    return write_files(folder, writers, removed=removed, comm=comm)
+    found = of_former_runs(folder, comm) if former is None else former
+    removed = [
+        name for name in found if name not in kept and not (moments and _FIELD.fullmatch(name))
+    ]
+    return write_files(folder, writers, removed, comm)
 
 
 def _if_drawn(write: Writer, tell: Callable[[str], object]) -> Writer:

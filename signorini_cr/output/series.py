@@ -15,7 +15,7 @@ from ..rounding import at_most, counted, interval, known
 from . import checkpoint
 from .files import Where, Writer, write_files, write_text
 from .meanings import OF_STEPS
-from .report import FIELDS, REPORT, bounded, energy_bounds, of_former_runs, plain, report_json
+from .report import FIELDS, REPORT, bounded, energy_bounds, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
 from .tables import (
     Column,
@@ -232,6 +232,7 @@ def write_search(
     report: Mapping[str, Any],
     restart: Restart,
     said: Mapping[str, Any],
+    former: Sequence[str],
     comm: MPI.Comm,
 ) -> None:
     """Write how far the search for a mesh has come, for a run that is resumed; collective.
@@ -243,6 +244,7 @@ def write_search(
         report: From `make_report`, with records from `search_record` as ``search``.
         restart: `Restart.of_meshes` of the last one.
         said: What the run was told to solve; nothing but what JSON knows.
+        former: What `of_former_runs` has found before this run wrote anything.
         comm: The ranks.
 
     Raises:
@@ -250,12 +252,11 @@ def write_search(
     """
     facts = {"said": said, "levels": report["search"]}
     begins = len(report["search"]) == 1
-    removed = of_former_runs(folder, comm) if begins else set()
     writers: dict[str, Writer] = {
         REPORT: lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
     }
-    write_files(folder, writers, removed, comm, begins)
+    write_files(folder, writers, former if begins else (), comm, begins)
 
 
 def write_steps(
@@ -265,6 +266,7 @@ def write_steps(
     restart: Restart,
     facts: dict[str, Any],
     moments: Sequence[Moment],
+    former: Sequence[str],
 ) -> None:
     """Write the last step's field, and all that tells of the steps so far; collective.
 
@@ -278,22 +280,22 @@ def write_steps(
         restart: From there.
         facts: What else a run that is resumed is to know; nothing but what JSON knows.
         moments: So far, for the strip.
+        former: What `of_former_runs` has found before this run wrote anything.
 
     Raises:
         InputError: The folder can't be written to.
     """
     comm, records = solution.domain.mesh.comm, report["times"]
     begins = len(records) == 1
-    removed = of_former_runs(folder, comm) if begins else set()
 
     def text(make: Callable[[], str]) -> Writer:
         return lambda path: on_root(comm, write_text, path, make)
 
     writers: dict[str, Writer] = {
         REPORT: text(lambda: report_json(report)),
+        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
         TABLE: text(lambda: levels_csv(records)),
         SERIES: text(lambda: _series(records)),
-        checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
         _field(len(records)): lambda path: write_solution(solution, path),
     }
     if moments and moments[-1].time == records[-1]["time"]:
@@ -301,7 +303,7 @@ def write_steps(
         writers[checkpoint.MOMENTS] = lambda path: on_root(
             comm, checkpoint.write_arrays, path, arrays
         )
-    write_files(folder, writers, removed, comm, begins)
+    write_files(folder, writers, former if begins else (), comm, begins)
 
 
 def read_moments(folder: Where, comm: MPI.Comm) -> list[Moment]:

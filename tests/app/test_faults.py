@@ -444,6 +444,7 @@ def test_a_disk_that_fills_up_keeps_the_levels_before(shared_tmp_path, monkeypat
         (signal.SIGINT, "interrupted", 130),
         (signal.SIGTERM, "terminated", 143),
         (signal.SIGHUP, "terminated", 129),
+        (signal.SIGXCPU, "terminated", 152),
     ],
 )
 def test_an_interruption_inside_a_callback_is_one(

@@ -23,6 +23,7 @@ from signorini_cr.app.cli import main
 from signorini_cr.app.formula import Clock
 from signorini_cr.errors import NotConverged
 from signorini_cr.output.meanings import REPORT, STEP
+from signorini_cr.output.report import FILES
 from signorini_cr.output.series import is_kept
 
 pytestmark = pytest.mark.slow
@@ -126,7 +127,7 @@ def test_what_a_run_in_time_leaves_behind(case, shared_tmp_path, capsys):
     out = shared_tmp_path / "out"
     if COMM.rank == 0:
         out.mkdir()
-        for name in ("step_00099.vtu", "convergence.png", "mine.txt"):
+        for name in ("report.json", "step_00099.vtu", "convergence.png", "mine.txt"):
             (out / name).write_text("of a former run")
     COMM.Barrier()
     assert main(["solve", str(case()), "--out", str(out)]) == 0
@@ -245,6 +246,31 @@ def test_fields_of_steps_go_where_another_run_has_none(case, undrawn, shared_tmp
     names = {path.name for path in out.iterdir()}
     assert {"mine.txt", "solution.vtu"} <= names and not names & {"times.csv", "series.pvd"}
     assert not any(name.startswith("step_") for name in names)
+
+
+@pytest.mark.parametrize("steady", [True, False])
+def test_files_of_somebody_else_stay(steady, case, undrawn, shared_tmp_path):
+    """Though they are called as a run's might be: where no run has been none is a run's."""
+    out, own = shared_tmp_path / "out", CASE.partition("[time]")[0].replace("sin(4*t)", "1")
+    own = own.replace(" - 0.02*t", "") if steady else CASE
+    others = [*FILES, "step_mine.vtu", "step_00077.vtu", "step_1.vtu", "step_000001_old.vtu"]
+    others.remove("report.json")  # which would tell of a run, and so would what it resumes from
+    others.remove("restart.npz")
+    if COMM.rank == 0:
+        out.mkdir()
+        for name in others:
+            (out / name).write_text("mine")
+    for time in range(2):
+        assert solved(case(own), out) == 0
+        mine = {name for name in others if (out / name).exists()}
+        mine = {name for name in mine if (out / name).read_bytes() == b"mine"}
+        COMM.Barrier()
+        fields = {"step_mine.vtu", "step_1.vtu", "step_000001_old.vtu"}
+        if time == 0:
+            assert fields | {"step_00077.vtu", "report.html", "check.png"} <= mine
+            assert ("times.csv" in mine) == steady
+        else:
+            assert mine == fields
 
 
 @pytest.mark.parametrize("option", ["--element=p1"])
