@@ -33,8 +33,9 @@ CELLS = 60_000
 """Cells that may have boxes of their own, if that is more than twice the pieces."""
 SMALLEST = 1e-11
 """Part of a cell, or of a facet, that is not cut any more: coordinates have so many digits."""
-IN_VAIN = 3
-"""Rounds in turn with next to no gain at most."""
+IN_VAIN, GAIN = 6, 0.95
+"""Rounds after which it ends if they have not made errors smaller by this factor; every other one
+may be a look at the ways to cut."""
 ROOMY, STEEP = 10, 1.2
 """More room for pieces where errors fall faster than with this power of their number."""
 MUCH = 1.5
@@ -171,15 +172,16 @@ def refine(
     if apart is not None and lost.any():
         finer = apart(pieces[lost])
         front = front[~lost] + _Front.of(finer, np.full(len(finer.share), UNKNOWN), wanted)
-    before, idle = np.inf, 0
+    past = [np.inf] * IN_VAIN
     for _ in range(CUTS):
         share = front.share
         bounded = share[np.isfinite(share)]
         number, have, missing = cells.total(len(share), bounded.sum(), len(share) - len(bounded))
         if not missing:
             limit.widen(number, have)
-        idle = idle + 1 if not missing and have > 0.95 * before else 0
-        if number >= limit.pieces or have + missing <= limit.enough or idle == IN_VAIN:
+        before, *past = *past, np.inf if missing else have
+        in_vain = not missing and have > GAIN * before
+        if number >= limit.pieces or have + missing <= limit.enough or in_vain:
             break
         # above half the mean is at least half of it; what is not cut may be all that is left over
         threshold = max(0.5 * have, 0.25) / number
@@ -189,10 +191,8 @@ def refine(
         space = int(limit.pieces - number) // 3 + 1
         large = (front.pieces.share > SMALLEST) | ~np.isfinite(share)
         chosen = _worst(np.where(large, share, 0.0), threshold, space, cells.comm)
-        found, looked = cells.total(chosen.sum(), np.sum(front.ways[chosen] == UNKNOWN))
-        if found == 0:
+        if not cells.total(chosen.sum())[0]:
             break
-        before = np.inf if missing or looked else have
         deep = share > DEEP * (threshold if 8 * number > limit.usual else DONE / number)
         front = front[~chosen] + _split(front[chosen], deep[chosen], wanted)
     pieces, origin = front.pieces.triangles()
