@@ -466,20 +466,18 @@ def of_gradients(kappa: Coefficient, sums: Sums) -> FloatArray:
 
     On strips along the sides of T, κ may be less than elsewhere: little of p + b and of σ is there.
     """
-    found = np.maximum(sums.middle, 0.0) / kappa.eigenvalues.core[0]
+    core, lowest = kappa.eigenvalues.core[0], kappa.eigenvalues.lowest
+    found = np.maximum(sums.middle, 0.0) / core
     if sums.fields is None or kappa.strips is None:
         return found
     own, missed, square = np.maximum(sums.fields, 0.0)
     rest = np.maximum(sums.indicators - square, 0.0)
-    there = (
-        1.0 / kappa.eigenvalues.core[0]
-        + 36.0 * kappa.strips * kappa.eigenvalues.core[0] / kappa.eigenvalues.lowest**2
-    )
-    inner = kappa.eigenvalues.core[0].copy()
+    there = 1.0 / core + 36.0 * kappa.strips * core / lowest**2
+    inner = core.copy()
     if kappa.cut is not None:  # along the jump, maybe, and then integrals have what is in strips
         cut = kappa.cut.pieces.parent
-        inner[cut] = kappa.eigenvalues.lowest[cut]
-    apart = np.sqrt(own / inner + missed / kappa.eigenvalues.lowest) + np.sqrt(rest * there)
+        inner[cut] = lowest[cut]
+    apart = np.sqrt(own / inner + missed / lowest) + np.sqrt(rest * there)
     return np.where(kappa.strips > 0.0, apart**2, found)
 
 
