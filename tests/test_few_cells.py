@@ -1,15 +1,21 @@
 """Fewer cells than ranks: whoever has none takes part in everything, and nothing else changes."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 import ufl
+from dolfinx import cpp
+from dolfinx.mesh import create_unit_square
+from helpers import tagged
 from mpi4py import MPI
 
 from signorini_cr import (
     Contact,
     Dirichlet,
+    Domain,
+    InputError,
     Material,
     Polygon,
     Problem,
@@ -139,3 +145,33 @@ def in_time(comm: MPI.Comm, scheme: str) -> list[float]:
 @pytest.mark.parametrize("scheme", ["euler", "bdf2"])
 def test_so_are_those_in_time(scheme: str) -> None:
     assert in_time(COMM, scheme) == pytest.approx(in_time(MPI.COMM_SELF, scheme), rel=1e-8)
+
+
+def all_on_the_last_rank(comm: MPI.Comm, parts: int, kinds: Any, corners: Any) -> Any:
+    """A partitioner."""
+    ranks = np.full((corners[0].size // 3, 1), comm.size - 1, dtype=np.int32)
+    return cpp.graph.AdjacencyList_int32(ranks)
+
+
+@pytest.mark.parametrize("name", ["f", "coefficient", "weight", "initial"])
+def test_conditions_in_what_has_no_enclosure(name: str) -> None:
+    """erf is known by its values alone; a rank without cells never asks for an enclosure of it."""
+
+    def datum(x: Any) -> Any:
+        return ufl.conditional(ufl.lt(ufl.erf(x[0]), 0.5), 1.0, 2.0)
+
+    mesh = create_unit_square(COMM, 4, 4, partitioner=all_on_the_last_rank)
+    domain = Domain.from_tags(mesh, tagged(mesh, lambda x, y: np.where(y < 1e-9, 1, 2)))
+    if name == "weight":
+        solution = solve(Problem(f=-2.0), domain)
+        with pytest.raises(InputError, match="weight holds an operator that has no enclosure: Erf"):
+            solution.mean(None, datum)
+    elif name == "initial":
+        steps = solve_in_time(Problem(f=0.0), domain, end=1.0, steps=2, initial=datum)
+        assert len([solution.certificate for _, solution in steps]) == 2
+    else:
+        data = {"f": -2.0, name: datum}
+        certificate = solve(Problem(**data), domain).certificate
+        assert certificate.bound_h1 is None
+        wanted = "no enclosure: Erf" if name == "f" else "no computable upper and lower bound"
+        assert certificate.reason is not None and wanted in certificate.reason

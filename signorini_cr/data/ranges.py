@@ -7,6 +7,7 @@ Both follow from the jets on a box around T.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -289,8 +290,10 @@ class Deviation:
         room = STRIP * np.maximum(np.abs(boxes.low), np.abs(boxes.high))
         at = Enclosure(replace(boxes, low=boxes.low - room, high=boxes.high + room), order=0)
         even = np.zeros(boxes.low.shape[1:], dtype=bool)
-        for jet in map(at, self._compared):
-            even |= ~((jet.low > 0) | (jet.high < 0))  # also where nothing is known
+        for difference in self._compared:
+            with suppress(Unknown):  # there is no enclosure then that null sets could contradict
+                jet = at(difference)
+                even |= ~((jet.low > 0) | (jet.high < 0))  # also where it may be anything
         return even
 
 

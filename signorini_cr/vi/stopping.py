@@ -156,7 +156,9 @@ class Stiffness:
         self._differences, self._weights = _differences(self._grid.matrix)
 
     def _classes(self, diagonal: FloatArray) -> IndexArray:
-        decades = np.log10(diagonal / self._smallest) / DECADES
+        with np.errstate(over="ignore"):
+            ratio = np.minimum(diagonal / self._smallest, np.finfo(float).max)
+        decades = np.log10(ratio) / DECADES
         return np.maximum(decades, 0.0).astype(np.intp)
 
     def sort(self, x: PETSc.Vec, b: PETSc.Vec) -> None:

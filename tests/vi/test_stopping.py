@@ -738,3 +738,19 @@ def test_an_obstacle_that_is_far_away_changes_nothing(far, size):
     assert mean.value == pytest.approx(exact, rel=1e-9, abs=1e-10 * size)
     assert mean.lower <= exact + 1e-15 * size and exact - 1e-15 * size <= mean.upper
     assert distant.certificate.bound_h1 == pytest.approx(near.certificate.bound_h1, rel=1e-6)
+
+
+def test_a_contrast_beyond_all_numbers():
+    """κ 10²⁰⁰ beside 10⁻²⁰⁰: u on the soft side is 10²⁰⁰ times that of 1, forces stay."""
+    sides = ("contact", "dirichlet", "neumann", "neumann")
+    domain = Polygon([(0, 0), (1, 0), (1, 1), (0, 1)], sides).mesh(0.3)
+    found = []
+    for size in (1e10, 1e100, 1e200):
+
+        def kappa(x, size=size):
+            return ufl.conditional(ufl.gt(x[0], 0.8), size, 1 / size)
+
+        solution = solve(Problem(f=-2.0, coefficient=kappa, obstacle=-1.0), domain)
+        lowest = MPI.COMM_WORLD.allreduce(float(solution.u.x.array.min()), op=MPI.MIN)
+        found.append((solution.contact.force, lowest / size))
+    assert np.allclose(found, found[0], rtol=1e-8, atol=0.0)
