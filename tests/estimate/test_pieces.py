@@ -961,6 +961,35 @@ def test_twist():
     )
     found = duality._twist(cells, kappa, everywhere, P, w)
     assert np.allclose(found, spread * (field + kappa.mean * slope))
+    # on strips 1/κ is that of the lowest κ, and squares of quadratic fields 36 of their mean
+    kappa.strips = rng.uniform(0, 0.01, cells.number)
+    kappa.bounds = replace(kappa.bounds, lowest=rng.uniform(0.1, 0.5, cells.number))
+    found = duality._twist(cells, kappa, everywhere, P, w)
+    spread += 36 * kappa.strips / kappa.bounds.lowest
+    assert np.allclose(found, spread * (field + kappa.mean * slope))
+
+
+@pytest.mark.serial
+def test_gradients_where_there_are_strips():
+    """‖κ^{-1/2}(p + κ^{-1/2}σ + b)‖, off strips and in them; cells that are cut know these."""
+    cells, rng, kappa, sums = some_cells(8)
+    n, core = cells.number, kappa.eigenvalues.core[0]
+    assert np.allclose(duality.of_gradients(kappa, sums), sums.middle / core)
+    sums.fields = rng.uniform(0.1, 1, size=(3, n))
+    sums.fields[2] *= 0.5 * sums.indicators
+    assert np.allclose(duality.of_gradients(kappa, sums), sums.middle / core)
+    part = np.where(np.arange(n) % 2, rng.uniform(0, 0.01, n), 0.0)
+    kappa.strips, lowest = part, core / rng.uniform(2, 9, n)
+    kappa.eigenvalues = replace(kappa.eigenvalues, lowest=lowest)
+    own, missed, square = sums.fields
+    for cut in ([], [1, 2, 3, 3]):
+        kappa.cut = SimpleNamespace(pieces=SimpleNamespace(parent=np.array(cut, int)))
+        weight = np.where(np.isin(np.arange(n), cut), lowest, core)
+        fields = np.sqrt(own / weight + missed / lowest)
+        # of σ what is off strips by 1/κ there, and κ on them by its share and the lowest κ twice
+        others = np.sqrt((sums.indicators - square) * (1 / core + 36 * part * core / lowest**2))
+        expected = np.where(part > 0, (fields + others) ** 2, sums.middle / core)
+        assert np.allclose(duality.of_gradients(kappa, sums), expected)
 
 
 @pytest.mark.serial

@@ -724,6 +724,33 @@ def test_the_gap_where_a_tensor_varies(more):
     assert np.allclose(energy, rough * mean * at.integral((dv**2).sum(axis=2)))
     assert np.allclose(sums.steepness, vv) and np.isclose(sums.totals.energy_slack, energy.sum())
     assert np.allclose((sums.totals.far, sums.totals.near), grown)
+    # strips of a cell hold 36 times their part of what squares of quadratic fields hold in it
+    lowest, high = rng.uniform(0.1, 1, number), rng.uniform(3, 9, number)
+    kappa.strips, kappa.bounds = rng.uniform(0, 0.01, number), Between.all_over(lowest, high)
+    _, more_far, more_near, more_energy = duality._of_tensor(
+        cells, kappa, slice(0, number), y, v, w, (before[0], before[1])
+    )
+    of_y = 36 * kappa.strips * at.integral((field**2).sum(axis=2)) / lowest
+    for gained, gained_with, dz in ((far, more_far, du + change), (near, more_near, du - change)):
+        of_z = 36 * kappa.strips * at.integral((dz**2).sum(axis=2)) * high
+        assert np.allclose(gained_with - gained, 4 * (of_y + of_z))
+        assert gained is near or np.allclose(more_energy - energy, of_z / 2)
+    within, wider = (
+        duality._tensor_within(cells, replace_strips(kappa, strips), slice(0, number), v, w)
+        for strips in (None, kappa.strips)
+    )
+    strips = 36 * kappa.strips * high
+    steep = np.sqrt(cells.volume * at.integral((dv**2).sum(axis=2)))
+    assert np.array_equal(wider[0], within[0])
+    assert np.allclose(wider[1] - within[1], strips * steep)
+    in_the_mean = np.linalg.norm(np.einsum("q,qnij->nij", at.weights, off), axis=(1, 2))
+    expected = mean + 2 * rough * mean + strips + in_the_mean
+    assert np.allclose(wider[2], np.minimum(expected, high))
+
+
+def replace_strips(kappa, strips):
+    """The same with other strips."""
+    return SimpleNamespace(**{**vars(kappa), "strips": strips})
 
 
 @pytest.mark.serial
