@@ -460,7 +460,8 @@ class NewtonTest:
         reach = DATUM * (x.norm(PETSc.NormType.INFINITY) + self._offset)
         moved = 2.0 * self._linear.moved() if moving else 0.0
         gap = self._linear.bounds.gap(at)
-        force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
+        with np.errstate(over="ignore"):  # what is beyond all numbers is not known
+            force = operator.diagonal * np.maximum(reach + moved - gap, 0.0)
         return self._stiffness.totals(np.where(active.mask, 0.0, force))
 
     def _of_data(self, x: PETSc.Vec, active: ActiveSet, total: float) -> float:

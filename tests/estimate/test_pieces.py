@@ -12,6 +12,7 @@ from helpers import SQUARE, of_gradients
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve, solve_levels
+from signorini_cr.compat import cell_nodes
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Known, Segments
 from signorini_cr.data.quadrature import Between, OnParts
@@ -309,7 +310,7 @@ def cusps(where, domain=None):
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
     x = domain.mesh.geometry.x[:, :2]
     vertex = np.argmin(np.abs(x - where).sum(axis=1))
-    nodes = domain.mesh.geometry.dofmap[: cells.number].T
+    nodes = cell_nodes(domain.mesh)[: cells.number].T
     energies = np.where((nodes == vertex).any(axis=0), 1.0, 0.01)
     rng = np.random.default_rng(1)
     kappa = rng.uniform(0.5, 3.0, cells.number)
@@ -327,7 +328,7 @@ def by_duffy(cells, cusp):
     t, weights = tau**8, 2 * tau**8 * 8 * tau**7 * across
     t, along = np.repeat(t, len(place)), np.tile(place, len(t))
     weights = np.outer(weights, beside).ravel()
-    x = cells.domain.mesh.geometry.x[cells.domain.mesh.geometry.dofmap[: cells.number], :2]
+    x = cells.domain.mesh.geometry.x[cell_nodes(cells.domain.mesh)[: cells.number], :2]
     for n, (cell, apex) in enumerate(zip(cusp.at, cusp.apex, strict=True)):
         inverse = np.linalg.inv(x[cell, 1:] - x[cell, :1]).T
         gradients = np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])
@@ -363,7 +364,7 @@ def test_integrals_of_cusps(where):
     gains, means = cusp.gains(cells, excess, bumps), cusp.means
     of_hats, of_bumps = cusp.pulls(cells)
     steepness, energy, crosses = np.zeros((3, number))
-    x = cells.domain.mesh.geometry.x[cells.domain.mesh.geometry.dofmap[:number], :2]
+    x = cells.domain.mesh.geometry.x[cell_nodes(cells.domain.mesh)[:number], :2]
     for cell, n, value, slope, weights, hats, gradients in by_duffy(cells, cusp):
         volume, k = cells.volume[cell], kappa[cell]
         assert np.isclose(means[n], weights @ value / volume, rtol=1e-9)
@@ -466,7 +467,7 @@ def test_vertices_with_cusps():
     """Those that hold a tenth, no two neighbours, and none where κ varies."""
     domain = square(4, comm=MPI.COMM_SELF, jitter=0.0)
     cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), (DIRICHLET,))
-    nodes, x = domain.mesh.geometry.dofmap[: cells.number].T, domain.mesh.geometry.x[:, :2]
+    nodes, x = cell_nodes(domain.mesh)[: cells.number].T, domain.mesh.geometry.x[:, :2]
 
     def around(*where):
         vertex = np.argmin(np.abs(x - where).sum(axis=1))
@@ -869,7 +870,7 @@ def test_energy_of_a_function_of_degree_two():
     bumps = rng.normal(size=len(cells.exterior))
 
     def energy(excess, bumps):
-        x = cells.domain.mesh.geometry.x[cells.domain.mesh.geometry.dofmap[: cells.number], :2]
+        x = cells.domain.mesh.geometry.x[cell_nodes(cells.domain.mesh)[: cells.number], :2]
         total = np.zeros(cells.number)
         points, weights = basix.make_quadrature(basix.CellType.triangle, 4)
         for cell in range(cells.number):
@@ -1050,7 +1051,7 @@ def test_what_the_gap_is_made_of_at_points(more):
     points = zip(k, weights, hats, strict=True)
     found = duality._at_points(cells, kappa.mean, slice(0, cells.number), y, v, w, points)
     mesh = cells.domain.mesh
-    x = mesh.geometry.x[mesh.geometry.dofmap[: cells.number], :2]
+    x = mesh.geometry.x[cell_nodes(mesh)[: cells.number], :2]
     for cell in range(cells.number):
         inverse = np.linalg.inv(x[cell, 1:] - x[cell, :1]).T
         gradients = np.concatenate([-inverse.sum(axis=0, keepdims=True), inverse])

@@ -13,6 +13,7 @@ from helpers import HELD_ABOVE, SQUARE
 from mpi4py import MPI
 
 from signorini_cr import Domain, InputError, Polygon, Problem, solve
+from signorini_cr.compat import cell_nodes
 from signorini_cr.data.diffusion import diffusion
 from signorini_cr.data.loads import Certain, Known, Segments, VolumeMoments
 from signorini_cr.data.pieces import Pieces
@@ -47,7 +48,7 @@ class Points:
         mesh = cells.domain.mesh
         self.cells, self.weights = cells, weights_ / weights_.sum()
         self.hats = np.column_stack([1 - points.sum(axis=1), points]).T
-        self.corners = mesh.geometry.x[mesh.geometry.dofmap[: cells.number], :2]
+        self.corners = mesh.geometry.x[cell_nodes(mesh)[: cells.number], :2]
         if cells.stretch is not None:
             self.corners = np.einsum("nij,nkj->nki", cells.stretch, self.corners)
         inverse = np.linalg.inv(self.corners[:, 1:] - self.corners[:, :1])
@@ -257,7 +258,7 @@ class OnFacets:
     def __init__(self, cells, side):
         t, w = np.polynomial.legendre.leggauss(12)
         self.s, self.cells, self.side = (t + 1) / 2, cells, side
-        nodes = cells.domain.mesh.geometry.dofmap[side.cells]
+        nodes = cell_nodes(cells.domain.mesh)[side.cells]
         ends = np.array([[j for j in range(3) if j != i] for i in side.local])
         x = cells.domain.mesh.geometry.x[np.take_along_axis(nodes, ends, axis=1), :2]
         self.length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
@@ -1143,7 +1144,7 @@ def test_what_bounds_ask_of_v():
     assert floors.facets == len(cells.exterior)
     ((sign, limit),) = floors.at_vertices
     x = cells.domain.mesh.geometry.x
-    nodes = cells.domain.mesh.geometry.dofmap
+    nodes = cell_nodes(cells.domain.mesh)
     of_vertex = np.zeros(len(limit), dtype=int)
     of_vertex[cells.vertices] = nodes[: cells.number].T
     below = x[of_vertex, 1] < 1e-9
@@ -1358,7 +1359,7 @@ def test_how_far_v_is_off_its_bounds(sign, curved):
     bumps, thirds = rng.normal(size=(2, len(cells.exterior)))
     part = SimpleNamespace(trace=trace, sign=sign, side=lambda _: side)
     t = np.linspace(0, 1, 2001)
-    nodes = cells.domain.mesh.geometry.dofmap[side.cells]
+    nodes = cell_nodes(cells.domain.mesh)[side.cells]
     (first, last) = (
         cells.domain.mesh.geometry.x[nodes[np.arange(3), end], 0]
         for end in np.array([[j for j in range(3) if j != i] for i in side.local]).T
@@ -1403,7 +1404,7 @@ def test_tetrahedra_ask_for_data_that_v_is_not_below(off):
     v[1, 2] += off
     found = affine(data.cells, alpha.side(data.cells), alpha.trace, v, alpha.ends, 9.0)
     assert (found.reason is None) == (off >= 0.0)
-    x = mesh.geometry.x[:, :2][mesh.geometry.dofmap[alpha.side(data.cells).cells]]
+    x = mesh.geometry.x[:, :2][cell_nodes(mesh)[alpha.side(data.cells).cells]]
     on_facet = np.array([[j for j in range(4) if j != i] for i in alpha.side(data.cells).local])
     middle = np.take_along_axis(x, on_facet[:, :, None], axis=1).mean(axis=1)
     assert np.allclose(found.least, middle @ [1, -2] - 9)
