@@ -612,8 +612,10 @@ def compare(solved: Sequence[Solution], alone: Sequence[Solution]) -> None:
         if one.dofs != other.dofs:
             ENDS["meshes that differ between ranks"] += 1
             return
-        sizes = [abs(one.energy), abs(other.energy), *np.abs(one.certificate.energy or 0.0)]
-        assert abs(one.energy - other.energy) <= 1e-8 * max(sizes), (one.energy, other.energy)
+        # in time a step has what is left of the one before in its data, and J may all but vanish
+        low, high = one.certificate.energy or (one.energy, one.energy)
+        room = 1e-8 * abs(one.energy) + 1e-5 * (high - low)
+        assert abs(one.energy - other.energy) <= room, (one.energy, other.energy, room)
         force = max(abs(one.contact.force), abs(other.contact.force))
         assert abs(one.contact.force - other.contact.force) <= 1e-6 * force + 1e-9
         bounds = one.certificate.bound_h1, other.certificate.bound_h1
