@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, Int32Array, summed
 from ..compat import cell_nodes
+from ..fem.cells import barycentric_coordinates
 from ..fem.conditions import Condition, as_number
 from ..fem.pointwise import evaluate
 from ..fem.problem import Forms
@@ -31,8 +32,8 @@ JUMP = 2.0
 """A factor by which κ may jump inside of a cell: the bound is not the sharper for another mesh."""
 
 BEYOND, INSIDE = 1e-6, 1e-9
-"""Distance behind a facet at which a cell is looked for, in the facet's size, and what a point may
-be outside of a cell, in that one's."""
+"""Distance behind a facet at which a cell is looked for, in the facet's size, and what barycentric
+coordinates may be below 0 of a point that counts as inside."""
 
 HALVINGS = 30
 """So many, and the halves of a cell's edge are shorter than what makes κ change by that factor,
@@ -83,7 +84,7 @@ def _slits(forms: Forms, domain: Domain) -> list[str]:
         if closed and condition.fixed is None and condition.loss is None and not condition.bounds:
             facets.append(domain.facets(condition.number))
     own: Int32Array = np.concatenate(facets)
-    corners, normals = facet_measures(mesh, own)[0], facet_normals(mesh, facet_entities(mesh, own))
+    corners, _, normals = _seen(mesh, own)
     sizes = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
     middles = corners.mean(axis=1)
     behind = mesh.comm.allgather(middles + BEYOND * sizes[:, None] * normals)
@@ -102,6 +103,12 @@ def _slits(forms: Forms, domain: Domain) -> list[str]:
     ]
 
 
+def _seen(mesh: Mesh, facets: Int32Array) -> tuple[FloatArray, Int32Array, FloatArray]:
+    """Find the vertices of boundary facets, shape (n, d, 3), their cells and outward normals."""
+    entities = facet_entities(mesh, facets)
+    return facet_measures(mesh, facets)[0], entities[:, 0], facet_normals(mesh, entities)
+
+
 def _inside_of(mesh: Mesh, x: FloatArray) -> BoolArray:
     """Tell which points, shape (n, 3), are in cells at the boundary that this rank has."""
     found = np.zeros(len(x), dtype=bool)
@@ -113,12 +120,9 @@ def _inside_of(mesh: Mesh, x: FloatArray) -> BoolArray:
         bb_tree(mesh, mesh.topology.dim, padding=0.0, entities=cells), x
     )
     which = np.repeat(np.arange(len(x)), np.diff(candidates.offsets))
-    d = mesh.topology.dim
-    corners = mesh.geometry.x[cell_nodes(mesh)[candidates.array], :d]
-    edges = (corners[:, 1:] - corners[:, :1]).swapaxes(1, 2)
-    hats = np.linalg.solve(edges, (x[which, :d] - corners[:, 0])[..., None])[..., 0]
-    least = np.minimum(hats.min(axis=1, initial=1.0), 1.0 - hats.sum(axis=1))
-    found[which[least >= -INSIDE]] = True
+    corners = mesh.geometry.x[cell_nodes(mesh)[candidates.array]]
+    hats = barycentric_coordinates(corners, x[which, None])[:, 0]
+    found[which[hats.min(axis=1) >= -INSIDE]] = True
     return found
 
 
@@ -251,9 +255,8 @@ class _Solution:
 
     def _facets(self, part: int) -> tuple[FloatArray, Int32Array, FloatArray]:
         """Find midpoints of facets, their cells and outward normals."""
-        entities = facet_entities(self.mesh, self.domain.facets(part))
-        corners, _ = facet_measures(self.mesh, self.domain.facets(part))
-        return corners.mean(axis=1), entities[:, 0], facet_normals(self.mesh, entities)
+        corners, cells, normals = _seen(self.mesh, self.domain.facets(part))
+        return corners.mean(axis=1), cells, normals
 
     def _values(self, e: Any, x: FloatArray, cells: Int32Array) -> Values:
         """Evaluate an expression at points; what can't be told is nan."""

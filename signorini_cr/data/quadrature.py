@@ -323,7 +323,7 @@ class Coefficient:
     def _entries(
         self, kappa: Tensor, means: FloatArray, cells: Cells
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Bound a tensor's entries on each cell, or say why that can't be done; collective.
+        """Bound a tensor's entries on each cell, or note why that can't be done; local.
 
         Returns:
             How far they are from their means but for strips, what part of the cell these have, and

@@ -89,6 +89,22 @@ def at_points(ends: FloatArray, hats: FloatArray) -> FloatArray:
     return np.asarray(hats.T @ np.moveaxis(ends, 0, -2))
 
 
+def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:
+    """Compute barycentric coordinates of points in simplices.
+
+    Args:
+        simplices: Vertices, shape (n, d + 1, 3).
+        points: Shape (n, m, 3).
+
+    Returns:
+        Shape (n, m, d + 1).
+    """
+    edges = simplices[:, 1:] - simplices[:, :1]
+    inverse = np.linalg.pinv(edges)
+    rest = np.einsum("nmx,nxd->nmd", points - simplices[:, :1], inverse)
+    return np.concatenate([1.0 - rest.sum(axis=2, keepdims=True), rest], axis=2)
+
+
 def points_of(corners: FloatArray, hats: FloatArray) -> FloatArray:
     """Find the same points of some simplices; what their corners have in common is exact.
 

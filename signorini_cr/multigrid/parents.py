@@ -21,6 +21,7 @@ from petsc4py import PETSc
 
 from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
+from ..fem.cells import barycentric_coordinates
 from ..fem.physics import Imposed
 from ..fem.space import facet_corners, facet_entities, function_space
 from ..mesh.exchange import Exchange
@@ -261,19 +262,3 @@ class Parents:
         weights = 1.0 - d * at if coarse.cr else at.copy()
         weights[np.abs(weights) < COORDINATE_ROUNDING] = 0.0
         return weights
-
-
-def barycentric_coordinates(simplices: FloatArray, points: FloatArray) -> FloatArray:
-    """Compute barycentric coordinates of points in simplices.
-
-    Args:
-        simplices: Vertices, shape (n, d + 1, 3).
-        points: Shape (n, m, 3).
-
-    Returns:
-        Shape (n, m, d + 1).
-    """
-    edges = simplices[:, 1:] - simplices[:, :1]
-    inverse = np.linalg.pinv(edges)
-    rest = np.einsum("nmx,nxd->nmd", points - simplices[:, :1], inverse)
-    return np.concatenate([1.0 - rest.sum(axis=2, keepdims=True), rest], axis=2)

@@ -279,7 +279,7 @@ def of_former_runs(folder: Where, comm: MPI.Comm) -> tuple[str, ...]:
     return tuple(on_root(comm, look))
 
 
-_FIELD = re.compile(r"step_[0-9]{5,}\.vtu")
+_FIELD = re.compile(re.escape(FIELDS).replace(r"\*", "[0-9]{5,}"))
 
 
 def write_output(

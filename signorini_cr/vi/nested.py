@@ -22,6 +22,7 @@ from petsc4py import PETSc
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, Int32Array
+from ..fem.cells import barycentric_coordinates
 from ..fem.space import (
     facet_corners,
     facet_entities,
@@ -29,7 +30,7 @@ from ..fem.space import (
     simplex_measures,
 )
 from ..garbage import release
-from ..multigrid.parents import Layout, barycentric_coordinates
+from ..multigrid.parents import Layout
 from ..multigrid.transfer import Ancestor, prolongate
 from .active import ActiveSet
 from .level import Level
