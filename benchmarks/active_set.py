@@ -38,7 +38,7 @@ def forces(solution: Solution) -> npt.NDArray[np.float64]:
     system = solution.level.system
     dofs, bounds = system.bounded, system.bounds
     x = solution.u.x.array[dofs] - system.offset
-    pushes = bounds.side(x) * solution.residual.x.array[dofs]
+    pushes = bounds.sign(x) * solution.residual.x.array[dofs]
     return (pushes - system.operator.diagonal * bounds.gap(x)) / system.residual_scale
 
 

@@ -50,7 +50,7 @@ MOST_SHOWN = 100
 """Points that are looked at for the one to be told."""
 
 TOLERANCE = 1e-9
-"""Gap that is no difference, in parts of u_D's size: formulas are written with so many digits."""
+"""Excess that counts as none, in parts of u_D's size: formulas are written with so many digits."""
 
 SKEW = 1e-12
 """The same for a tensor's entries, of which both are told: what is no rounding has no bound."""
@@ -192,21 +192,21 @@ def _unfit(
 
 
 def differs(
-    cells: Cells, side: BoundaryFacets, gap: FloatArray, scale: float, *data: Trace
+    cells: Cells, side: BoundaryFacets, excess: FloatArray, scale: float, *data: Trace
 ) -> bool:
     """Tell whether data differ at the vertices of facets by more than their rounding; collective.
 
     Args:
         cells: The mesh.
         side: The facets.
-        gap: What should not be above 0 at their vertices, shape (d, n).
+        excess: What should not be above 0 at their vertices, shape (d, n).
         scale: Size of what the data are compared with, the same on all ranks.
-        *data: What the gap is made of.
+        *data: What the excess is made of.
 
     Returns:
         Whether they do on this rank.
     """
-    vertex, facet = np.nonzero(gap > TOLERANCE * scale)
+    vertex, facet = np.nonzero(excess > TOLERANCE * scale)
     if not cells.comm.allreduce(len(facet)):
         return False
     precision = Precision.of(cells.domain.mesh).vertices
@@ -216,7 +216,7 @@ def differs(
     where = side.cells[facet].astype(np.int32)
     found = (evaluate(each.expression, points, precision, where) for each in data)
     slack = sum(SAFETY * each[1] for each in found if each is not None)
-    return bool((gap[vertex, facet] > TOLERANCE * scale + slack).any())
+    return bool((excess[vertex, facet] > TOLERANCE * scale + slack).any())
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ Values = tuple[FloatArray, FloatArray]
 """Values at points, and what rounding may have done to them."""
 
 SAME = 1e-6
-"""Gap that is no difference, in parts of the largest value: an exact solution may be a fit."""
+"""Difference that counts as none, in parts of the largest value: an exact solution may be a fit."""
 
 JUMP = 2.0
 """A factor by which κ may jump inside of a cell: the bound is not the sharper for another mesh."""
@@ -243,8 +243,8 @@ class _Solution:
         )
 
     def _same(self, key: str, x: FloatArray, given: Values, wanted: Values) -> str | None:
-        gap = _difference(given, wanted)
-        wrong = np.abs(gap[0]) > SAME * self._size(given, wanted) + gap[1]
+        apart = _difference(given, wanted)
+        wrong = np.abs(apart[0]) > SAME * self._size(given, wanted) + apart[1]
         return self._first(
             wrong,
             x,

@@ -1,8 +1,8 @@
 """Guaranteed bounds of a solution's error and of the energy.
 
-For v ∈ K and y ∈ H(div) with −div y = f, y·n = g on Γg and y·n ≥ 0 on Γ1 the gap J(v) − D(y) bounds
-what neither of them knows about u. Both come from u_h at linear cost, see `flux` and `companion`.
-`docs/certificate.md` has the mathematics; the letters are the same there.
+For v ∈ K and y ∈ H(div) with −div y = f, y·n = g on Γg and y·n ≥ 0 on Γ1 the duality gap
+J(v) − D(y) bounds what neither of them knows about u. Both come from u_h at linear cost, see `flux`
+and `companion`. `docs/certificate.md` has the mathematics; the letters are the same there.
 """
 
 from __future__ import annotations
@@ -467,7 +467,7 @@ def _seen_from(
 
 
 _Way = tuple[_Known, Companion, Sums]
-"""y, v, and what their gap is made of."""
+"""y, v, and what their duality gap is made of."""
 
 
 def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[_Way]:
@@ -503,7 +503,7 @@ def _companions(solution: Found, known: _Known, sweeps: int) -> Iterator[_Way]:
 
 
 def _integrated(known: _Known, v: Companion) -> Sums:
-    """Integrate the gap between y and v."""
+    """Integrate the duality gap between y and v."""
     cells, kappa, flux, load = known.cells, known.kappa, known.flux, known.certain.load
     sums = integrate(cells, kappa, known.w, load, flux, v, known.c.low, known.c.high)
     if v.cusps is not None:
@@ -661,11 +661,11 @@ class _Ball:
 
 
 def _bracket(total: Totals, ball: _Ball, hidden: float, rounding: float) -> tuple[float, float]:
-    """Find two numbers with J(u) between them: J(v) is above it, by the gap at most.
+    """Find two numbers with J(u) between them: J(v) is above it, by the duality gap at most.
 
     Args:
         total: The integrals over all ranks' cells.
-        ball: What the gap is made of.
+        ball: What the duality gap is made of.
         hidden: What quadrature may have missed of J(v).
         rounding: What rounding may do to norms.
     """

@@ -220,7 +220,7 @@ class Cusps:
         self, cells: Cells, w: FloatArray, load: VolumeMoments, low: FloatArray, flux: Flux,
         reaction: FloatArray, v: tuple[FloatArray, FloatArray], sums: Sums,
     ) -> float:  # fmt: skip
-        """Add ψ to the parts of the gap.
+        """Add ψ to the parts of the duality gap.
 
         ∫ (f − f_T) ψ is bounded by ‖κ^{-1/2}σ‖ ‖κ^{1/2}∇ψ‖ and goes into the slack.
         c is a number on each of these cells, see `steady` of `Functional`.

@@ -37,7 +37,7 @@ def integrate(
     reaction: FloatArray = NOTHING,
     most: FloatArray | None = None,
 ) -> Sums:
-    """Sum up the parts of the gap.
+    """Sum up the parts of the duality gap.
 
     Args:
         cells: The mesh.
@@ -66,7 +66,7 @@ one of degree 1."""
 
 @dataclass(frozen=True)
 class _Products:
-    """∫_T of what the gap is made of, and what may be missed of it; shapes (n,).
+    """∫_T of what the duality gap is made of, and what may be missed of it; shapes (n,).
 
     Attributes:
         pp: |p|².
@@ -89,7 +89,7 @@ class _Products:
 
 @dataclass(frozen=True, eq=False)
 class DualityGap:
-    """The gap between y and v, which is added up range by range of cells.
+    """J(v) − D(y), which is added up range by range of cells.
 
     Attributes but for the last are the arguments of `integrate`.
 
@@ -108,7 +108,7 @@ class DualityGap:
     sums: Sums
 
     def add(self, block: slice) -> None:
-        """Add what a range of cells has of the gap."""
+        """Add what a range of cells has of the duality gap."""
         height = self.v.bumps[self.cells.facets[:, block]] if self.cells.tdim == 2 else None
         products = self._products(block, height)
         self._add_fields(block, products)
@@ -598,7 +598,7 @@ def _of_tensor(
     w: FloatArray,
     mean_squares: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Bound what a tensor that varies within cells does to the gap.
+    """Bound what a tensor that varies within cells does to the duality gap.
 
     For F = y − κ∇z, z = v or 2u_h − v, and with N the root of the rule's ∫ |·|² / k where lengths
     are stretched, ‖κ^{-1/2}F‖ ≤ (1 − θ)^{-1/2} (N(F) + 2ϱ N(k∇z)): the rule is exact for the
@@ -614,8 +614,8 @@ def _of_tensor(
         mean_squares: ∫_T |p − b|² and ∫_T |p + b|² as they are for κ_T.
 
     Returns:
-        ∫_T κ|∇v|² by the rule; what the gap has beyond that of κ_T; and what the rule may have
-        missed of ½∫_T κ|∇v|².
+        ∫_T κ|∇v|² by the rule; what the duality gap has beyond that of κ_T; and what the rule may
+        have missed of ½∫_T κ|∇v|².
     """
     d, k, volume = cells.tdim, pick(kappa.mean, block)[:, None], cells.volume[block]
     P, slopes, theta = flux.excess[:, block], v.slopes(cells, block), kappa.spread[block]
@@ -764,7 +764,7 @@ def _at_points(
     w: FloatArray,
     points: Iterable[tuple[FloatArray, float, FloatArray]],
 ) -> FloatArray:
-    """Average over points |T| times what the gap is made of.
+    """Average over points |T| times what the duality gap is made of.
 
     It is |p|², |b|², p·b, κ|∇v|², |y|², and |∇z|² and κ⁻¹|∇z|² for z = v and z = 2u_h − v.
 

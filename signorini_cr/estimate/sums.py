@@ -66,7 +66,7 @@ class Totals:
 
 @dataclass(eq=False)
 class Sums:
-    """Shares of this rank's cells in the gap, each for itself and all together.
+    """Shares of this rank's cells in the duality gap, each for itself and all together.
 
     Attributes:
         indicators: The cells' shares of ‖p‖² + ‖b‖² + ‖κ^{-1/2}σ‖², shape (cells,).

@@ -1,7 +1,7 @@
 """Bounds of dofs from below and above; everything about contact is said of the nearer of the two.
 
-A dof's gap is its distance from the nearer bound, its side 1 where that is the lower and −1 where
-it is the upper one. With s its side, s (A u − b) is the force that pushes it off the bound, and so
+A dof's gap is its distance from the nearer bound, its sign 1 where that is the lower and −1 where
+it is the upper one. With s its sign, s (A u − b) is the force that pushes it off the bound, and so
 a bound from above differs from one from below by a sign only.
 """
 
@@ -26,7 +26,7 @@ class Bounds:
     lower: FloatArray
     upper: FloatArray
 
-    def side(self, x: FloatArray) -> FloatArray:
+    def sign(self, x: FloatArray) -> FloatArray:
         """Return 1 where the lower bound is nearer to x, else −1, shape (n,)."""
         return np.where(x - self.lower <= self.upper - x, 1.0, -1.0)
 
@@ -35,6 +35,6 @@ class Bounds:
         gap: FloatArray = np.minimum(x - self.lower, self.upper - x)
         return gap
 
-    def on(self, side: FloatArray) -> FloatArray:
-        """Return the bound on a side, shape (n,)."""
-        return np.where(side > 0.0, self.lower, self.upper)
+    def on(self, sign: FloatArray) -> FloatArray:
+        """Return the lower bound where a sign is 1, the upper where it is −1, shape (n,)."""
+        return np.where(sign > 0.0, self.lower, self.upper)

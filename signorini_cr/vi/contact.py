@@ -159,7 +159,7 @@ def contact_facts(
         np.sum(np.abs(at_dofs.force * at_dofs.gap)),
         at_dofs.left @ at_dofs.left,
     ]
-    ends = at_dofs.gap, at_dofs.side * pressure
+    ends = at_dofs.gap, at_dofs.sign * pressure
     least = np.array([np.min(each, initial=np.inf) for each in ends])
     comm = data.domain.mesh.comm
     force, length, number, number_active, complementarity, squares = summed(comm, np.array(sums))
@@ -231,7 +231,7 @@ class _AtDofs:
 
     Attributes:
         gap: Distance of the bounded dofs from the nearer bound, shape (n,).
-        side: Which that is, see `Bounds`, shape (n,).
+        sign: Which that is, see `Bounds`, shape (n,).
         force: Contact forces there, 0 where they are rounding alone, shape (n,).
         active: The active set.
         left: What is left of the equations at owned dofs: all of r off Γ1, on it the smaller of
@@ -239,7 +239,7 @@ class _AtDofs:
     """
 
     gap: FloatArray
-    side: FloatArray
+    sign: FloatArray
     force: FloatArray
     active: ActiveSet
     left: FloatArray
@@ -255,14 +255,14 @@ class _AtDofs:
         release(vector)
         diagonal = system.operator.whole_diagonal
         x, raw = u.x.array[bounded], residual.x.array[bounded]
-        gap, side = system.bounds.gap(x), system.bounds.side(x)
+        gap, sign = system.bounds.gap(x), system.bounds.sign(x)
         force = np.where(np.abs(raw) > rounding * terms, raw, 0.0)
         left = residual.x.array[: len(diagonal)].copy()
-        left[bounded] = np.minimum(side * raw, diagonal[bounded] * gap)
+        left[bounded] = np.minimum(sign * raw, diagonal[bounded] * gap)
         left[np.abs(left) <= NOISE * diagonal * np.abs(u.x.array[: len(diagonal)])] = 0.0
-        active = ActiveSet.of(bounded, gap, side * force)
+        active = ActiveSet.of(bounded, gap, sign * force)
         # Off the bound r is what is left of an equation; on it, a pull is a pressure of wrong sign
-        return cls(gap, side, np.where(gap <= 0.0, force, 0.0), active, left)
+        return cls(gap, sign, np.where(gap <= 0.0, force, 0.0), active, left)
 
 
 def _bound(values: FloatArray) -> FloatArray:

@@ -160,7 +160,7 @@ class Extended:
     def _refine(self, share: float) -> FloatArray:
         """Solve with the active set; return what the last refinement changed, by class."""
         x, dofs = self._vectors.x, self.active.dofs
-        on_bound = self._bounds.on(self._bounds.side(x.array_r[self.active.bounded]))
+        on_bound = self._bounds.on(self._bounds.sign(x.array_r[self.active.bounded]))
         x.array[dofs] = on_bound[self.active.mask]
         self._remainder.array[dofs] = 0.0
         self._compute_residual()
@@ -196,13 +196,13 @@ class Extended:
         """Compute how far bounded dofs are from the nearer bound, shape (n,)."""
         bounded = self.active.bounded
         x, low = (each.array_r[bounded] for each in (self._vectors.x, self._remainder))
-        return self._bounds.gap(x) + self._bounds.side(x) * low
+        return self._bounds.gap(x) + self._bounds.sign(x) * low
 
     def _pushes(self) -> FloatArray:
         """Return the residual in bounded dofs, above 0 where it pushes them off, shape (n,)."""
         bounded = self.active.bounded
-        side = self._bounds.side(self._vectors.x.array_r[bounded])
-        return side * self.residual.array_r[bounded]
+        sign = self._bounds.sign(self._vectors.x.array_r[bounded])
+        return sign * self.residual.array_r[bounded]
 
     def _forces(self) -> FloatArray:
         """Return the forces on active dofs, 0 on others, shape (n,)."""
@@ -265,6 +265,6 @@ class Extended:
         nothing = none[self._stiffness.bounded] | (self._pushes() <= FORCES * self._bottom)
         residual.array[bounded[mask & nothing]] = 0.0
         at = x.array_r[bounded]
-        side = self._bounds.side(at)
-        off = np.nextafter(self._bounds.on(side), side * np.inf)
+        sign = self._bounds.sign(at)
+        off = np.nextafter(self._bounds.on(sign), sign * np.inf)
         x.array[bounded] = np.where(~mask & (self._bounds.gap(at) <= 0.0), off, at)

@@ -80,7 +80,7 @@ class Floating:
         owned = system.A.getLocalSize()[0]
         sizes, dofs = np.abs(system.chi[:owned]), np.ones(owned)
         size, number = self._sums(V.mesh.comm, self.piece[:owned], sizes, dofs)
-        finite = (np.isfinite(_floors(system, side)[system.bounded]) for side in (1.0, -1.0))
+        finite = (np.isfinite(_floors(system, sign)[system.bounded]) for sign in (1.0, -1.0))
         below, above = self._sums(V.mesh.comm, self.piece[system.bounded], *finite) > 0.0
         forces, doubt = net[None], NOISE * np.sqrt(number) * size
         if inflow is not None:
@@ -140,14 +140,14 @@ class Floating:
         system.residual(start, residual)
         bounded, bounds = system.bounded, system.bounds
         at = x[bounded]
-        forces = bounds.side(at) * residual.x.array[bounded]
+        forces = bounds.sign(at) * residual.x.array[bounded]
         pushed = ActiveSet.of(bounded, bounds.gap(at), forces)
         active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
         diagonal = system.operator.whole_diagonal
         lift = np.abs(system.b[: len(diagonal)]) / diagonal
         # upside down where the net force pulls
-        side = np.where(self._net(system) <= 0.0, 1.0, -1.0)
-        floor = np.where(side[self.piece] > 0.0, _floors(system, 1.0), _floors(system, -1.0))
+        sign = np.where(self._net(system) <= 0.0, 1.0, -1.0)
+        floor = np.where(sign[self.piece] > 0.0, _floors(system, 1.0), _floors(system, -1.0))
         bottom, depth = np.full(self.count + 1, np.inf), np.zeros(self.count + 1)
         top = -bottom
         np.maximum.at(depth, self.piece[: len(lift)], lift)
@@ -162,7 +162,7 @@ class Floating:
                 below = BELOW * depth[piece] + (top[piece] - bottom[piece])
                 there = self.piece == piece
                 held = np.where(np.isfinite(floor), floor, bottom[piece] - below)
-                x[there] = side[piece] * held[there]
+                x[there] = sign[piece] * held[there]
 
     def _net(self, system: System) -> FloatArray:
         """Compute the net force ∫ f + ∫ g on each piece, shape (count + 1,); collective."""
@@ -189,9 +189,9 @@ def _of_contact(below: bool, above: bool, amount: str) -> str:
     return f"a net force ∫f + ∫g {amount}: {wanted}"
 
 
-def _floors(system: System, side: float) -> FloatArray:
-    """Return α, or −β for the other side, by dof; −∞ where there is none."""
-    floor = system.lower if side > 0.0 else -system.upper
+def _floors(system: System, sign: float) -> FloatArray:
+    """Return α, or −β for the sign −1, by dof; −∞ where there is none."""
+    floor = system.lower if sign > 0.0 else -system.upper
     return np.where(floor > PETSc.NINFINITY, floor, -np.inf)
 
 

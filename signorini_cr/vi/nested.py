@@ -88,9 +88,9 @@ def known_start(u: fem.Function, level: Level, start: fem.Function) -> None:
     start.x.array[system.dirichlet] = values
     bounded, bounds = system.bounded, system.bounds
     x = start.x.array[bounded]
-    side = bounds.side(x)
-    bound = bounds.on(side)
-    near = side * (x - bound) < _margin(_largest(start), bound)
+    sign = bounds.sign(x)
+    bound = bounds.on(sign)
+    near = sign * (x - bound) < _margin(_largest(start), bound)
     start.x.array[bounded] = np.where(near, bound, x)
 
 
@@ -100,12 +100,12 @@ class _Expected:
 
     Attributes:
         active: The active set to begin with.
-        side: The side of the bound that a dof is on or nearer to, shape (n,).
+        sign: The sign of the bound that a dof is on or nearer to, shape (n,).
         force: Forces wanted on active dofs, off the bound; 0 on others, shape (n,).
     """
 
     active: ActiveSet
-    side: FloatArray
+    sign: FloatArray
     force: FloatArray
 
     @classmethod
@@ -114,14 +114,14 @@ class _Expected:
         operator, bounded, bounds = system.operator, system.bounded, system.bounds
         x = vector.array_r[bounded]
         of_parent = inherited.active & ~inherited.at_front
-        side = np.where(of_parent, np.sign(inherited.force), bounds.side(x))
-        gap = x - bounds.on(side)
+        sign = np.where(of_parent, np.sign(inherited.force), bounds.sign(x))
+        gap = x - bounds.on(sign)
         on_bound = operator.times(vector) - system.b[bounded] - operator.diagonal * gap
-        force = side * np.where(inherited.at_front, on_bound, inherited.force)
+        force = sign * np.where(inherited.at_front, on_bound, inherited.force)
         # with its parent off the bound a facet has no force, as the criterion sees it
         pushing = np.where(inherited.at_front | inherited.active, force, 0.0)
         active = ActiveSet.of(bounded, 0.0, pushing)
-        return cls(active, side, np.where(active.mask, force, 0.0))
+        return cls(active, sign, np.where(active.mask, force, 0.0))
 
 
 def _put_on_bounds(start: fem.Function, system: System, expected: _Expected) -> None:
@@ -133,7 +133,7 @@ def _put_on_bounds(start: fem.Function, system: System, expected: _Expected) -> 
         for sign, bound in ((-1.0, bounds.lower), (1.0, bounds.upper))
     )
     free = np.where(low < high, np.clip(x, low, high), 0.5 * (bounds.lower + bounds.upper))
-    start.x.array[system.bounded] = np.where(expected.active.mask, bounds.on(expected.side), free)
+    start.x.array[system.bounded] = np.where(expected.active.mask, bounds.on(expected.sign), free)
 
 
 def _largest(start: fem.Function) -> float:
@@ -171,18 +171,18 @@ def _make_forces(
     others += (system.bounded % block)[:, None]
     free = np.ones(len(start.x.array), dtype=bool)
     free[system.dirichlet] = free[system.bounded] = False
-    side, force = expected.side, expected.force
-    surplus = side * (operator.times(vector) - b) - force
+    sign, force = expected.sign, expected.force
+    surplus = sign * (operator.times(vector) - b) - force
     weak = (force > 0.0) & (surplus < (TRUSTED - 1.0) * force)
     movable = free[others] & weak[:, None]
     number = np.maximum(movable.sum(axis=1), 1)
     layout, moves = Layout.of_space(V), np.zeros(len(free))
     for _ in range(SWEEPS):
-        shift = side * surplus / operator.diagonal * (others.shape[1] - 1) / number
+        shift = sign * surplus / operator.diagonal * (others.shape[1] - 1) / number
         np.add.at(moves, others[movable], np.broadcast_to(shift[:, None], others.shape)[movable])
         start.x.array[:] += layout.shared_sum(moves)
         moves[:] = 0.0
-        surplus = side * (operator.times(vector) - b) - force
+        surplus = sign * (operator.times(vector) - b) - force
 
 
 @dataclass(frozen=True, eq=False)

@@ -304,7 +304,7 @@ class ReducedSolver:
     def forces(self) -> FloatArray:
         """Return the residual in the bounded dofs, above 0 where it pushes them off, shape (n,)."""
         bounded = self.active.bounded
-        return self.bounds.side(self._x.array_r[bounded]) * self._residual.array_r[bounded]
+        return self.bounds.sign(self._x.array_r[bounded]) * self._residual.array_r[bounded]
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,7 +356,7 @@ class ReducedSystem:
         if step is not None:
             x, forces = x - step.array_r[operator.dofs], forces - operator.times(step)
         bounds = self.bounds
-        return self.active.indicator(bounds.side(x) * forces, operator.diagonal * bounds.gap(x))
+        return self.active.indicator(bounds.sign(x) * forces, operator.diagonal * bounds.gap(x))
 
     def outlook(self, now: FloatArray, before: FloatArray) -> Outlook:
         """Judge a step by its indicator and by that of the step before; collective."""
