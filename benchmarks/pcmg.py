@@ -93,7 +93,7 @@ class Shell:
     def multTranspose(self, _: PETSc.Mat, b: PETSc.Vec, b_coarse: PETSc.Vec) -> None:
         """Restrict b, and drop what constrained dofs get."""
         self._transfer.restrict(b, b_coarse)
-        b_coarse.array[self._coarse.held] = 0.0
+        b_coarse.array[self._coarse.left_out] = 0.0
 
 
 def shells(grids: Sequence[Grid]) -> list[PETSc.Mat]:
@@ -137,7 +137,7 @@ class Theirs:
         for whole, matrix, grid in zip(self._whole, self._transfers, self._coarse, strict=True):
             kept = grid.matrix.createVecRight()
             kept.set(1.0)
-            kept.array[grid.held] = 0.0
+            kept.array[grid.left_out] = 0.0
             whole.copy(matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             matrix.diagonalScale(R=kept)
 
@@ -184,7 +184,7 @@ def compared(solution: Solution, cycle: Multigrid, repeats: int) -> Figures:
 
     with cycle.constrained(active):
         b.array[:] = np.random.default_rng(0).standard_normal(b.local_size)
-        b.array[cycle.finest.held] = 0.0
+        b.array[cycle.finest.left_out] = 0.0
     found = in_turns({"made": lambda: 1e3 * timed(lambda: whole_transfers(grids))}, 2)
     found |= measured("first of all", first_of_all) | measured("first", first)
     with cycle.constrained(active):

@@ -22,7 +22,6 @@ from .errors import (
     insist_on_kind,
     insist_on_number,
 )
-from .estimate.certificate import Certificate
 from .fem.problem import Problem
 from .levels import LevelMonitor, check_arguments, solve_sequence
 from .limits import Limits
@@ -135,8 +134,6 @@ class Shares(NamedTuple):
                 f"adaptive refinement goes by the certified bound, and there is none: "
                 f"{certificate.reason}"
             )
-        if not isinstance(certificate, Certificate):  # another physics may know no more
-            return cls(certificate.bound_h1, certificate.indicators)
         energy = max(map(abs, certificate.energy or (0.0,)))
         return cls(
             certificate.bound_h1,

@@ -13,13 +13,13 @@ Int32Array: TypeAlias = npt.NDArray[np.int32]
 Int64Array: TypeAlias = npt.NDArray[np.int64]
 
 
-def summed(comm: MPI.Comm, values: FloatArray) -> FloatArray:
-    """Sum up what the ranks have, in place where the array has floating-point numbers; collective.
+def summed(comm: MPI.Comm, values: npt.ArrayLike) -> FloatArray:
+    """Sum up what the ranks have, in the same array if it has floating-point numbers; collective.
 
     `np.bincount` has integers where it is given nothing to add up, on one rank perhaps, and what
     the others then got would be no number. mpi4py's `allreduce` would pickle the array, which takes
     longer than many a sum.
     """
-    values = np.asarray(values, dtype=np.float64)
-    comm.Allreduce(MPI.IN_PLACE, values)
-    return values
+    found: FloatArray = np.asarray(values, dtype=np.float64)
+    comm.Allreduce(MPI.IN_PLACE, found)
+    return found

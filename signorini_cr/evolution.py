@@ -537,6 +537,7 @@ def _at_first(solver: Solver, initial: Data, time: Clock | None) -> FloatArray:
     if time is None:
         return solver.projected(initial).x.array
     now, time.value = float(time.value), 0.0
-    found = solver.projected(initial).x.array
-    time.value = now
-    return found
+    try:
+        return solver.projected(initial).x.array
+    finally:
+        time.value = now

@@ -164,11 +164,12 @@ def solve_physics(
         return hierarchy.multigrid(system.operator, system.owned_dirichlet)
 
     if restart is not None:
-        held = level.floating is None  # so it is on finer meshes, of which none needs a system
+        # so it is on finer meshes, of which none needs a system
+        nothing_floats = level.floating is None
         for refined in restart.meshes(domain):
             level.tidy()
             hierarchy.add(*refined)
-            level = Level(hierarchy.meshes, held=held)
+            level = Level(hierarchy.meshes, nothing_floats=nothing_floats)
         start = Start(known=restart.function(level.V, 0))
         before = restart.function(hierarchy.meshes[-2].V, 1) if restart.added else None
     while True:
@@ -180,7 +181,7 @@ def solve_physics(
             break
         level.tidy()
         hierarchy.add(*following)
-        level = Level(hierarchy.meshes, held=level.floating is None)
+        level = Level(hierarchy.meshes, nothing_floats=level.floating is None)
         start = Start()
         if nested:
             start, before = Start(solution, before), solution.u

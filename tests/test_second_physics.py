@@ -8,7 +8,7 @@ multipliers of its own, and of the package no more than where the vertices are a
 numbered.
 """
 
-from types import SimpleNamespace
+from functools import cache
 
 import basix.ufl
 import numpy as np
@@ -20,8 +20,10 @@ from helpers import SQUARE
 from mpi4py import MPI
 from scipy.sparse.linalg import spsolve
 
-from signorini_cr import InputError, Polygon, compat
+from signorini_cr import InputError, Polygon, Problem, Robin, compat, solve_levels
 from signorini_cr.adaptive import adaptively
+from signorini_cr.data.diffusion import DiffusionOnMesh
+from signorini_cr.estimate.certificate import Certificate
 from signorini_cr.fem.physics import Imposed
 from signorini_cr.fem.snapshot import Snapshot
 from signorini_cr.fem.space import facet_corners, facet_entities, facet_measures
@@ -31,6 +33,7 @@ from signorini_cr.mesh.refinement import refine
 from signorini_cr.mesh.shared import shared_sum
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.restart import Restart
+from signorini_cr.rounding import at_most
 
 pytestmark = pytest.mark.ranks
 
@@ -89,6 +92,7 @@ class OnMesh:
         f, v = self.force(ufl.SpatialCoordinate(self.domain.mesh)), ufl.TestFunction(V)
         values = fem.Function(V).x.array
         fem.assemble_vector(values, fem.form(ufl.inner(f, v) * ufl.dx))
+        values.flags.writeable = False  # an array is its physics' own
         return values
 
     def chi(self):
@@ -183,7 +187,7 @@ class Coupled:
         slopes = np.linalg.solve(edges, away[:, 1:] - away[:, :1])
         squares = 0.5 * np.abs(np.linalg.det(edges)) * (slopes**2).sum(axis=(1, 2))
         total = mesh.comm.allreduce(squares.sum())
-        return SimpleNamespace(bound_h1=np.sqrt(total), indicators=squares, reason=None)
+        return Certificate(bound_h1=float(np.sqrt(total)), indicators=squares)
 
 
 def turned(vectors):
@@ -347,3 +351,38 @@ def test_each_component_is_held_elsewhere():
     assert contact.number_active < contact.number
     with pytest.raises(InputError, match=r"net force ∫f \+ ∫g of 1: only one below 0"):
         next(solve_physics(Coupled(Lifted), domain, uniformly))
+
+
+def test_bounds_of_another_kind_are_told(domain):
+    """A certificate that knows no more than a bound and its shares."""
+    (solution,) = solve_physics(Coupled(), domain, lambda _: None)
+    bound = solution.certificate.bound_h1
+    for said in (repr(solution), repr(solution.certificate), solution._repr_html_()):
+        assert at_most(bound) in said and "None" not in said
+
+
+def test_arrays_stay_the_physics_own(monkeypatch):
+    """With c and b alone to hold u, where a_h(1, ·) is asked for again and again."""
+    problem = Problem(
+        f=-1.0, obstacle=-0.3, reaction=0.5, conditions={"right": Robin(coefficient=2.0)}
+    )
+    corners = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    square = Polygon(corners, ["contact", "right", "neumann", "neumann"], names=("right",))
+
+    def solved():
+        (solution,) = solve_levels(problem, square.mesh(0.3), 1)
+        contact = solution.contact
+        assert 0 < contact.number_active < contact.number
+        return solution.energy, contact.force, solution.certificate.bound_h1
+
+    expected = solved()
+    for name in ("chi", "of_constants"):
+        made = cache(getattr(DiffusionOnMesh, name))
+
+        def kept(self, made=made):
+            values = made(self)
+            values.flags.writeable = False
+            return values
+
+        monkeypatch.setattr(DiffusionOnMesh, name, kept)
+    assert solved() == expected

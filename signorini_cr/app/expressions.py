@@ -31,6 +31,7 @@ T = TypeVar("T")
 LONGEST = 10_000  # characters
 DEEPEST = 150  # levels of nesting
 LARGEST = 10_000  # operations, definitions included
+LISTED = 30  # names told of, where one is not among them
 LONGEST_CHAIN = 250  # operations, each of which needs the one before; at 500 UFL 2026.1 gives up
 
 RESERVED = frozenset((*VARIABLES, *CONSTANTS, *FUNCTIONS))
@@ -369,8 +370,8 @@ def _is_or_are(number: int) -> str:
     return "is" if number < 2 else "are"
 
 
-def _listed(words: Collection[str], most: int = 30) -> str:
+def _listed(words: Collection[str]) -> str:
     words = list(words)
-    if len(words) > most:
-        return ", ".join(words[:most]) + " and others"
+    if len(words) > LISTED:
+        return ", ".join(words[:LISTED]) + " and others"
     return ", ".join(words[:-1]) + (" and " if words[:-1] else "") + words[-1]

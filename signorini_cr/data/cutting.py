@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int64Array, summed
 from ..fem.cells import Cells, blocks
 from .jets import Boxes
 from .pieces import JUMP, QUARTERS, SLANTED, UNKNOWN, Levels, Pieces
@@ -385,7 +385,7 @@ def _negligible(share: FloatArray, enough: float, comm: MPI.Comm) -> float:
     mantissa, exponent = np.frexp(share / least)
     power = np.clip(exponent - (mantissa == 0.5), 0, highest + 1)
     power[~np.isfinite(share)] = highest + 1
-    sums = comm.allreduce(np.bincount(power, share, minlength=highest + 2))
+    sums = summed(comm, np.bincount(power, share, minlength=highest + 2))
     return float(least * 2.0 ** np.searchsorted(np.cumsum(sums)[1:-1], enough, side="right"))
 
 

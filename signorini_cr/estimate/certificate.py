@@ -81,10 +81,10 @@ class Certificate:
 
     def __repr__(self) -> str:
         """Write bound and energy on a line, or why there are none."""
-        if self.bound_h1 is None or self.energy is None:
+        if self.bound_h1 is None:
             return f"<Certificate: no bound, {self.reason}>"
-        bound, energy = at_most(self.bound_h1), interval(*self.energy)
-        return f"<Certificate: error at most {bound}, energy in {energy}>"
+        energy = "" if self.energy is None else f", energy in {interval(*self.energy)}"
+        return f"<Certificate: error at most {at_most(self.bound_h1)}{energy}>"
 
     @cached_property
     def flux(self) -> fem.Function | None:

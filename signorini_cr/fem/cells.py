@@ -19,7 +19,7 @@ from dolfinx.mesh import Mesh
 from scipy.sparse import csc_array
 
 from .. import compat
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
 from ..mesh.domain import Domain, Refinement
 from ..mesh.shared import shared_maximum, shared_sum
 from .space import facet_entities, simplex_measures
@@ -520,7 +520,7 @@ class Cells:
 
     def total(self, *values: float | np.floating | FloatArray) -> FloatArray:
         """Sum over all ranks."""
-        return self.comm.allreduce(np.array(values, dtype=np.float64))
+        return summed(self.comm, np.array(values, dtype=np.float64))
 
     def apply(self, c: FloatArray, block: slice | IndexArray) -> FloatArray:
         """Compute |T| ∇λ_i·∇w for w = Σ c_i λ_i, shape (d + 1, cells in the block)."""

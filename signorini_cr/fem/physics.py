@@ -4,7 +4,8 @@ Meshes, multigrid and the active set method know of nodes, of how many unknowns 
 matrices, and of which unknowns are set or bounded. A node is a facet, or a vertex of the P1 spaces
 on coarse meshes; all nodes of a space have the same number of unknowns, its block size, and unknown
 c of node i has the number ``block * i + c``. Everything else is a physics': the space, a_h, χ, what
-is set and bounded, the P1 operator of coarse meshes, and the certificate. A physics whose bounds
+is set and bounded, the P1 operator of coarse meshes, and the certificate. Arrays that it hands over
+are read, not written, and stay its own. A physics whose bounds
 are on a combination of a facet's unknowns chooses that combination as one of them. Transfers carry
 each unknown by itself: the choice is to be the same at all nodes. What is set on Γ0 are all
 unknowns of a facet, and meshes have no ghost cells, so that forms have no inner facets.
@@ -137,7 +138,10 @@ class Physics(Protocol):
     def certify(self, solution: Any) -> Any:
         """Bound the error of a solution, or say why that can't be done; collective.
 
+        Args:
+            solution: The `Solution`, of this physics.
+
         Returns:
-            A `Certificate`, or what has its `bound_h1`, `indicators` and `reason`, which is what
-            adaptive refinement goes by. Of a `Certificate` it knows how much is rounding, too.
+            The `Certificate`. All that it may know has a default; adaptive refinement goes by
+            `bound_h1` and `indicators`, or passes on the `reason` why there are none.
         """

@@ -30,7 +30,7 @@ from ufl.domain import extract_unique_domain
 from ufl.geometry import GeometricFacetQuantity
 from ufl.restriction import Restricted
 
-from ..arrays import FloatArray, Int32Array
+from ..arrays import FloatArray, Int32Array, summed
 from ..errors import InputError, insist_on_kind, together
 from ..hints import meant
 from ..jit import compiled
@@ -782,7 +782,7 @@ class Forms:
         """
         form = self._squared_errors.on(domain, [fem.functionspace(domain.mesh, self._pair)], [w])
         squares = np.asarray(fem.assemble_vector(form).array).reshape(-1, 2)
-        h1, l2 = np.sqrt(domain.mesh.comm.allreduce(squares.sum(axis=0)))
+        h1, l2 = np.sqrt(summed(domain.mesh.comm, squares.sum(axis=0)))
         return float(h1), float(l2)
 
 

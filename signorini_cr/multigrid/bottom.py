@@ -64,15 +64,13 @@ class Bottom:
         self._matrix, self._prefix = matrix, ALONE_PREFIX if alone else BOTTOM_PREFIX
         self._options = _choice(matrix, dimension, alone)
         self._pc: PETSc.PC | None = None
-        self._constrained: Int32Array | None = None
-        self._stale = True
+        self._constrained: Int32Array = np.empty(0, np.int32)
+        self._made_for: Int32Array | None = None
+        self._checked = False
 
     def constrain(self, dofs: Int32Array) -> None:
-        """Note which owned dofs are constrained from now on; collective."""
-        known = self._constrained is not None and np.array_equal(dofs, self._constrained)
-        comm = self._matrix.getComm().tompi4py()
-        self._stale |= comm.allreduce(not known, op=MPI.LOR)
-        self._constrained = dofs
+        """Note which owned dofs are constrained from now on; on all ranks, which need not talk."""
+        self._constrained, self._checked = dofs, False
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[object] = ()) -> None:
         """Solve with the matrix as it is constrained now; nothing is below."""
@@ -82,14 +80,22 @@ class Bottom:
             self._pc.setOperators(self._matrix)
             with defaults(self._options, self._prefix):
                 read(self._pc)
-        if self._stale:
-            # The matrix is whole in between, which is no reason to PETSc to set up anew
-            self._pc.setReusePreconditioner(False)
-            with defaults(self._options, self._prefix):
-                self._pc.setUp()
-            self._pc.setReusePreconditioner(True)
-            self._stale = False
+        if not self._checked:
+            self._follow(self._pc)
         self._pc.apply(b, x)
+
+    def _follow(self, pc: PETSc.PC) -> None:
+        """Set up anew if other dofs are constrained than those it was made for; collective."""
+        made = self._made_for
+        stale = made is None or not np.array_equal(self._constrained, made)
+        if self._matrix.getComm().tompi4py().allreduce(stale, op=MPI.LOR):
+            # The matrix is whole in between, which is no reason to PETSc to set up anew
+            pc.setReusePreconditioner(False)
+            with defaults(self._options, self._prefix):
+                pc.setUp()
+            pc.setReusePreconditioner(True)
+            self._made_for = self._constrained
+        self._checked = True
 
     def describe(self, why: str = "") -> str:
         """Say in words what it is, and why unless it is what users have asked for."""

@@ -75,7 +75,7 @@ class ConstrainedMatrix:
 
     def __init__(self, A: PETSc.Mat, dofs: Int32Array):
         """Note the rows and columns of all dofs that may ever be constrained; collective."""
-        self.matrix, self.dofs = A, dofs
+        self.matrix, self.dofs, self._open = A, dofs, False
         entries = A.getDiagonal()
         self.whole_diagonal: FloatArray = entries.array_r.copy()
         release(entries)
@@ -108,6 +108,8 @@ class ConstrainedMatrix:
     def constrained(self, dofs: Int32Array) -> Iterator[Int32Array]:
         """Have the identity in the rows and columns of some dofs for a block; collective at entry.
 
+        Blocks of one matrix are not nested.
+
         Args:
             dofs: Owned dofs, local numbers. Others than `dofs` are left alone: a space may meet Γ0
                 where the finer one's bounds end, and far from the origin rounding reaches more.
@@ -115,20 +117,23 @@ class ConstrainedMatrix:
         Yields:
             Those that are constrained, ascending.
         """
+        assert not self._open, "a block inside another would put back what that one left out"
         named = np.zeros(self.matrix.getLocalSize()[0], dtype=bool)
         named[dofs] = True
         chosen = self.dofs[named[self.dofs]]
         named[:] = False
         named[chosen] = True
         which = np.flatnonzero(named[self._own_row] | self._seen(chosen)[self._place])
-        if not self.matrix.getComm().tompi4py().allreduce(len(chosen)):
-            yield chosen
-            return
+        anyone = self.matrix.getComm().tompi4py().allreduce(len(chosen)) > 0
+        self._open = True
         try:
-            self._write(which, self._unit[which])
+            if anyone:
+                self._write(which, self._unit[which])
             yield chosen
         finally:
-            self._write(which, self._value[which])
+            if anyone:
+                self._write(which, self._value[which])
+            self._open = False
 
     def times(self, x: PETSc.Vec) -> FloatArray:
         """Compute A x in the dofs that can be constrained, shape (n,), whether or not they are."""
@@ -188,6 +193,8 @@ class ConstrainedMatrix:
         start = np.arange(len(which) + 1, dtype=PETSc.IntType)
         local = PETSc.Mat.Option.NO_OFF_PROC_ENTRIES
         self.matrix.setOption(local, True)
-        self.matrix.setValuesIJV(start, self._column[which], values, rowmap=self._row[which])
-        self.matrix.assemble()
-        self.matrix.setOption(local, False)
+        try:
+            self.matrix.setValuesIJV(start, self._column[which], values, rowmap=self._row[which])
+            self.matrix.assemble()
+        finally:
+            self.matrix.setOption(local, False)

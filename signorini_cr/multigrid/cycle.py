@@ -71,7 +71,7 @@ class Grid:
         dofs: Its dofs.
         dirichlet: Its owned dofs on Γ0, local numbers.
         transfer: What writes functions of the next coarser space in this one, None at the bottom.
-        held: Owned dofs that are left out at present: those on Γ0, and the constrained ones.
+        left_out: Owned dofs that are left out at present: those on Γ0, and the constrained ones.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Grid:
             whole: Whether it does so from the beginning, by `Whole`.
         """
         self.operator, self.dofs, self.dirichlet = operator, dofs, dirichlet
-        self.transfer, self._sweeps, self.held = transfer, sweeps, dirichlet
+        self.transfer, self._sweeps, self.left_out = transfer, sweeps, dirichlet
         self.solver: Bottom | TwoGrids | Whole
         if whole:
             self.solver = Whole(self.matrix, operator.dofs)
@@ -121,7 +121,7 @@ class Grid:
             Owned dofs of the next coarser space whose functions don't vanish at those left out.
         """
         with self.operator.constrained(dofs) as constrained:
-            self.held = np.concatenate([self.dirichlet, constrained])
+            self.left_out = np.concatenate([self.dirichlet, constrained])
             self.solver.constrain(constrained)
             try:
                 yield (
@@ -130,7 +130,8 @@ class Grid:
                     else self.transfer.coarse_support(constrained)
                 )
             finally:
-                self.held = self.dirichlet
+                self.left_out = self.dirichlet
+                self.solver.constrain(constrained[:0])
 
     def rounding(self, x: PETSc.Vec, constrained: Int32Array) -> float:
         """Take the norm of diagonal times x over free dofs: the residual's digits are lost in it.
@@ -180,7 +181,7 @@ class TwoGrids:
         self._matrix.mult(x, self._residual)
         self._residual.aypx(-1.0, b)
         self._transfer.restrict(self._residual, self._b_coarse)
-        self._b_coarse.array[below[0].held] = 0.0
+        self._b_coarse.array[below[0].left_out] = 0.0
         below[0].solver.solve(self._b_coarse, self._x_coarse, below[1:])
         self._transfer.add(self._x_coarse, x)
         self._smoother.backward(b, x)
@@ -238,18 +239,20 @@ class Multigrid:
         return LITTLE if is_small(self.matrix) else PATIENCE
 
     def give_up(self) -> None:
-        """Leave the coarser spaces alone from now on, for BoomerAMG or a factorisation."""
+        """Leave the coarser spaces alone from now on, for BoomerAMG or a factorisation.
+
+        Not in a block of `constrained`, which the replacement would know nothing of; collective.
+        """
         fine = self.finest
-        held = np.setdiff1d(fine.held, fine.dirichlet)
         self._replacement = Grid(fine.operator, fine.dofs, fine.dirichlet, alone=True)
-        self._replacement.solver.constrain(held)
         self.grids, self.given_up = [self._replacement], True
 
     @contextmanager
     def constrained(self, dofs: Int32Array, deep: bool = True) -> Iterator[None]:
         """Leave dofs out of the finest space for a block, and what needs them out of the others.
 
-        All matrices are whole again after the block, whatever happens in it; collective at entry.
+        All matrices are whole again after the block, and the cycle is theirs, whatever happens in
+        it; collective at entry.
 
         Args:
             dofs: Owned dofs of the finest space, local numbers; only those with a bound count.

@@ -62,29 +62,33 @@ class Whole:
         # what is constrained afterwards is no reason to PETSc to set up anew
         self._pc.setReusePreconditioner(True)
         self._unit, self._image = matrix.createVecs()
-        self._constrained = dofs[:0]
+        self._constrained = self._made_for = dofs[:0]
 
     def constrain(self, dofs: Int32Array) -> None:
         """Note which dofs are constrained from now on."""
-        if np.array_equal(dofs, self._constrained):
-            return
+        self._constrained = dofs
+
+    def solve(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[object] = ()) -> None:
+        """Solve with the matrix as it is constrained now, b being 0 there; nothing is below."""
+        dofs = self._constrained
+        if len(dofs) and not np.array_equal(dofs, self._made_for):
+            self._follow(dofs)
+        self._pc.apply(b, x)
+        if len(dofs):
+            values = x.array
+            values -= (self._schur @ values[dofs]) @ self._theirs
+            values[dofs] = 0.0
+
+    def _follow(self, dofs: Int32Array) -> None:
+        """Find the columns of the inverse that are not known yet, and the Schur complement."""
         rows = np.searchsorted(self._dofs, dofs)
         for row in rows[~self._known[rows]]:
             self._unit.array[:] = 0.0
             self._unit.array[self._dofs[row]] = 1.0
             self._pc.apply(self._unit, self._image)
             self._columns[row], self._known[row] = self._image.array_r, True
-        self._constrained = dofs
         self._theirs: FloatArray = self._columns[rows]
-        self._schur = np.linalg.inv(self._theirs[:, dofs])
-
-    def solve(self, b: PETSc.Vec, x: PETSc.Vec, below: Sequence[object] = ()) -> None:
-        """Solve with the matrix as it is constrained now, b being 0 there; nothing is below."""
-        self._pc.apply(b, x)
-        if len(self._constrained):
-            values = x.array
-            values -= (self._schur @ values[self._constrained]) @ self._theirs
-            values[self._constrained] = 0.0
+        self._schur, self._made_for = np.linalg.inv(self._theirs[:, dofs]), dofs
 
     def is_accurate(self) -> bool:
         """Tell whether constants are found: a matrix that hardly anything holds may seem singular.

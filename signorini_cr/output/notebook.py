@@ -19,7 +19,7 @@ def as_html(solution: Solution) -> str:
 
     Nothing is solved or certified for it: of the certificate there is what has been made. There is
     no picture where there are several ranks, which would have to draw it together, nor of
-    domains in space, nor without Matplotlib.
+    domains in space or of several unknowns a facet, nor without Matplotlib.
     """
     contact, iterations = solution.contact, solution.iterations
     certificate = solution.__dict__.get("certificate")
@@ -39,11 +39,12 @@ def as_html(solution: Solution) -> str:
     }
     if certificate is None:
         rows["error bound"] = "not asked for: solution.certificate"
-    elif certificate.bound_h1 is None or certificate.energy is None:
+    elif certificate.bound_h1 is None:
         rows["error bound"] = f"none: {certificate.reason}"
     else:
         rows["error at most"] = at_most(certificate.bound_h1)
-        rows["energy J(u) in"] = interval(*certificate.energy)
+        if certificate.energy is not None:
+            rows["energy J(u) in"] = interval(*certificate.energy)
     left, right = 'style="text-align:left"', 'style="text-align:right"'
     table = "".join(
         f"<tr><th {left}>{escape(name)}</th><td {right}>{escape(value)}</td></tr>"
@@ -53,8 +54,8 @@ def as_html(solution: Solution) -> str:
 
 
 def _picture(solution: Solution) -> str:
-    mesh = solution.domain.mesh
-    if mesh.comm.size > 1 or mesh.geometry.dim != 2 or not plots.can_draw(mesh.comm):
+    mesh, block = solution.domain.mesh, solution.u.function_space.dofmap.index_map_bs
+    if mesh.comm.size > 1 or mesh.geometry.dim != 2 or block > 1 or not plots.can_draw(mesh.comm):
         return ""
     figure = plots.plot_solution(solution)
     assert figure is not None

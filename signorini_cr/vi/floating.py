@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from .. import compat
-from ..arrays import FloatArray, IndexArray, Int32Array
+from ..arrays import FloatArray, IndexArray, Int32Array, summed
 from ..errors import raise_together
 from ..mesh.planar import pieces
 from ..multigrid.parents import Layout
@@ -113,8 +113,7 @@ class Floating:
             *values: Each of shape (n,).
         """
         sums = [np.bincount(piece, each, self.count + 1) for each in values]
-        found: FloatArray = comm.allreduce(np.array(sums))
-        return found
+        return summed(comm, np.array(sums))
 
     def _where(self, V: fem.FunctionSpace, piece: int) -> str | None:
         """Name a piece by a point in it; None on ranks that have no cell of it."""
@@ -142,7 +141,7 @@ class Floating:
         at = x[bounded]
         forces = bounds.sign(at) * residual.x.array[bounded]
         pushed = ActiveSet.of(bounded, bounds.gap(at), forces)
-        active = np.bincount(self.piece[bounded], pushed.mask, self.count + 1)
+        active = summed(comm, np.bincount(self.piece[bounded], pushed.mask, self.count + 1))
         diagonal = system.operator.whole_diagonal
         lift = np.abs(system.b[: len(diagonal)]) / diagonal
         # upside down where the net force pulls
@@ -154,7 +153,6 @@ class Floating:
         own = bounded[np.isfinite(floor[bounded])]
         np.minimum.at(bottom, self.piece[own], floor[own])
         np.maximum.at(top, self.piece[own], floor[own])
-        active = comm.allreduce(active)
         bottom = np.min(comm.allgather(bottom), axis=0)
         top, depth = np.max(comm.allgather([top, depth]), axis=0)
         for piece in range(1, self.count + 1):

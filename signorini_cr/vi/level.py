@@ -25,13 +25,13 @@ class Level:
 
     Attributes:
         meshes: The meshes up to this one, coarsest first.
-        held: True if each piece of the domain is known to be held by Γ0, or by b or c; refinement
-            keeps that.
+        nothing_floats: True if each piece of the domain is known to be held by Γ0, or by b or c;
+            refinement keeps that.
         like: A system with the same matrix, if there is one.
     """
 
     meshes: tuple[NestedMesh, ...]
-    held: bool = False
+    nothing_floats: bool = False
     like: System | None = None
 
     def __post_init__(self) -> None:
@@ -89,9 +89,9 @@ class Level:
     @cached_property
     def floating(self) -> Floating | None:
         """Pieces that nothing but an obstacle can hold, None if there are none."""
-        if self.held:
+        if self.nothing_floats:
             return None
         found = Floating.of(self.V, self.system.dirichlet)
         if found.count:  # what else may hold them takes a form of its own to be known
-            found = Floating.of(self.V, self.system.held)
+            found = Floating.of(self.V, self.system.dofs_that_hold())
         return found if found.count else None

@@ -189,14 +189,10 @@ class ReducedSolver:
         careful = self._snes.getIterationNumber() >= CAREFUL
         if careful:
             self._hold()
-        forces = self._residual.array_r[self.active.bounded].copy()
-        self._residual.array[self.active.dofs] = 0.0
-        with self._cycle.constrained(self.active.dofs, deep=self._uses_cycle):
-            test = self._run(forces)
-            if test.slow:  # from the start, which one step of a factorisation makes up for
-                self._cycle.give_up()
-                test = self._run(forces)
-        self._residual.array[self.active.bounded] = forces
+        test = self._without_active()
+        if test.slow:  # from the start, which one step of a factorisation makes up for
+            self._cycle.give_up()
+            test = self._without_active()
         self.reached, self.force_errors = test.reached, test.force_errors
         next_to_nothing = SETTLING_LIMIT * self.ksp.getTolerances()[1]
         # with several classes what is rounding in one may be much in another
@@ -243,6 +239,19 @@ class ReducedSolver:
         self._cut = self._comm.allreduce(clipped, op=MPI.LOR) or share < 1.0
         self._step.scale(share)
         release(way, image)
+
+    def _without_active(self) -> LinearTest:
+        """Solve with active dofs left out of matrices and residual.
+
+        The matrices are whole afterwards whatever happens. After an error the residual is not, as
+        PETSc keeps it locked; it is of no use then.
+        """
+        forces = self._residual.array_r[self.active.bounded].copy()
+        self._residual.array[self.active.dofs] = 0.0
+        with self._cycle.constrained(self.active.dofs, deep=self._uses_cycle):
+            test = self._run(forces)
+        self._residual.array[self.active.bounded] = forces
+        return test
 
     def _run(self, forces: FloatArray) -> LinearTest:
         """Run the inner solver, and return what its test has found out."""
@@ -370,7 +379,7 @@ class ReducedSystem:
                 sums(np.where(active, np.maximum(now, 0.0), 0.0)),
             ]
         )
-        summed(self.stiffness.comm, facts)
+        facts = summed(self.stiffness.comm, facts)
         moved, forces = facts[2:].reshape(2, -1)
         forces = np.maximum(forces, self.stiffness.least)
         return Outlook(float(np.sqrt(facts[0])), bool(facts[1]), moved, forces)

@@ -32,6 +32,9 @@ from .reduced import LINEAR_SHARE, SET_SHARE, ReducedSolver
 from .stopping import FLOWS, FORCES, GAIN, LOST, NOISE, ROUNDED, STORED, TOUCHING, Stiffness
 from .system import DATUM, Vectors
 
+TOLERANCE = 1e-8
+"""Norm that the residual may have, in parts of that at the most trivial start."""
+
 SET_TOLERANCE = 0.01
 """Residual that dofs in the wrong set may have, in parts of what all may have together."""
 
@@ -127,11 +130,14 @@ def solve_vi(
     vectors: Vectors,
     scale: float,
     *,
-    tolerance: float = 1e-8,
     monitor: Monitor | None = None,
     data: SystemData | None = None,
 ) -> Iterations:
     """Solve the variational inequality in place; collective.
+
+    The solve ends when the residual's norm is below `TOLERANCE` times `scale`, or lost in rounding,
+    and what is due to the choice of the active set far below; and the contact forces and each class
+    of stiffness are converged for themselves, see `stopping`.
 
     Args:
         cycle: The preconditioner, with the matrix A on its finest grid: symmetric positive
@@ -140,9 +146,6 @@ def solve_vi(
         vectors: Right-hand side and bounds, start and solution.
         scale: Norm that the residual is measured against, `System.residual_scale`; the same for
             all starts.
-        tolerance: The solve ends when the residual's norm is below ``tolerance * scale``, or lost
-            in rounding, and what is due to the choice of the active set far below; and the contact
-            forces and each class of stiffness are converged for themselves, see `stopping`.
         monitor: Called after each step.
         data: What there is to know of the data; without it all equations are of one class of
             stiffness, all contact is one neighbourhood, and what is lost in rounding stays so.
@@ -152,7 +155,7 @@ def solve_vi(
             `Indefinite` where CG has seen that A is not positive definite.
         InputError: PETSc can't solve with the options that are set.
     """
-    target = tolerance * scale or 1e-300
+    target = TOLERANCE * scale or 1e-300
     # looked up here, as the linear solver has to know; what is below rounding is all the same to it
     wanted = max(read_number("snes_atol", target), 1e-30 * target)
     snes = PETSc.SNES().create(cycle.matrix.getComm())

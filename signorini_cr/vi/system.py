@@ -161,7 +161,7 @@ class System:
             _require_positive(comm, self.operator.whole_diagonal)
         else:
             self.A, self.operator = like.A, like.operator
-        self.chi = layout.shared_sum(data.chi())
+        self.chi = layout.shared_sum(data.chi().copy())
         self._take_balance()
         shares = like is not None and self.u_D is like.u_D and self.offset == like.offset
         same = like if shares else None
@@ -233,10 +233,10 @@ class System:
         """
         comm = self._data.V.mesh.comm
         held = comm.allreduce(len(self.dirichlet) > 0, op=MPI.LOR)
-        if held or (of_constants := self._data.of_constants()) is None:
+        if held or (of_constants := self._of_constants()) is None:
             return
-        owned, layout = self.A.getLocalSize()[0], Layout.of_space(self._data.V)
-        of_one, chi = layout.shared_sum(of_constants)[:owned], self.chi[:owned]
+        owned = self.A.getLocalSize()[0]
+        of_one, chi = of_constants[:owned], self.chi[:owned]
         lost, net, loads = summed(comm, np.array([of_one.sum(), chi.sum(), np.abs(chi).sum()]))
         diagonal = self.operator.whole_diagonal
         softest = comm.allreduce(float(diagonal.min(initial=np.inf)), op=MPI.MIN)
@@ -394,15 +394,18 @@ class System:
         finally:
             release(*(getattr(vectors, each.name) for each in fields(vectors)))
 
-    @property
-    def held(self) -> Int32Array:
-        """Local dofs on Γ0, or on which a_h(1, ·) does not vanish; collective."""
-        of_constants = self._data.of_constants()
+    def dofs_that_hold(self) -> Int32Array:
+        """Find local dofs on Γ0, or on which a_h(1, ·) does not vanish; collective."""
+        of_constants = self._of_constants()
         if of_constants is None:
             return self.dirichlet
-        layout = Layout.of_space(self._data.V)
         of_constants[self.dirichlet] = 1.0
-        return np.flatnonzero(layout.shared_sum(of_constants) > 0.0).astype(np.int32)
+        return np.flatnonzero(of_constants > 0.0).astype(np.int32)
+
+    def _of_constants(self) -> FloatArray | None:
+        """Compute a_h(1, ·), ghosts up to date, shape (dofs,), if it is not 0; collective."""
+        found = self._data.of_constants()
+        return None if found is None else Layout.of_space(self._data.V).shared_sum(found.copy())
 
     def _bc(self, values: fem.Function) -> fem.DirichletBC:
         """Impose values on Γ0, where all unknowns of a node are set."""
@@ -448,9 +451,8 @@ class System:
         Returns:
             Sums of a_h(1, ·) of owned dofs; None where there are no c and no b.
         """
-        if (of_constants := self._data.of_constants()) is None:
+        if (of_constants := self._of_constants()) is None:
             return None
-        Layout.of_space(self.u_D.function_space).shared_sum(of_constants)
         pattern = with_entries(self.A, np.ones_like)
         here, around = pattern.createVecs()
         here.array[:] = np.abs(of_constants[: len(here.array_r)])

@@ -106,12 +106,25 @@ def test_what_a_grid_holds():
     space = grid()
     whole = space.matrix[:, :]
     with space.constrained(np.array([8, 9, 4], np.int32)) as constrained:
-        assert constrained.tolist() == [4, 8] and sorted(space.held) == [0, 4, 8, 19]
+        assert constrained.tolist() == [4, 8] and sorted(space.left_out) == [0, 4, 8, 19]
         expected = whole.copy()
         expected[[4, 8]] = expected[:, [4, 8]] = 0.0
         expected[[4, 8], [4, 8]] = 1.0
         assert np.array_equal(space.matrix[:, :], expected)
-    assert np.array_equal(space.matrix[:, :], whole) and space.held.tolist() == [0, 19]
+    assert np.array_equal(space.matrix[:, :], whole) and space.left_out.tolist() == [0, 19]
+
+
+def test_blocks_are_not_nested():
+    """The inner one would put back what the outer one leaves out."""
+    space = grid()
+    whole = space.matrix[:, :]
+    with space.constrained(np.array([4, 8], np.int32)):
+        within = space.matrix[:, :]
+        with pytest.raises(AssertionError, match="inside another"):
+            with space.constrained(np.array([8, 11], np.int32)):
+                pass
+        assert np.array_equal(space.matrix[:, :], within)
+    assert np.array_equal(space.matrix[:, :], whole)
 
 
 def test_when_a_chain_is_given_up(monkeypatch):
@@ -121,12 +134,12 @@ def test_when_a_chain_is_given_up(monkeypatch):
     monkeypatch.setattr(bottom, "DIRECT", 19)
     cycle = Multigrid([grid()])
     assert cycle.may_give_up
+    before = cycle.finest
+    cycle.give_up()
+    b, x = cycle.matrix.createVecs()
+    b.array[:] = np.arange(20.0)
+    b.array[8] = 0.0
     with cycle.constrained(np.array([8], np.int32)):
-        before = cycle.finest
-        cycle.give_up()
-        b, x = cycle.matrix.createVecs()
-        b.array[:] = np.arange(20.0)
-        b.array[8] = 0.0
         cycle.apply(None, b, x)
         if HAS_HYPRE:
             assert "multigrid took too many CG steps" in cycle.describe()

@@ -34,6 +34,7 @@ from signorini_cr.multigrid.parents import Layout, Parents
 from signorini_cr.multigrid.smoothing import GaussSeidel
 from signorini_cr.multigrid.transfer import Ancestor, inclusion, prolongate, prolongation
 from signorini_cr.options import AMG
+from signorini_cr.vi import solver
 from signorini_cr.vi.level import Level
 from signorini_cr.vi.nested import nested_start
 from signorini_cr.vi.reduced import ReducedSolver
@@ -304,7 +305,9 @@ def active(system, u, residual):
     ],
     ids=lambda value: getattr(value, "name", str(value)),
 )
-def test_the_same_solution_as_a_direct_solver(example, shift, squares, levels, options):
+def test_the_same_solution_as_a_direct_solver(
+    example, shift, squares, levels, options, monkeypatch
+):
     """The active set facet by facet, and the residual the report promises.
 
     Contact ends in C with a pressure that grows like the power 2.5 or 4.5 of the distance, so that
@@ -317,9 +320,10 @@ def test_the_same_solution_as_a_direct_solver(example, shift, squares, levels, o
     options("ksp_type", "preonly")
     options("pc_type", "lu")
     options("pc_factor_mat_solver_type", "mumps")
+    monkeypatch.setattr(solver, "TOLERANCE", 1e-13)
     grid = Grid(system.operator, Layout.of_space(V), system.owned_dirichlet)
     with system.vectors(u, r) as vectors:
-        cold = solve_vi(Multigrid([grid]), vectors, system.residual_scale, tolerance=1e-13)
+        cold = solve_vi(Multigrid([grid]), vectors, system.residual_scale)
     assert cold.newton > 1
     for function in (u, r):
         function.x.scatter_forward()
@@ -404,6 +408,33 @@ def watched(levels=3):
         matrices = [(grid.matrix, grid.matrix.copy()) for grid in cycle.grids]
         yield cycle, vectors, system.residual_scale, matrices
     hierarchy.free()
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("levels", [1, 3])
+def test_after_a_block_the_cycle_is_that_of_the_whole_matrices(levels):
+    """With factors, Schur complements and sweeps: what it makes of a vector is as it was before."""
+    with watched(levels) as (cycle, _, _, matrices):
+        (b, x), bounded = cycle.matrix.createVecs(), cycle.operator.dofs
+        values = np.random.default_rng(MPI.COMM_WORLD.rank).standard_normal(b.local_size)
+
+        def applied(left_out):
+            b.array[:] = values
+            b.array[left_out] = b.array[cycle.finest.dirichlet] = 0.0
+            cycle.apply(None, b, x)
+            return x.array.copy()
+
+        before = applied(bounded[:0])
+        with cycle.constrained(bounded):
+            assert difference(applied(bounded), before) > 0.01 * np.abs(before).max(initial=0.0)
+        assert difference(applied(bounded[:0]), before) < 1e-12
+        with cycle.constrained(bounded[::2]):
+            within = applied(bounded[::2])
+        with cycle.constrained(bounded[1::2]):
+            pass
+        with cycle.constrained(bounded[::2]):
+            assert difference(applied(bounded[::2]), within) < 1e-12
+        assert all(same(*pair) for pair in matrices)
 
 
 @pytest.mark.ranks
