@@ -210,12 +210,16 @@ def adapt_to_run(
     """
     insist_on_function("run", run)
     step = _by_shares(Limits(max_time), tolerance, levels, max_dofs, fraction, runs=RUNS)
+    insist_on_kind("meshes", meshes, Sequence, "a list of refined meshes")
     refined = [*meshes]
     while True:
         total, last = Shares(0.0, np.zeros(1), of_energy=0.0), None
         steps = run(refined)
         insist_on_kind("what run returns", steps, Iterable, "pairs of a time and a solution")
-        for _, last in steps:
+        for each in steps:
+            if not (isinstance(each, tuple) and len(each) == 2 and isinstance(each[1], Solution)):
+                raise InputError(f"the run gives {each!r}: a time and a solution are needed")
+            last = each[1]
             shares = Shares.of(last)
             total = Shares(
                 max(total.bound, shares.bound),

@@ -27,6 +27,7 @@ from signorini_cr import (
 )
 from signorini_cr.errors import InputError, on_root
 from signorini_cr.memory import ran_out_of_memory
+from signorini_cr.output.vtu import write_solution
 
 WORLD = MPI.COMM_WORLD
 SIDES = HELD_ABOVE.boundary
@@ -152,6 +153,18 @@ def test_a_size_that_one_rank_alone_refuses_is_refused_by_all() -> None:
         (lambda d: next(solve_adaptive(Problem(), d, tolerance=None)), "tolerance is of the type"),
         (lambda d: next(adapt_to_run(3)), "run is of the type int: a function is needed"),
         (lambda d: next(adapt_to_run(lambda _: None)), "what run returns is of the type NoneType"),
+        (lambda d: next(adapt_to_run(lambda _: [], meshes=3)), "meshes is of the type int: a list"),
+        (
+            lambda d: next(adapt_to_run(lambda _: [solve(Problem(), d)])),
+            "a time and a solution",
+        ),
+        (lambda d: solve(Problem(), d).flux(["contact"]), "a part is of the type list: a name or"),
+        (lambda d: solve(Problem(), d).mean(["contact"]), "a part is of the type list: a name or"),
+        (lambda d: write_solution(solve(Problem(), d), None), "path is of the type NoneType: the"),
+        (
+            lambda d: solve(Problem(g=ufl.FacetArea(d.mesh)), d),
+            "it holds FacetArea, which can",
+        ),
         (lambda d: next(in_time(d, end="1")), "end is of the type str: a number is needed"),
         (lambda d: next(in_time(d, steps=10**400)), "steps would be too short for numbers to tell"),
         (lambda d: next(in_time(d, end=1e308)), "times that is too much for a number"),

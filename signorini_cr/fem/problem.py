@@ -27,7 +27,7 @@ from ufl.constantvalue import ComplexValue, IntValue
 from ufl.core.expr import Expr
 from ufl.corealg.traversal import unique_pre_traversal
 from ufl.domain import extract_unique_domain
-from ufl.geometry import GeometricFacetQuantity
+from ufl.geometry import GeometricFacetQuantity, GeometricQuantity
 from ufl.restriction import Restricted
 
 from ..arrays import FloatArray, Int32Array, summed
@@ -228,6 +228,8 @@ def _expression(data: Data, x: Expr, called: str, in_cells: bool = False) -> Exp
             for kind, words in _NO_DATA.items():
                 if isinstance(each, kind) and (in_cells or kind is not GeometricFacetQuantity):
                     raise ValueError(f"it holds {words}")
+            if isinstance(each, GeometricQuantity) and not isinstance(each, _KNOWN_OF_CELLS):
+                raise ValueError(f"it holds {type(each).__name__}, which can't be evaluated")
             if isinstance(each, IntValue):
                 float(each)  # which may be too large
         return found
@@ -245,6 +247,18 @@ _NO_DATA: dict[type, str] = {
     Restricted: "values of one side of a facet",
     GeometricFacetQuantity: "what facets have, as their normal",
 }
+
+_KNOWN_OF_CELLS = (
+    ufl.SpatialCoordinate,
+    ufl.FacetNormal,
+    ufl.CellVolume,
+    ufl.CellDiameter,
+    ufl.Circumradius,
+    ufl.MinCellEdgeLength,
+    ufl.MaxCellEdgeLength,
+    ufl.JacobianDeterminant,
+)
+"""Geometry that data may hold."""
 
 
 class Kernel:

@@ -103,6 +103,7 @@ class Parts(dict[str, int]):
 
 def named(parts: Mapping[str, int], key: str | int) -> str:
     """Return the name of the part that a name or a facet value stands for; "" for no such value."""
+    insist_on_kind("a part", key, (str, int, np.integer), "a name or a facet value")
     if not isinstance(key, int | np.integer):
         return key
     return parts.called.get(key, "") if isinstance(parts, Parts) else ""

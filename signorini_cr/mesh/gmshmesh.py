@@ -30,6 +30,7 @@ _MOST_GRADED = 3e4  # on edges beside short ones: gmsh takes a minute for so man
 _UNEVEN = 0.4  # by what factor facets that meet at a vertex may differ
 _LINE, _TRIANGLE = 1, 2  # gmsh's element types
 _FAR = 1e3  # in parts of the extent: a polygon that is moved to the origin for gmsh
+_USUAL = 1e-6, 1e6  # extents that gmsh is told as they are
 _GROWTH = 0.3  # of the size, per length, away from short facets
 _ROUNDING = 1e-14  # what distances to boxes may be too long by, in parts
 _OPTIONS = {
@@ -132,9 +133,9 @@ def triangulate(
     away = _away(loops[0])
     moved = [polygon - away for polygon in polygons.values()]
     loops, labels, inner = arranged([loop - away for loop in loops], labels, moved)
-    outline = _outline(loops, inner, size)
+    outline, unit = _outline(loops, inner, size), _unit(loops[0])
     with _session() as gmsh:
-        curves = _draw(gmsh, outline, [len(loop) for loop in loops], size)
+        curves = _draw(gmsh, outline.over(unit), [len(loop) for loop in loops], size / unit)
         try:
             gmsh.model.mesh.generate(2)
         except Exception as error:
@@ -143,7 +144,7 @@ def triangulate(
         tags, nodes, _ = gmsh.model.mesh.getNodes()
         raw = _compact(
             tags,
-            nodes,
+            unit * nodes,
             _elements(gmsh, 2, _TRIANGLE),
             np.concatenate(found),
             np.repeat(labels, [len(ends) for ends in found]),
@@ -183,6 +184,17 @@ def _away(outline: FloatArray) -> FloatArray:
     return np.where(np.abs(outline[0]) > _FAR * extent, outline[0], 0.0)
 
 
+def _unit(outline: FloatArray) -> float:
+    """Find the length that a polygon's are told to gmsh in parts of, a power of two.
+
+    gmsh takes a length for none below some number, and has another one for infinity: a polygon of
+    1e-12 across gets no point inside, whatever size is asked for.
+    """
+    extent = np.ptp(outline, axis=0).max()
+    low, high = _USUAL
+    return 1.0 if low <= extent <= high else float(2.0 ** np.floor(np.log2(extent)))
+
+
 class _Outline(NamedTuple):
     """The lines that a mesh follows, one loop after the other and then those inside.
 
@@ -199,6 +211,11 @@ class _Outline(NamedTuple):
     edges: IndexArray
     counts: FloatArray
     facets: FloatArray
+
+    def over(self, unit: float) -> _Outline:
+        """Divide all lengths by a unit."""
+        x, near, facets = (np.divide(each, unit) for each in (self.x, self.near, self.facets))
+        return self._replace(x=x, near=near, facets=facets)
 
 
 def _outline(loops: Sequence[FloatArray], inner: FloatArray, size: float) -> _Outline:

@@ -11,13 +11,12 @@ import io
 import textwrap
 from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..arrays import FloatArray
-from .files import Where, disk_errors
+from .files import Where, as_path, disk_errors
 from .units import PLAIN, Units, literal
 
 if TYPE_CHECKING:
@@ -352,5 +351,5 @@ def save(figure: Figure | SubFigure, path: Where | None) -> None:
         InputError: The system does not let us.
     """
     if path is not None:
-        with disk_errors(Path(path)):
-            Path(path).write_bytes(as_png(figure))
+        with disk_errors(file := as_path(path)):
+            file.write_bytes(as_png(figure))

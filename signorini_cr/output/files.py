@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from ..errors import InputError, on_root
+from ..errors import InputError, insist_on_kind, on_root
 
 Where = str | os.PathLike[str]
 """A path."""
@@ -22,6 +22,12 @@ Writer = Callable[[Path], object]
 
 STAGE = ".signorini-cr-"
 """Prefix of the names of hidden folders in which files are written at first."""
+
+
+def as_path(path: Where) -> Path:
+    """Take a path, or refuse what is none."""
+    insist_on_kind("path", path, (str, os.PathLike), "the path of a file")
+    return Path(path)
 
 
 @contextmanager

@@ -50,7 +50,7 @@ from .canvas import (
 )
 from .contactpage import contact_page
 from .files import Where
-from .raster import averaged, raster
+from .raster import averaged, plane, raster
 from .touching import contact_lines, in_words
 from .units import PLAIN, literal
 from .units import Units as Units
@@ -134,7 +134,7 @@ def plot_mesh(
     Raises:
         InputError: The domain is not plane, or the file can't be written.
     """
-    mesh = _plane(domain)
+    mesh = plane(domain)
     cells, edges = mesh.topology.index_map(2).size_global, _edges(mesh)
     parts = {part: _segments(domain, part) for part in domain.parts.values()}
     triangles = {name: _triangles(domain, name) for name in domain.materials.numbers}
@@ -180,7 +180,7 @@ def plot_solution(
         InputError: The domain is not plane, or the file can't be written.
     """
     domain, contact = solution.domain, solution.contact
-    mesh = _plane(domain)
+    mesh = plane(domain)
     image, box, limits = raster(solution.u)
     mean, of_parts = _smooth(solution, limits)
     smooth, words = raster(mean)[0], in_words(contact)
@@ -254,7 +254,7 @@ def plot_contact(
     Raises:
         InputError: The domain is not plane or has no Γ1, or the file can't be written.
     """
-    comm, contact = _plane(solution.domain).comm, solution.contact
+    comm, contact = plane(solution.domain).comm, solution.contact
     table = contact.table()
     if contact.number == 0:
         raise InputError("a picture of the contact needs a contact boundary")
@@ -388,12 +388,6 @@ def drawn(comm: MPI.Comm, draw: Callable[[], Figure | SubFigure]) -> Figure | Su
 
     on_root(comm, attempt)
     return figures[0] if figures else None
-
-
-def _plane(domain: Domain) -> Mesh:
-    if domain.mesh.geometry.dim != 2 or domain.mesh.topology.dim != 2:
-        raise InputError("pictures are of plane domains only; for others open solution.vtu")
-    return domain.mesh
 
 
 def _gather(comm: MPI.Comm, array: FloatArray) -> FloatArray:

@@ -6,11 +6,14 @@ import itertools
 
 import numpy as np
 from dolfinx import fem
+from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from ..arrays import FloatArray, Int64Array
 from ..compat import cell_nodes
+from ..errors import InputError
 from ..fem.space import function_space, vertex_values
+from ..mesh.domain import Domain
 from ..multigrid.parents import Layout
 
 AT_ONCE = 2**20
@@ -18,6 +21,13 @@ AT_ONCE = 2**20
 
 EDGE = 1e-9
 """Rounding in a barycentric coordinate."""
+
+
+def plane(domain: Domain) -> Mesh:
+    """Return the mesh of a plane domain, or refuse to draw another."""
+    if domain.mesh.geometry.dim != 2 or domain.mesh.topology.dim != 2:
+        raise InputError("pictures are of plane domains only; for others open solution.vtu")
+    return domain.mesh
 
 
 def raster(

@@ -26,7 +26,7 @@ from .canvas import (
     short_numbers,
 )
 from .files import Where
-from .raster import averaged, raster
+from .raster import averaged, plane, raster
 from .touching import contact_lines, in_words
 from .units import PLAIN, Units, literal
 
@@ -92,8 +92,13 @@ def chosen(steps: int) -> set[int]:
 
 
 def moment(time: float, solution: Solution) -> Moment:
-    """Keep what a strip shows of a step on a plane domain; collective."""
+    """Keep what a strip shows of a step on a plane domain; collective.
+
+    Raises:
+        InputError: The domain is not plane.
+    """
     domain, contact = solution.domain, solution.contact
+    plane(domain)
     ends = [facet_measures(domain.mesh, domain.facets(i))[0] for i in domain.parts.values()]
     pieces = domain.mesh.comm.gather(np.concatenate(ends)[..., :2], root=0)
     boundary = np.zeros((0, 2, 2)) if pieces is None else np.concatenate(pieces)

@@ -28,7 +28,7 @@ from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root, raise_together
 from ..fem.space import facet_corners, facet_entities, vertex_values
-from .files import Where, disk_errors
+from .files import Where, as_path, disk_errors
 
 if TYPE_CHECKING:
     from ..solution import Solution
@@ -62,7 +62,7 @@ def write_vtu(u: fem.Function, path: Where, name: str = "u") -> None:
     mesh = u.function_space.mesh
     owned = slice(mesh.topology.index_map(mesh.topology.dim).size_local)
     x = mesh.geometry.x[cell_nodes(mesh)[owned, : mesh.topology.dim + 1]]
-    _write(mesh.comm, Path(path), [x], {name: vertex_values(u, owned).ravel()}, {})
+    _write(mesh.comm, as_path(path), [x], {name: vertex_values(u, owned).ravel()}, {})
 
 
 def write_solution(solution: Solution, path: Where) -> None:
@@ -113,7 +113,7 @@ def write_solution(solution: Solution, path: Where) -> None:
         shares = np.sqrt(np.maximum(certificate.indicators, 0.0))
         on_cells["indicator"] = np.append(shares, on_facets)
     shapes = [mesh.geometry.x[nodes] for nodes in at_corners(cell_nodes(mesh)[:, :corners])]
-    _write(mesh.comm, Path(path), shapes, on_points, on_cells)
+    _write(mesh.comm, as_path(path), shapes, on_points, on_cells)
 
 
 def _write(

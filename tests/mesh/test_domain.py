@@ -426,6 +426,19 @@ def test_a_name_that_no_edge_has_is_refused():
     assert "roof" in around.mesh(0.5).parts
 
 
+@pytest.mark.parametrize("unit", [2.0**-40, 1e-12, 1e-13, 1e-25, 1e12, 1e22, 2.0**80, 1e25])
+def test_a_polygon_is_cut_as_finely_in_any_unit(unit):
+    """Powers of two give the same mesh to the digit; others round coordinates."""
+    corners = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])
+    labels = ["contact", "neumann", "dirichlet", "neumann"]
+    usual, scaled = (Polygon(u * corners, labels).mesh(0.1 * u) for u in (1.0, unit))
+    cells = [domain.mesh.topology.index_map(2).size_global for domain in (usual, scaled)]
+    assert cells[1] == pytest.approx(cells[0], rel=0.03)
+    if np.frexp(unit)[0] == 0.5:
+        assert np.array_equal(scaled.mesh.geometry.x, unit * usual.mesh.geometry.x)
+    assert area(scaled) == pytest.approx(2.0 * unit**2, rel=1e-12)
+
+
 @pytest.mark.parametrize("size", [0, -1, np.nan, np.inf, 1e-12, 1e-4])
 def test_bad_sizes(size: float):
     assert f"size is {size}" in fails_alike(Polygon(RECTANGLE, LABELS).mesh, size)
