@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
+from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array, found_in
 from ..errors import InputError, naming
 from ..hints import guess
 from ..rounding import counted
@@ -559,8 +559,8 @@ def _check_labels(
         return f"the facet {ends_in_words(raw.points[raw.facets[number]])}"
 
     own = _key(raw.facets, len(raw.points))
-    side = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
-    strange = np.flatnonzero(keys[side] != own)
+    side, is_side = found_in(keys, own)
+    strange = np.flatnonzero(~is_side)
     inside = np.flatnonzero(count[side] > 1)
     for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
         if len(bad):
