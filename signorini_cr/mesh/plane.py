@@ -1,4 +1,8 @@
-"""Points, vectors and segments of the plane: which way they turn, cross and lie, and in words."""
+"""Points, vectors and segments of the plane: which way they turn, cross and lie, and in words.
+
+Arrays of points and vectors have shape (…, 2), in any unit of length, and are broadcast; what is
+computed of each has shape (…).
+"""
 
 from __future__ import annotations
 
@@ -10,24 +14,14 @@ from ..arrays import BoolArray, FloatArray
 def cross(u: FloatArray, v: FloatArray) -> FloatArray:
     """Compute u₁v₂ − u₂v₁, the signed area that two vectors span: above 0 where v is to the left.
 
-    Args:
-        u: Shape (…, 2), or more components, which do not count; in any unit of length.
-        v: Likewise; the two are broadcast.
-
-    Returns:
-        Shape (…), in the unit's square.
+    More components than two do not count.
     """
     product: FloatArray = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     return product
 
 
 def angle(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Compute the angle from u to v, counterclockwise, in radians from −π to π, shape (…).
-
-    Args:
-        u: Vectors, shape (…, 2).
-        v: Likewise.
-    """
+    """Compute the angle from u to v, counterclockwise, in radians from −π to π."""
     return np.arctan2(cross(u, v), (u * v).sum(axis=-1))
 
 
@@ -35,13 +29,10 @@ def side(a: FloatArray, b: FloatArray, x: FloatArray, near: float = 0.0) -> Floa
     """Tell on which side of the line from a to b a point lies: 1 left, −1 right, 0 on it.
 
     Args:
-        a: Shape (…, 2).
-        b: Likewise.
-        x: Likewise; the three are broadcast.
+        a: Where the line begins.
+        b: Where it ends.
+        x: The point.
         near: Distance from the line, in parts of the lengths at hand, that counts as none.
-
-    Returns:
-        Shape (…).
     """
     u, v = b - a, x - a
     turn = cross(u, v)
@@ -55,42 +46,19 @@ def side(a: FloatArray, b: FloatArray, x: FloatArray, near: float = 0.0) -> Floa
 def crossing(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, near: float = 0.0
 ) -> BoolArray:
-    """Tell whether segments from a to b and from c to d have one point inside both in common.
-
-    Args:
-        a: Shape (…, 2); the four are broadcast.
-        b: Likewise.
-        c: Likewise.
-        d: Likewise.
-        near: As in `side`.
-
-    Returns:
-        Shape (…).
-    """
+    """Tell whether segments ab and cd have one point inside both in common; near as in `side`."""
     parted = side(a, b, c, near) * side(a, b, d, near) < 0
     return parted & (side(c, d, a, near) * side(c, d, b, near) < 0)
 
 
 def share(a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
-    """Compute how far along from a, 0, to b, 1, the feet of points on lines are, shape (…).
-
-    Args:
-        a: Shape (…, 2); the three are broadcast.
-        b: Likewise, nowhere the same as a.
-        x: Likewise.
-    """
+    """Compute how far along from a, 0, to b, 1, the feet of points on lines are; a is not b."""
     along = b - a
     return ((x - a) * along).sum(axis=-1) / (along**2).sum(axis=-1)
 
 
 def distance(x: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Compute how far points are from segments from a to b, shape (…).
-
-    Args:
-        x: Shape (…, 2); the three are broadcast.
-        a: Likewise.
-        b: Likewise, nowhere the same as a.
-    """
+    """Compute how far points are from segments from a to b, which is not a."""
     t = np.clip(share(a, b, x), 0, 1)[..., None]
     return np.linalg.norm(a + t * (b - a) - x, axis=-1)
 
