@@ -23,3 +23,22 @@ def summed(comm: MPI.Comm, values: npt.ArrayLike) -> FloatArray:
     found: FloatArray = np.asarray(values, dtype=np.float64)
     comm.Allreduce(MPI.IN_PLACE, found)
     return found
+
+
+def found_in(ordered: npt.NDArray, wanted: npt.NDArray) -> tuple[IndexArray, BoolArray]:
+    """Find values in an ascending list.
+
+    Args:
+        ordered: The list, shape (n,), perhaps (0,). If it is long, let the values have its type: it
+            is converted else.
+        wanted: The values, of any shape.
+
+    Returns:
+        The place of each in the list, another one (0 if the list is empty) where it isn't there,
+        and whether it is; both of the values' shape.
+    """
+    place = np.searchsorted(ordered, wanted)
+    if not len(ordered):
+        return place, np.zeros(place.shape, dtype=bool)
+    place = np.minimum(place, len(ordered) - 1)
+    return place, ordered[place] == wanted

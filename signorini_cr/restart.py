@@ -18,7 +18,7 @@ from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
 from . import compat
-from .arrays import BoolArray, FloatArray, Int32Array
+from .arrays import BoolArray, FloatArray, Int32Array, found_in
 from .errors import InputError
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain, exterior_facets
@@ -145,15 +145,15 @@ class Restart:
                 "nodes of P1 at the same place, as on the two faces of a slit, can't be told apart"
             )
         order, mine = np.argsort(at), _places(V)
-        index = order[np.minimum(np.searchsorted(at, mine, sorter=order), len(at) - 1)]
-        other = len(at) != V.dofmap.index_map.size_global or not np.array_equal(at[index], mine)
+        place, there = found_in(at[order], mine)
+        other = len(at) != V.dofmap.index_map.size_global or not there.all()
         if V.mesh.comm.allreduce(other, op=MPI.LOR):
             raise AnotherMesh(
                 "the mesh is not the one that the levels before were solved on: other versions of"
                 " gmsh and DOLFINx may make another one of the same polygon"
             )
         u = fem.Function(V)
-        u.x.array[:] = values[index].ravel()
+        u.x.array[:] = values[order[place]].ravel()
         return u
 
 

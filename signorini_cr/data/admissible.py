@@ -23,7 +23,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, Int64Array
+from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, Int64Array, found_in
 from ..compat import cell_nodes
 from ..errors import InputError, raise_together
 from ..fem.cells import BoundaryFacets, Cells, corner_points
@@ -564,8 +564,7 @@ def _crossing(
     mine = [array.ravel() for array in (fixed.nodes, sign * found[0], found[1])]
     node, value, slack = (np.concatenate(each) for each in zip(*comm.allgather(mine)))
     node, one = np.unique(node, return_index=True)
-    row = np.minimum(np.searchsorted(node, contact.nodes), max(len(node) - 1, 0))
-    meets = node[row] == contact.nodes if len(node) else np.zeros(row.shape, dtype=bool)
+    row, meets = found_in(node, contact.nodes)
     below, less = value[one][row[meets]], slack[one][row[meets]]
     top, more = (array[meets] for array in above)
     finite = np.abs(value[np.isfinite(value)]).max(initial=0.0)

@@ -23,6 +23,7 @@ from ..arrays import BoolArray, FloatArray, IndexArray
 from ..fem.cells import at_points
 from ..fem.pointwise import Unknown
 from ..fem.simplified import bits
+from ..mesh.plane import angle, cross
 from .jets import (
     SERIES,
     Boxes,
@@ -389,7 +390,7 @@ def _measures(corners: FloatArray) -> FloatArray:
     edges = corners[1:] - corners[:1]
     if len(corners) == 2:
         return np.asarray(np.linalg.norm(edges[0], axis=0))
-    return np.asarray(0.5 * np.abs(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]))
+    return np.asarray(0.5 * np.abs(cross(edges[0].T, edges[1].T)))
 
 
 def _barycentric(corners: FloatArray, point: FloatArray) -> FloatArray:
@@ -502,10 +503,10 @@ def _sectors(
     turn: FloatArray = np.zeros(len(tip))
     for i, j in ((1, 2), (0, 1), (0, 2)):  # the widest of the angles between two vertices
         one, other = ((tip + k) % 3 for k in (i, j))
-        a, b = unit[one, :, at].T, unit[other, :, at].T
-        between = np.arctan2(a[0] * b[1] - a[1] * b[0], (a * b).sum(axis=0))
+        a, b = unit[one, :, at], unit[other, :, at]
+        between = angle(a, b)
         wider = (np.abs(between) > np.abs(turn)) & ~(exact & (i == 0))
-        start = np.where(wider, np.arctan2(a[1], a[0]), start)
+        start = np.where(wider, np.arctan2(a[:, 1], a[:, 0]), start)
         turn = np.where(wider, between, turn)
     ends = start[:, None] + turn[:, None] * np.linspace(0.0, 1.0, SECTORS + 1)
     low = np.minimum(ends[:, :-1], ends[:, 1:])

@@ -18,6 +18,7 @@ from petsc4py import PETSc
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..compat import cell_nodes, facet_vertices
 from ..errors import InputError
+from ..mesh.domain import facet_entities
 from ..mesh.shared import ghosted
 
 ELEMENTS = {"CR": "CR", "P1": "Lagrange"}
@@ -37,27 +38,6 @@ def ufl_element(mesh: Mesh, element: str) -> Any:
 def function_space(mesh: Mesh, element: str = "CR") -> fem.FunctionSpace:
     """Make V_h on a mesh; boundary values are not built in."""
     return fem.functionspace(mesh, ufl_element(mesh, element))
-
-
-def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
-    """Find the cell and the local facet index of boundary facets.
-
-    Args:
-        mesh: The mesh.
-        facets: Local indices of exterior facets, shape (n,).
-
-    Returns:
-        Pairs (cell, facet's number in the cell), shape (n, 2).
-    """
-    tdim = mesh.topology.dim
-    mesh.topology.create_connectivity(tdim - 1, tdim)
-    mesh.topology.create_connectivity(tdim, tdim - 1)
-    f2c = mesh.topology.connectivity(tdim - 1, tdim)
-    c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
-    cells = f2c.array[f2c.offsets[facets]]
-    return np.column_stack([cells, np.argmax(c2f[cells] == facets[:, None], axis=1)]).astype(
-        np.int32
-    )
 
 
 def facet_corners(mesh: Mesh) -> IndexArray:

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
 from ..compat import cell_nodes, facet_nodes
+from ..mesh.plane import cross
 from .space import facet_entities
 
 
@@ -102,8 +103,7 @@ def _clockwise(mesh: Mesh, entities: Int32Array, vertices: FloatArray) -> npt.ND
     """Tell whether Ω lies to the right on the way from a facet's first vertex to its second."""
     cells, local = entities.T
     apex = mesh.geometry.x[cell_nodes(mesh)[cells, local]]
-    along, inward = vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]
-    return along[:, 0] * inward[:, 1] - along[:, 1] * inward[:, 0] < 0
+    return cross(vertices[:, 1] - vertices[:, 0], apex - vertices[:, 0]) < 0
 
 
 def _nodes(mesh: Mesh, entities: Int32Array) -> Int64Array:

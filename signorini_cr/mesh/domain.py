@@ -449,6 +449,27 @@ def exterior_facets(mesh: Mesh) -> Int32Array:
     return exterior_facet_indices(mesh.topology)
 
 
+def facet_entities(mesh: Mesh, facets: Int32Array) -> Int32Array:
+    """Find the cell and the local facet index of facets; of those inside the first of their cells.
+
+    Args:
+        mesh: The mesh.
+        facets: Local indices, shape (n,).
+
+    Returns:
+        Pairs (cell, facet's number in the cell), shape (n, 2).
+    """
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    mesh.topology.create_connectivity(tdim, tdim - 1)
+    f2c = mesh.topology.connectivity(tdim - 1, tdim)
+    c2f = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
+    cells = f2c.array[f2c.offsets[facets]]
+    return np.column_stack([cells, np.argmax(c2f[cells] == facets[:, None], axis=1)]).astype(
+        np.int32
+    )
+
+
 def _unfit(mesh: Mesh, facet_tags: MeshTags) -> str | None:
     """Say what keeps a user's mesh and tags from being used, if anything."""
     tdim = mesh.topology.dim

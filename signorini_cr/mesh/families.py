@@ -13,6 +13,7 @@ from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError, insist_on_kind, to_float
 from .domain import Domain, Polygon, _distribute
 from .gmshmesh import Triangulation
+from .plane import distance
 from .polygon import inside
 
 
@@ -82,7 +83,8 @@ def _squares(polygon: Polygon, n: float, shift: float, jitter: float, seed: int)
     used, triangles = np.unique(triangles[within], return_inverse=True)
     points, triangles = points[used], triangles.reshape(-1, 3)
     facets = _boundary(triangles)
-    edge = _edge_of(starts, ends, points[facets].mean(axis=1))
+    # that each lies on, or is nearest to
+    edge = distance(points[facets].mean(axis=1)[:, None], starts, ends).argmin(axis=1)
     if jitter:
         points = points + _moves(
             points, facets, ends[edge] - starts[edge], polygon, n, jitter, seed
@@ -126,17 +128,6 @@ def _boundary(triangles: Int64Array) -> Int64Array:
     unique, count = np.unique(facets, axis=0, return_counts=True)
     single: Int64Array = unique[count == 1]
     return single
-
-
-def _edge_of(starts: FloatArray, ends: FloatArray, points: FloatArray) -> Int64Array:
-    """Find the edge that each point lies on, or is nearest to."""
-    along = ends - starts
-    offset = points[:, None] - starts
-    share = np.clip((offset * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
-    nearest: Int64Array = np.argmin(
-        np.linalg.norm(offset - share[..., None] * along, axis=2), axis=1
-    )
-    return nearest
 
 
 def _moves(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array
+from ..arrays import FloatArray, IndexArray, Int32Array, Int64Array, found_in
 from ..errors import InputError, naming
 from ..hints import guess
 from ..rounding import counted
@@ -22,6 +22,7 @@ from . import mshfile
 from .lines import arranged, sorted_out
 from .mshfile import ELEMENTS, MshFile
 from .planar import overlap, pieces
+from .plane import ends_in_words, in_words
 from .polygon import MOST_EDGES
 from .valid import too_thin
 
@@ -524,9 +525,9 @@ def _check_twins(raw: Triangulation) -> None:
     """Insist on triangles that are there once."""
     order, counts = np.unique(np.sort(raw.triangles), axis=0, return_counts=True)
     if counts.max() > 1:
-        x, y = raw.points[order[counts.argmax(), 0]]
+        place = in_words(raw.points[order[counts.argmax(), 0]])
         raise InputError(
-            f"triangles are there twice, as the one at ({x:g}, {y:g}): so gmsh's format 2 has"
+            f"triangles are there twice, as the one at {place}: so gmsh's format 2 has"
             " those of two physical surfaces, where format 4 has them once"
         )
 
@@ -572,12 +573,11 @@ def _check_labels(
     """
 
     def facet(number: int) -> str:
-        a, b = raw.points[raw.facets[number]]
-        return f"the facet from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g})"
+        return f"the facet {ends_in_words(raw.points[raw.facets[number]])}"
 
     own = _key(raw.facets, len(raw.points))
-    side = np.minimum(np.searchsorted(keys, own), len(keys) - 1)
-    strange = np.flatnonzero(keys[side] != own)
+    side, is_side = found_in(keys, own)
+    strange = np.flatnonzero(~is_side)
     inside = np.flatnonzero(count[side] > 1)
     for bad, fault in ((strange, "is no side of a triangle"), (inside, "lies inside the domain")):
         if len(bad):

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import InputError
+from .plane import cross, share
 from .polygon import MOST_EDGES, inside
 
 NEAR = 1e-12
@@ -126,9 +127,8 @@ def _crossings(a: FloatArray, b: FloatArray, of_outline: int, near: float) -> Fl
         at = np.flatnonzero((low[:i] <= high[i]).all(axis=1) & (high[:i] >= low[i]).all(axis=1))
         u, v, w = b[i] - a[i], b[at] - a[at], a[at] - a[i]
         with np.errstate(all="ignore"):  # parallel ones have none
-            det = u[0] * v[:, 1] - u[1] * v[:, 0]
-            t = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / det
-            s = (w[:, 0] * u[1] - w[:, 1] * u[0]) / det
+            det = cross(u, v)
+            t, s = cross(w, v) / det, cross(w, u) / det
             meet = (t > 0) & (t < 1) & (s > 0) & (s < 1)
         found.append(a[i] + t[meet, None] * u)
         total += len(found[-1])
@@ -162,7 +162,7 @@ def _pieces(edges: IndexArray, x: FloatArray, near: float) -> list[IndexArray]:
         low, high = np.minimum(start, x[last]) - near, np.maximum(start, x[last]) + near
         at = np.flatnonzero((x >= low).all(axis=1) & (x <= high).all(axis=1))
         at = at[(at != first) & (at != last)]
-        t = (x[at] - start) @ u / (u @ u)
+        t = share(start, x[last], x[at])
         on = np.linalg.norm(x[at] - start - t[:, None] * u, axis=1) <= near
         on &= (t > 0) & (t < 1)
         found.append(np.array([first, *at[on][np.argsort(t[on])], last]))

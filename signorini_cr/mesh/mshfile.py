@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, NoReturn, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, Int64Array
+from ..arrays import FloatArray, Int64Array, found_in
 from ..errors import InputError
 from ..reading import read_regular
 from ..rounding import counted
@@ -311,8 +311,7 @@ class _Reader:
         if len(twice):
             raise _Damaged(f"damaged gmsh file: two nodes have the number {tags[twice[0]]}")
         for block in self.blocks:
-            place = np.minimum(np.searchsorted(tags, block.nodes), max(len(tags) - 1, 0))
-            absent = block.nodes[tags[place] != block.nodes] if len(tags) else block.nodes.ravel()
+            absent = block.nodes[~found_in(tags, block.nodes)[1]]
             if len(absent):
                 raise _Damaged(f"damaged gmsh file: an element has node {absent[0]}, which is none")
         return MshFile(tags, points, self.blocks, self.names)

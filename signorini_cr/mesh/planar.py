@@ -18,6 +18,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ..arrays import BoolArray, FloatArray, Int64Array
+from .plane import angle, cross, crossing, ends_in_words, in_words, side
 
 _NEAR = 1e-12
 """Distance from a line, in parts of the lengths at hand, that counts as none."""
@@ -47,45 +48,41 @@ def overlap(
             (triangles,).
     """
     u, v = np.diff(points[triangles], axis=1).swapaxes(0, 1)
-    turned = u[:, 0] * v[:, 1] < u[:, 1] * v[:, 0]
+    turned = cross(u, v) < 0
     ends = triangles[:, [[1, 2], [2, 0], [0, 1]]]
     up = (ends[:, :, 0] < ends[:, :, 1]) != turned[:, None]
     ups = np.bincount(sides.ravel(), up.ravel(), len(count))
     alike = ((count == 2) & (ups != 1))[sides]
     if alike.any():
-        a, b = points[ends[alike][0]]
-        return f"triangles overlap at the facet from {_point(a)} to {_point(b)}"
+        return f"triangles overlap at the facet {ends_in_words(points[ends[alike][0]])}"
     angles = np.bincount(triangles.ravel(), _angles(points[triangles]).ravel(), len(points))
     if len(bad := np.flatnonzero(angles > 2 * np.pi + 1e-6)):
-        return f"triangles overlap around {_point(points[bad[0]])}"
+        return f"triangles overlap around {in_words(points[bad[0]])}"
     outer = count[sides] == 1
     rim = np.where(turned[:, None, None], ends[:, :, ::-1], ends)[outer]
     owner = np.broadcast_to(piece[:, None], sides.shape)[outer]
     ccw = np.where(turned[:, None], triangles[:, ::-1], triangles)
     for vertex in np.flatnonzero(np.bincount(rim[:, 0], minlength=len(points)) > 1):
         if _crowded(points, ccw, vertex):
-            return f"triangles overlap around {_point(points[vertex])}"
+            return f"triangles overlap around {in_words(points[vertex])}"
     return _crossing(points, rim) or _nested(points, triangles, piece, rim, owner)
 
 
 def _angles(corners: FloatArray) -> FloatArray:
     """Compute the angle at each corner of triangles, shape (triangles, 3)."""
     u, v = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    cross = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-    return np.arctan2(np.abs(cross), (u * v).sum(axis=-1))
+    return np.abs(angle(u, v))
 
 
 def _crowded(points: FloatArray, ccw: Int64Array, vertex: int) -> bool:
     """Tell whether two triangles that have a vertex in common overlap around it."""
     cell, corner = np.nonzero(ccw == vertex)
     first, last = points[ccw[cell, (corner + 1) % 3]], points[ccw[cell, (corner + 2) % 3]]
-    apex = np.broadcast_to(points[vertex], first.shape)
-    begin = np.stack([apex, first], axis=1)
+    apex = points[vertex]
     for i in range(len(cell) - 1):
-        later = slice(i + 1, None)
-        one = np.broadcast_to(begin[i], begin[later].shape)
-        inside = (_turn(one, first[later]) >= 0) & (_turn(begin[later], last[i]) > 0)
-        around = (_turn(begin[later], first[i]) >= 0) & (_turn(one, last[later]) > 0)
+        a, b, c, d = first[i], last[i], first[i + 1 :], last[i + 1 :]
+        inside = (side(apex, a, c, _NEAR) >= 0) & (side(apex, c, b, _NEAR) > 0)
+        around = (side(apex, c, a, _NEAR) >= 0) & (side(apex, a, d, _NEAR) > 0)
         if np.any(inside | around):
             return True
     return False
@@ -95,8 +92,9 @@ def _crossing(points: FloatArray, sides: Int64Array) -> str | None:
     """Say which two sides of the boundary cross, touch or run along each other, if any do."""
     for i, j in _close(points[sides] @ _DIRECTION):
         one, two = points[sides[i]], points[sides[j]]  # shape (pairs, 2 ends, 2)
+        ends = one[:, 0], one[:, 1], two[:, 0], two[:, 1]
         faults = [
-            (_cross(one, two), "crosses", one, two),
+            (crossing(*ends, _NEAR), "crosses", one, two),
             (_run_along(one, two), "overlaps", one, two),
             (_touched(one, two), "ends in", two, one),
             (_touched(two, one), "ends in", one, two),
@@ -104,8 +102,8 @@ def _crossing(points: FloatArray, sides: Int64Array) -> str | None:
         for found, word, first, second in faults:
             if len(k := np.flatnonzero(found)):
                 return (
-                    f"the facet {_side(first[k[0]])} {word} that {_side(second[k[0]])}: facets may"
-                    " meet at their ends only"
+                    f"the facet {ends_in_words(first[k[0]])} {word} that"
+                    f" {ends_in_words(second[k[0]])}: facets may meet at their ends only"
                 )
     return None
 
@@ -132,29 +130,14 @@ def _close(along: FloatArray) -> Iterator[tuple[Int64Array, Int64Array]]:
         begin = end
 
 
-def _turn(side: FloatArray, x: FloatArray) -> FloatArray:
-    """Tell on which side of a line a point lies: 1 left, -1 right, 0 on it; shape (pairs,)."""
-    u, v = side[:, 1] - side[:, 0], x - side[:, 0]
-    left, right = u[:, 0] * v[:, 1], u[:, 1] * v[:, 0]
-    scale = np.abs(left) + np.abs(right) + np.hypot(*u.T) * np.hypot(*v.T)
-    return np.where(np.abs(left - right) > _NEAR * scale, np.sign(left - right), 0.0)
-
-
-def _cross(one: FloatArray, two: FloatArray) -> BoolArray:
-    """Tell whether two sides have a point inside both in common, and no more."""
-    return (_turn(one, two[:, 0]) * _turn(one, two[:, 1]) < 0) & (
-        _turn(two, one[:, 0]) * _turn(two, one[:, 1]) < 0
-    )
-
-
-def _touched(side: FloatArray, other: FloatArray) -> BoolArray:
-    """Tell whether an end of the other lies inside the side."""
-    u = side[:, 1] - side[:, 0]
+def _touched(one: FloatArray, other: FloatArray) -> BoolArray:
+    """Tell whether an end of the other lies inside the one."""
+    u = one[:, 1] - one[:, 0]
     length = np.hypot(*u.T)
-    found = np.zeros(len(side), dtype=bool)
+    found = np.zeros(len(one), dtype=bool)
     for end in (0, 1):
-        t = ((other[:, end] - side[:, 0]) * u).sum(axis=1) / length**2
-        x = side[:, 0] + t[:, None] * u
+        t = ((other[:, end] - one[:, 0]) * u).sum(axis=1) / length**2
+        x = one[:, 0] + t[:, None] * u
         on = np.hypot(*(x - other[:, end]).T) <= _NEAR * length
         found |= on & (t > 1e-6) & (t < 1 - 1e-6)
     return found
@@ -183,16 +166,8 @@ def _nested(
         hit = p[:, 0] + (x[1] - p[:, 1]) / (q[:, 1] - p[:, 1]) * (q[:, 0] - p[:, 0])
         right = owner[spans][hit > x[0]]
         if np.any(np.bincount(right) % 2):
-            return f"a piece of the mesh lies on another one at {_point(x)}"
+            return f"a piece of the mesh lies on another one at {in_words(x)}"
     return None
-
-
-def _point(x: FloatArray) -> str:
-    return f"({x[0]:g}, {x[1]:g})"
-
-
-def _side(ends: FloatArray) -> str:
-    return f"from {_point(ends[0])} to {_point(ends[1])}"
 
 
 def pieces(sides: npt.NDArray[np.integer], edges: int) -> Int64Array:

@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ..arrays import BoolArray, FloatArray, IndexArray
 from ..errors import InputError, naming, to_float
+from .plane import cross, crossing, distance, in_words
 
 FARTHEST = 1e100
 """Largest coordinate: areas, and products of them, stay finite."""
@@ -39,19 +40,15 @@ def coordinates(vertices: npt.ArrayLike, least: int = 3) -> FloatArray:
         raise InputError(f"{len(points)} vertices: a polygon has at least {least}")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
-        raise InputError(f"vertex {bad[0]} is {_point(points[bad[0]])}: not a finite point")
+        raise InputError(f"vertex {bad[0]} is {in_words(points[bad[0]])}: not a finite point")
     far = np.flatnonzero(np.abs(points).max(axis=1) > FARTHEST)
     if len(far):
         raise InputError(
-            f"vertex {far[0]} is {_point(points[far[0]])}: "
+            f"vertex {far[0]} is {in_words(points[far[0]])}: "
             f"coordinates up to {FARTHEST:g} are allowed"
         )
     points.flags.writeable = False
     return points
-
-
-def _point(x: FloatArray) -> str:
-    return f"({x[0]:g}, {x[1]:g})"
 
 
 def cut(
@@ -114,11 +111,11 @@ def _one(point: Sequence[float]) -> FloatArray:
 def _arc(start: FloatArray, through: FloatArray, end: FloatArray, size: float) -> FloatArray:
     """Compute the ends of an arc's facets, its own end left out."""
     d, e = through - start, end - start
-    d2, e2, area = d @ d, e @ e, d[0] * e[1] - d[1] * e[0]
+    d2, e2, area = d @ d, e @ e, cross(d, e)
     if abs(area) <= 1e-9 * max(d2, e2):
         raise InputError(
-            f"no circle passes through {_point(start)}, {_point(through)} and {_point(end)}; a"
-            " point between its ends and beside the straight line is needed"
+            f"no circle passes through {in_words(start)}, {in_words(through)} and"
+            f" {in_words(end)}; a point between its ends and beside the straight line is needed"
         )
     offset = np.array([e[1] * d2 - d[1] * e2, d[0] * e2 - e[0] * d2]) / (2 * area)
     first, last = (math.atan2(x[1], x[0]) for x in (-offset, e - offset))
@@ -238,7 +235,7 @@ class _Edges:
         (before,) = np.flatnonzero(self.after == i)
         on_arc = self.called[before] == self.called[i]
         kind = "the point of edge" if on_arc else "vertex"
-        return f"{kind} {self.called[i]}{self._where(i)} at {_point(self.start[i])}"
+        return f"{kind} {self.called[i]}{self._where(i)} at {in_words(self.start[i])}"
 
     def edge(self, i: int) -> str:
         """Name an edge."""
@@ -268,13 +265,13 @@ def _check_meetings(edges: _Edges, near: float) -> None:
         at = np.flatnonzero((left <= right[i]) & (right >= left[i]))
         at = at[(bottom[at] <= top[i]) & (top[at] >= bottom[i])]
         c, d = start[at], end[at]
-        distance = _distance(a, c, d)
-        distance[(at == i) | (edges.after[at] == i)] = np.inf
-        if distance.min() <= near:
-            raise InputError(f"{edges.vertex(i)} lies on {edges.edge(at[distance.argmin()])}")
-        crossing = _parts(a, b, c, d) & _parts(c, d, a, b)
-        if crossing.any():
-            raise InputError(f"{edges.edge(i)} crosses {edges.edge(at[crossing.argmax()])}")
+        away = distance(a, c, d)
+        away[(at == i) | (edges.after[at] == i)] = np.inf
+        if away.min() <= near:
+            raise InputError(f"{edges.vertex(i)} lies on {edges.edge(at[away.argmin()])}")
+        crossed = crossing(a, b, c, d)
+        if crossed.any():
+            raise InputError(f"{edges.edge(i)} crosses {edges.edge(at[crossed.argmax()])}")
 
 
 def _check_holes(loops: Sequence[FloatArray]) -> None:
@@ -289,25 +286,6 @@ def _check_holes(loops: Sequence[FloatArray]) -> None:
         within = at[inside(first[at], loop)]
         if len(within):
             raise InputError(f"hole {within[0] - 1} lies inside hole {j - 1}")
-
-
-def _distance(x: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Compute how far a point is from segments from a to b, shape (n,)."""
-    along = b - a
-    t = np.clip(((x - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
-    distance: FloatArray = np.linalg.norm(a + t[:, None] * along - x, axis=1)
-    return distance
-
-
-def _parts(a: FloatArray, b: FloatArray, x: FloatArray, y: FloatArray) -> BoolArray:
-    """Tell whether the line through a and b runs between x and y."""
-    return np.asarray(_side(a, b, x) * _side(a, b, y) < 0)
-
-
-def _side(a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
-    """Compute the sign of the area of the triangles a, b, x."""
-    u, v = b - a, x - a
-    return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
 
 def inside(points: FloatArray, loop: FloatArray) -> BoolArray:

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from .. import compat
 from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError, together
-from .domain import Domain, Refinement
+from .domain import Domain, Refinement, facet_entities
 from .shared import shared_sum
 
 SIMILAR: FloatArray = np.array(
@@ -86,7 +86,7 @@ def refine(domain: Domain) -> tuple[Domain, Int32Array]:
         topology.create_connectivity(1, 2)
     fine = _wrap(coarse, topology, vertices, children)
     parent = np.repeat(np.arange(cells, dtype=np.int32), 4)
-    tags = _child_tags(domain, fine, facets)
+    tags = _child_tags(domain, fine)
     return _child(domain, fine, tags, parent, SIMILAR), parent
 
 
@@ -368,12 +368,11 @@ def _between_ranks(
         The topology, and new numbers of this rank's fine facets, in the order of `_give_facets`; or
         nothing where a rank has too few cells.
     """
-    facet_map, around = coarse.topology.index_map(1), coarse.topology.connectivity(1, 2)
+    facet_map = coarse.topology.index_map(1)
     owned, inner = facet_map.size_local, 3 * len(facets)
     shared = _shared(coarse)
     border = np.concatenate([shared, np.arange(owned, _count(facet_map), dtype=np.int32)])
-    cell = around.array[around.offsets[border]]
-    j = np.argmax(facets[cell] == border[:, None], axis=1)
+    cell, j = facet_entities(coarse, border).T
     beside = np.unique(np.concatenate([4 * cell + (j + 1) % 3, 4 * cell + (j + 2) % 3]))
     cell_map = cpp.common.IndexMap(coarse.comm, len(beside))
     topology = compat.create_topology(
@@ -572,20 +571,12 @@ def _wrap(coarse: Mesh, topology: Any, vertices: _Vertices, children: Int32Array
     return Mesh(mesh, ufl.Mesh(coarse.ufl_domain().ufl_coordinate_element()))
 
 
-def _child_tags(domain: Domain, fine: Mesh, facets: Int32Array) -> Any:
-    """Tag the parts of the fine boundary: facet j of a cell goes to two of its children.
-
-    Args:
-        domain: The coarse domain.
-        fine: The fine mesh.
-        facets: Coarse facets of the coarse cells, shape (cells, 3).
-    """
+def _child_tags(domain: Domain, fine: Mesh) -> Any:
+    """Tag the parts of the fine boundary: facet j of a cell goes to two of its children."""
     topology, tags = domain.mesh.topology, domain.tags
     owned = tags.indices < topology.index_map(1).size_local
     tagged, values = tags.indices[owned], tags.values[owned]
-    around = topology.connectivity(1, 2)
-    cell = around.array[around.offsets[tagged]]
-    j = np.argmax(facets[cell] == tagged[:, None], axis=1)
+    cell, j = facet_entities(domain.mesh, tagged).T
     of_cells = _table(fine.topology.connectivity(2, 1))
     found = np.concatenate([of_cells[4 * cell + (j + i) % 3, j] for i in (1, 2)])
     order = np.argsort(found)

@@ -7,6 +7,7 @@ from dolfinx.mesh import Mesh, compute_midpoints
 
 from ..arrays import FloatArray
 from ..compat import cell_nodes
+from .plane import cross, in_words
 from .shared import shared_sum
 
 THINNEST = 1e6
@@ -53,7 +54,7 @@ def too_thin(corners: FloatArray, origin: FloatArray | None = None) -> str | Non
     found = thinness(corners)
     length = np.abs(corners[:, 1:] - corners[:, :1]).max(axis=(1, 2))
     if len(small := np.flatnonzero(length < SMALLEST)) and length[small[0]] > 0.0:
-        place = _place(origin + corners[small[0], 0])
+        place = in_words(origin + corners[small[0], 0])
         return (
             f"the cell at {place} is {length[small[0]]:.2g} long: lengths"
             f" from {SMALLEST:g} on are possible, in other units perhaps"
@@ -61,7 +62,7 @@ def too_thin(corners: FloatArray, origin: FloatArray | None = None) -> str | Non
     bad = np.flatnonzero(~(found <= THINNEST))
     if not len(bad):
         return None
-    ratio, place = found[bad[0]], _place(origin + corners[bad[0], 0])
+    ratio, place = found[bad[0]], in_words(origin + corners[bad[0], 0])
     kind = "triangle" if corners.shape[2] == 2 else "tetrahedron"
     # rounding may leave a little where there is nothing
     if ratio > 1e13:
@@ -101,17 +102,13 @@ def folded(mesh: Mesh) -> str | None:
     bad = np.flatnonzero(np.abs(sides[: of_facets.size_local]) > 1.5).astype(np.int32)
     if not len(bad):
         return None
-    place = _place(compute_midpoints(mesh, d - 1, bad[:1])[0, :d])
+    place = in_words(compute_midpoints(mesh, d - 1, bad[:1])[0, :d])
     return f"cells overlap at the facet around {place}: both lie on the same side of it"
-
-
-def _place(x: FloatArray) -> str:
-    return "(" + ", ".join(f"{value:g}" for value in x) + ")"
 
 
 def _determinants(spans: FloatArray) -> FloatArray:
     """Compute determinants of small matrices, shape (n,), much faster than LAPACK does."""
     if spans.shape[1] == 2:
-        return spans[:, 0, 0] * spans[:, 1, 1] - spans[:, 0, 1] * spans[:, 1, 0]
+        return cross(spans[:, 0], spans[:, 1])
     volume: FloatArray = (spans[:, 0] * np.cross(spans[:, 1], spans[:, 2])).sum(axis=1)
     return volume

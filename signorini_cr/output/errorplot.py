@@ -7,6 +7,7 @@ import numpy as np
 from .. import compat
 from ..errors import InputError, on_root
 from ..fem.space import facet_measures
+from ..mesh.plane import cross
 from ..rounding import at_most
 from ..solution import Solution
 from .canvas import RED, chains, draw_lines, headline, legend, log_ticks, plane_axes, save
@@ -36,8 +37,7 @@ def plot_error(solution: Solution, path: Where, title: str = "") -> None:
     bound = at_most(certificate.bound_h1)
     number = len(certificate.indicators)
     corners = mesh.geometry.x[compat.cell_nodes(mesh)[:number, :3], :2]
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    area = 0.5 * np.abs(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     density = np.sqrt(np.maximum(certificate.indicators, 0.0) / area)
     ends = [
         facet_measures(mesh, solution.domain.facets(part))[0][..., :2]

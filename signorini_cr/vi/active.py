@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import BoolArray, FloatArray, Int32Array
+from ..arrays import BoolArray, FloatArray, Int32Array, found_in
 
 
 def touching(gap: FloatArray, force: FloatArray, diagonal: FloatArray | float) -> BoolArray:
@@ -96,11 +96,8 @@ class ActiveSet:
             first: Global number of the first owned dof.
         """
         # bounded dofs are few, and all others many
-        if not len(inactive):
-            return cls(bounded, np.ones(len(bounded), dtype=bool))
         numbers = bounded.astype(inactive.dtype) + inactive.dtype.type(first)
-        place = np.searchsorted(inactive, numbers)
-        return cls(bounded, inactive.take(place, mode="clip") != numbers)
+        return cls(bounded, ~found_in(inactive, numbers)[1])
 
     @property
     def dofs(self) -> Int32Array:
