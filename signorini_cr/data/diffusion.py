@@ -236,7 +236,10 @@ class DiffusionOnMesh:
         return c, c
 
     def reacting(self, w: FloatArray) -> tuple[Volume, Volume]:
-        """Return f − c u_h and c u_h², from u_h at the cells' vertices, shape (d + 1, cells)."""
+        """Return f − c u_h and c u_h², from u_h at the cells' vertices, shape (d + 1, cells).
+
+        They hold until the next call: both are formulas in a function that then becomes another.
+        """
         self._put(w)
         return self.compiled.with_reaction
 

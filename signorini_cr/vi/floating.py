@@ -206,10 +206,10 @@ def _labels(V: fem.FunctionSpace) -> FloatArray:
     dofs, layout = _cell_dofs(V), Layout.of_space(V)
     piece = pieces(dofs, layout.local)
     labels = layout.numbers(np.arange(layout.local, dtype=np.int32)).astype(np.float64)
-    total = -1.0
-    while total != (total := V.mesh.comm.allreduce(float(labels.sum()))):
-        largest = np.full(len(dofs), -1.0)
+    while True:  # from rank to rank, along a piece
+        before, largest = labels.copy(), np.full(len(dofs), -1.0)
         np.maximum.at(largest, piece, labels[dofs].max(axis=1, initial=-1.0))
         labels[dofs] = largest[piece][:, None]
         layout.shared_maximum(labels)
-    return labels
+        if not V.mesh.comm.allreduce(not np.array_equal(labels, before), op=MPI.LOR):
+            return labels
