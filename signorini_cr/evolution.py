@@ -352,7 +352,7 @@ def solve_in_time(
         max_time: No step is begun that would end later than so many seconds from now.
         restart: Where to go on, from `Restart.of_steps`: the first solution is the one it was taken
             from, once more.
-        done: The number of that step.
+        done: The number of that step; 0 without a restart.
 
     Yields:
         The time, and u_h then. The solution of a step stays as it is.
@@ -363,6 +363,10 @@ def solve_in_time(
             not fit into the memory there is.
     """
     end, steps, done = _checked_steps(end, steps, done, scheme, time)
+    if (restart is None) != (done == 0):
+        raise InputError(
+            "restart: what to go on from and done, the number of that step, are both needed"
+        )
     check_arguments(problem, domain)
     problem = problem.called_once()  # though a scheme may take a second solver
     capacity, own = _capacities(problem, capacity)
@@ -385,6 +389,11 @@ def solve_in_time(
             solver = stepper.prepare(method.factor * steps / end)
             if not past and restart is not None:
                 start, past = _gone_on(solver, restart, initial, step, time)
+                if len(past) < len(method.weights):
+                    raise InputError(
+                        f"restart: {scheme} goes on from {1 + len(method.weights)} steps, the last"
+                        f" one included, and there are {len(restart.u)}"
+                    )
             elif not past:
                 past = [_at_first(solver, initial, time)]
             source = fem.Function(solver.V)

@@ -28,6 +28,7 @@ from signorini_cr import (
 from signorini_cr.errors import InputError, on_root
 from signorini_cr.memory import ran_out_of_memory
 from signorini_cr.output.vtu import write_solution
+from signorini_cr.restart import Restart
 
 WORLD = MPI.COMM_WORLD
 SIDES = HELD_ABOVE.boundary
@@ -70,6 +71,11 @@ def one(x: Any) -> float:
 
 def in_time(domain: Domain, **arguments: Any) -> Iterator[Any]:
     return solve_in_time(Problem(f=-1.0), domain, **{"end": 1.0, "steps": 2, **arguments})
+
+
+def going_on(domain: Domain, **arguments: Any) -> None:
+    _, solution = next(in_time(domain, steps=4))
+    next(in_time(domain, steps=4, restart=Restart.of_steps([solution]), **arguments))
 
 
 def laplace(u: Any, v: Any, dx: Any, ds: Any) -> ufl.Form:
@@ -171,6 +177,9 @@ def test_a_size_that_one_rank_alone_refuses_is_refused_by_all() -> None:
         (lambda d: next(in_time(d, end=10**400)), "end is larger than 1.8e"),
         (lambda d: next(in_time(d, scheme=["euler"])), r"scheme is \['euler'\]; it must be one of"),
         (lambda d: next(in_time(d, done=5)), "done is 5; it must be the number of a step"),
+        (lambda d: next(in_time(d, done=1)), "restart: what to go on from and done, the number"),
+        (lambda d: going_on(d), "restart: what to go on from and done, the number"),
+        (lambda d: going_on(d, done=3), "euler goes on from 2 steps, the last one included, and t"),
         (lambda d: next(in_time(d, time=Constant(d.mesh, (1.0, 2.0)))), "it must be a dolfinx Con"),
         (
             lambda d: next(in_time(d, initial=lambda x: x)),

@@ -200,7 +200,7 @@ class Steps:
             monitor=monitor if run.screen.verbose else None,
             max_time=run.time_left,
             restart=self._restart if done else None,
-            done=max(done, 1),
+            done=done,
         )
         for moment, solution in steps:
             self._last = [solution, *self._last[: self._back]]
