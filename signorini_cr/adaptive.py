@@ -107,7 +107,7 @@ class Shares(NamedTuple):
     """Bound of the error, and the cells' shares of it.
 
     Attributes:
-        bound: Of the broken error (1.6).
+        bound: Of the broken error (1.6); infinite where a physics knows none, and only marks.
         indicators: What this rank's cells hold of its square, shape (cells,).
         of_energy: The same bound in the norm of the energy.
         rounding: What this one has for rounding in the certificate's own sums, which grows with the
@@ -126,17 +126,17 @@ class Shares(NamedTuple):
         """Take the shares from what the certificate says; collective.
 
         Raises:
-            InputError: There is no bound; the message says why.
+            InputError: There are no shares; the message says why.
         """
         certificate = solution.certificate
-        if certificate.bound_h1 is None or certificate.indicators is None:
+        if certificate.indicators is None:
             raise InputError(
                 f"adaptive refinement goes by the certified bound, and there is none: "
                 f"{certificate.reason}"
             )
         energy = max(map(abs, certificate.energy or (0.0,)))
         return cls(
-            certificate.bound_h1,
+            np.inf if certificate.bound_h1 is None else certificate.bound_h1,
             certificate.indicators,
             np.inf if certificate.bound_energy_norm is None else certificate.bound_energy_norm,
             certificate.rounding,
@@ -271,6 +271,8 @@ def _by_shares(
     most = insist_on_number("max_dofs", max_dofs, 1.0)
 
     def step(solution: Solution, shares: Shares) -> Refined | None:
+        if tolerance > 0.0 and shares.bound == np.inf:
+            raise InputError("tolerance: there is no bound that could be below it")
         last = levels is not None and solution.level.number + 1 >= levels
         if last or shares.bound <= tolerance or solution.dofs >= most:
             return None

@@ -86,9 +86,11 @@ def flux(solution: Certified, *parts: str | int, weight: Data | None = None) -> 
 def _interval(
     solution: Certified, conditions: Sequence[Condition], weight: Data | None = None
 ) -> Interval:
-    """Take the better ends of both intervals; collective."""
-    found = interval(solution, conditions, weight)
-    other = _corrected(made_of(solution), solution, conditions, weight)
+    """Take the better ends of both intervals, with the data as they were; collective."""
+    made = made_of(solution)
+    with made.level.as_made():
+        found = interval(solution, conditions, weight)
+        other = _corrected(made, solution, conditions, weight)
     if other is None:
         return found
     lower, upper = max(found.lower, other[0]), min(found.upper, other[1])

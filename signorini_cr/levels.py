@@ -176,7 +176,11 @@ def solve_physics(
         solution = solve_level(level, lend, start, monitor, seconds)
         yield solution
         began = time.perf_counter()
-        following = step(solution)
+        try:
+            following = step(solution)
+        except (InputError, NotConverged):  # a limit, for one: all ranks come to it together
+            hierarchy.free()
+            raise
         if following is None:
             break
         level.tidy()

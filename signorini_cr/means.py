@@ -85,6 +85,14 @@ def _bounded(
     solution: Certified, where: str | int | None, weight: Data | None
 ) -> tuple[Pairing, Interval]:
     """Bound ∫ ψ u by two numbers, and return what is known of ψ."""
+    with solution.level.as_made():  # for whom the data have changed since
+        return _bounded_as_made(solution, where, weight)
+
+
+def _bounded_as_made(
+    solution: Certified, where: str | int | None, weight: Data | None
+) -> tuple[Pairing, Interval]:
+    """Do so with data that are as they were when the solution was made; collective."""
     certificate, level = solution.certificate, solution.level
     forms = diffusion(level.data).forms
     place = _place(forms, level.domain, where)

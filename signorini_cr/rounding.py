@@ -32,7 +32,7 @@ def interval(lower: float, upper: float) -> str:
     return f"[{_placed(low)}, {_placed(_rounded(_exact(upper), last, ROUND_CEILING))}]"
 
 
-def known(value: float, within: float | None, digits: int = 6, least: int = 2) -> str:
+def digits_of(value: float, within: float | None, digits: int = 6, least: int = 2) -> str:
     """Format a figure with the digits that mean something.
 
     Args:

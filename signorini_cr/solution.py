@@ -20,7 +20,7 @@ from .fem.cells import on_cells
 from .fem.conditions import Data
 from .fem.problem import Problem
 from .mesh.domain import Domain
-from .rounding import at_most, counted, known
+from .rounding import at_most, counted, digits_of
 from .shown import HTML
 from .vi.contact import ContactFacts
 from .vi.level import Level
@@ -53,9 +53,10 @@ class Solution:
     def __repr__(self) -> str:
         """Describe it in a line; the certificate only if it is made, as making it is collective."""
         contact, certificate = self.contact, self.__dict__.get("certificate")
+        force = digits_of(contact.force, None, 4)
         line = (
             f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
-            f"{counted(contact.number, 'facet')} in contact, force {known(contact.force, None, 4)}"
+            f"{counted(contact.number, 'facet')} in contact, force {force}"
         )
         bound = certificate and certificate.bound_h1
         return line + (">" if bound is None else f", error at most {at_most(bound)}>")
@@ -156,7 +157,7 @@ class Solution:
         """Have the certificate that a quantity needs, and make room after it."""
         _ = self.certificate
         try:
-            with self.level.as_made(), self._estimating():
+            with self._estimating():
                 yield
         finally:
             self.level.tidy()

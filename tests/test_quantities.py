@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import ufl
+from dolfinx.fem import Constant
 from dolfinx.mesh import compute_midpoints, create_unit_cube, exterior_facet_indices, meshtags
-from helpers import SIDES, STRIP, bar, strip
+from helpers import HELD_ABOVE, SIDES, STRIP, bar, strip
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -224,3 +225,26 @@ def test_where_contact_alone_holds_u_a_mean_is_refused_and_a_force_is_not():
                 continue
             with pytest.raises(InputError, match="nothing but contact is known to hold"):
                 ask()
+
+
+@pytest.mark.ranks
+def test_intervals_are_of_the_data_that_were_solved_with():
+    """Asked for by a method, or by the function of the module that it calls."""
+    domain = HELD_ABOVE.mesh(0.3)
+    data = [Constant(domain.mesh, value) for value in (-3.0, 1.0, 1.0)]
+    f, c, kappa = data
+    problem = Problem(f=f, reaction=c, coefficient=kappa, obstacle=lambda x: -0.1 - 0.3 * x[0])
+    solution = solve(problem, domain)
+    asked = (
+        (solution.mean, lambda: mean(solution), ()),
+        (solution.integral, lambda: integral(solution, "neumann"), ("neumann",)),
+        (solution.flux, lambda: flux(solution, "dirichlet"), ("dirichlet",)),
+        (solution.force_bounds, lambda: force_bounds(solution), ()),
+    )
+    before = [method(*arguments) for method, _, arguments in asked]
+    for each in data:
+        each.value = 1e3
+    for (method, function, arguments), expected in zip(asked, before, strict=True):
+        assert function() == pytest.approx(expected, rel=1e-12)
+        assert method(*arguments) == pytest.approx(expected, rel=1e-12)
+    assert [float(each.value) for each in data] == [1e3] * 3

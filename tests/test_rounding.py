@@ -8,7 +8,7 @@ import pytest
 
 import signorini_cr
 from signorini_cr.output import series
-from signorini_cr.rounding import at_most, interval, known, rounded_up, told
+from signorini_cr.rounding import at_most, digits_of, interval, rounded_up, told
 
 pytestmark = pytest.mark.serial
 RANDOM = random.Random(1)
@@ -58,7 +58,7 @@ def test_small_and_round_numbers_are_told_as_people_write_them():
     ],
 )
 def test_what_is_not_known_is_not_told(value, within, text):
-    assert known(value, within) == text
+    assert digits_of(value, within) == text
 
 
 STEP = {

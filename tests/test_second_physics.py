@@ -24,16 +24,16 @@ from signorini_cr import InputError, Polygon, Problem, Robin, compat, solve_leve
 from signorini_cr.adaptive import adaptively
 from signorini_cr.data.diffusion import DiffusionOnMesh
 from signorini_cr.estimate.certificate import Certificate
-from signorini_cr.fem.physics import Imposed
+from signorini_cr.fem.physics import Imposed, Words
 from signorini_cr.fem.snapshot import Snapshot
-from signorini_cr.fem.space import facet_corners, facet_entities, facet_measures
+from signorini_cr.fem.space import facet_corners, facet_measures
 from signorini_cr.levels import solve_physics
 from signorini_cr.limits import Limits
+from signorini_cr.mesh.domain import facet_entities
 from signorini_cr.mesh.refinement import refine
 from signorini_cr.mesh.shared import shared_sum
 from signorini_cr.multigrid.parents import Layout
 from signorini_cr.restart import Restart
-from signorini_cr.rounding import at_most
 
 pytestmark = pytest.mark.ranks
 
@@ -61,6 +61,8 @@ def room(x):
 
 class OnMesh:
     """The physics on one mesh."""
+
+    words = Words(load="the load of both components")
 
     def __init__(self, domain):
         self.domain, mesh = domain, domain.mesh
@@ -186,8 +188,7 @@ class Coupled:
         edges = x[:, 1:] - x[:, :1]
         slopes = np.linalg.solve(edges, away[:, 1:] - away[:, :1])
         squares = 0.5 * np.abs(np.linalg.det(edges)) * (slopes**2).sum(axis=(1, 2))
-        total = mesh.comm.allreduce(squares.sum())
-        return Certificate(bound_h1=float(np.sqrt(total)), indicators=squares)
+        return Certificate(indicators=squares, reason="averages mark, and bound nothing")
 
 
 def turned(vectors):
@@ -349,16 +350,26 @@ def test_each_component_is_held_elsewhere():
         assert (contact.u >= contact.obstacle - 1e-12).all()
         assert np.allclose(contact.u[contact.active], contact.obstacle[contact.active])
     assert contact.number_active < contact.number
-    with pytest.raises(InputError, match=r"net force ∫f \+ ∫g of 1: only one below 0"):
+    with pytest.raises(
+        InputError,
+        match=r"unknowns fall .* has no Dirichlet facet, and a net force ∫f \+ ∫g of 1: only",
+    ):
         next(solve_physics(Coupled(Lifted), domain, uniformly))
 
 
-def test_bounds_of_another_kind_are_told(domain):
-    """A certificate that knows no more than a bound and its shares."""
+def test_marks_without_a_bound_are_told_as_that(domain):
     (solution,) = solve_physics(Coupled(), domain, lambda _: None)
-    bound = solution.certificate.bound_h1
-    for said in (repr(solution), repr(solution.certificate), solution._repr_html_()):
-        assert at_most(bound) in said and "None" not in said
+    assert solution.certificate.reason in solution._repr_html_()
+    assert solution.certificate.reason in repr(solution.certificate)
+    assert "error at most" not in repr(solution) + solution._repr_html_()
+    step = adaptively(Limits(), tolerance=0.1, levels=3, max_dofs=10_000, fraction=0.5)
+    with pytest.raises(InputError, match="no bound that could be below it"):
+        list(solve_physics(Coupled(), domain, step))
+
+
+def test_a_bound_without_more_is_told():
+    certificate = Certificate(bound_h1=0.25, indicators=np.ones(3))
+    assert repr(certificate) == "<Certificate: error at most 0.25>"
 
 
 def test_arrays_stay_the_physics_own(monkeypatch):

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from signorini_cr import Contact, Domain, InputError, Neumann, Problem, solve_adaptive, solve_levels
 from signorini_cr.data.consistency import doubts
 from signorini_cr.fem.problem import Forms
-from signorini_cr.fem.space import facet_entities
+from signorini_cr.mesh.domain import facet_entities
 from signorini_cr.restart import Restart
 from signorini_cr.verification.exact import S1
 

@@ -15,7 +15,7 @@ from ..data.admissible import shown
 from ..errors import InputError
 from ..mesh.domain import Domain
 from ..mesh.shared import bounding_box
-from .expressions import Expression
+from .formula import Expression
 from .reference import ABOVE, EXPRESSIONS, Key
 
 

@@ -40,8 +40,8 @@ from ..quantities import Quantity
 from ..rounding import counted
 from ..solution import Solution
 from .datacheck import Datum, check_values
-from .expressions import Expression, check_name, parse
-from .formula import Clock, Node
+from .expressions import check_name, parse
+from .formula import Clock, Expression, Node
 from .readers import (
     HUGE,
     array,

@@ -30,7 +30,7 @@ from ..output.page import run_page
 from ..output.tables import short
 from ..output.units import GLUE
 from ..restart import Restart
-from ..rounding import at_most, known
+from ..rounding import at_most, digits_of
 from ..solution import Solution
 from .problemfile import ProblemFile
 from .reference import ENDS
@@ -153,7 +153,7 @@ class Run:
 
     def tell_the_end(self, names: str) -> None:
         """Say which files there are, and how long it all has taken."""
-        seconds = known(time.perf_counter() - self.args.began, None, 2)
+        seconds = digits_of(time.perf_counter() - self.args.began, None, 2)
         self.screen.text(
             f"written to {self.folder}: {names}, and {RESTART} for --resume;"
             f" {seconds}{GLUE}s with start, pictures and files"

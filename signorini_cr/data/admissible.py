@@ -30,9 +30,9 @@ from ..fem.cells import BoundaryFacets, Cells, corner_points
 from ..fem.conditions import as_number, facets_of, is_by_cells, negative
 from ..fem.pointwise import EPS, evaluate
 from ..fem.problem import Forms
-from ..fem.space import facet_entities, function_space, ghosted_vector
+from ..fem.space import function_space, ghosted_vector
 from ..garbage import release
-from ..mesh.domain import Domain
+from ..mesh.domain import Domain, facet_entities
 from ..mesh.shared import bounding_box
 
 if TYPE_CHECKING:

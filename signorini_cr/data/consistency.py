@@ -18,8 +18,8 @@ from ..fem.cells import barycentric_coordinates
 from ..fem.conditions import Condition, as_number
 from ..fem.pointwise import evaluate
 from ..fem.problem import Forms
-from ..fem.space import facet_entities, facet_measures, facet_normals
-from ..mesh.domain import Domain, exterior_facets
+from ..fem.space import facet_measures, facet_normals
+from ..mesh.domain import Domain, exterior_facets, facet_entities
 from .admissible import SAFETY, Complaint, Precision, first, place, shown
 
 Values = tuple[FloatArray, FloatArray]

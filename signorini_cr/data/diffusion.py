@@ -18,10 +18,10 @@ from ..arrays import FloatArray, IndexArray, Int32Array
 from ..errors import InputError
 from ..fem.cells import Cells, measures, vertex_rows
 from ..fem.conditions import Condition, as_number, is_by_cells
-from ..fem.physics import Imposed, OnMesh
+from ..fem.physics import Imposed, OnMesh, Words
 from ..fem.problem import Kernel
-from ..fem.space import facet_corners, facet_entities, function_space, vertex_values
-from ..mesh.domain import Domain
+from ..fem.space import facet_corners, function_space, vertex_values
+from ..mesh.domain import Domain, facet_entities
 from .admissible import check_symmetry
 from .loads import NeumannMoments, VolumeMoments, bounds_on_facets, chi
 from .quadrature import Compiled, OnFacets, Tensor, Trace, Volume
@@ -157,6 +157,13 @@ class DiffusionOnMesh:
         V: The discrete space.
         moments: What is large, and kept for a while only.
     """
+
+    words = Words(
+        load="f, g or coefficient",
+        positive="the coefficient must be finite and above 0 everywhere, reactions and coefficients"
+        " of parts finite",
+        held="no Dirichlet facet, no loss of heat, no reaction",
+    )
 
     def __init__(
         self,

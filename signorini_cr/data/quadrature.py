@@ -29,8 +29,8 @@ from ..fem.physics import Imposed
 from ..fem.pointwise import Samples, Unknown
 from ..fem.problem import Forms
 from ..fem.simplified import simplified
-from ..fem.space import facet_entities, facet_quadrature
-from ..mesh.domain import Domain
+from ..fem.space import facet_quadrature
+from ..mesh.domain import Domain, facet_entities
 from .cutting import Cut, cut
 from .jets import Boxes, Enclosure, Range, lowered, values
 from .pieces import Pieces

@@ -81,7 +81,7 @@ class Certificate:
 
     def __repr__(self) -> str:
         """Write bound and energy on a line, or why there are none."""
-        if self.bound_h1 is None:
+        if self.bound_h1 is None or self.reason is not None:
             return f"<Certificate: no bound, {self.reason}>"
         energy = "" if self.energy is None else f", energy in {interval(*self.energy)}"
         return f"<Certificate: error at most {at_most(self.bound_h1)}{energy}>"

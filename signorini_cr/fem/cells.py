@@ -20,9 +20,9 @@ from scipy.sparse import csc_array
 
 from .. import compat
 from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
-from ..mesh.domain import Domain, Refinement
+from ..mesh.domain import Domain, Refinement, facet_entities
 from ..mesh.shared import shared_maximum, shared_sum
-from .space import facet_entities, simplex_measures
+from .space import simplex_measures
 
 BLOCK = 1 << 15
 """Cells that are worked on at a time: as many as the processor's cache holds."""

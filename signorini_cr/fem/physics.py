@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from dolfinx import fem
 
@@ -45,8 +45,26 @@ class Imposed:
     sign: int = 1
 
 
+class Words(NamedTuple):
+    """A physics' own words for what messages are about.
+
+    Attributes:
+        load: What χ is made of.
+        positive: What a_h's diagonal that is not above 0 says of the data.
+        held: What holds no part of the domain that floats.
+    """
+
+    load: str = "a load"
+    positive: str = "a_h must be finite, and its diagonal above 0"
+    held: str = "no Dirichlet facet"
+
+
 class OnMesh(Protocol):
     """A physics on one mesh, with its data, each sampled once."""
+
+    @property
+    def words(self) -> Words:
+        """The words of messages."""
 
     @property
     def domain(self) -> Domain:
@@ -142,6 +160,7 @@ class Physics(Protocol):
             solution: The `Solution`, of this physics.
 
         Returns:
-            The `Certificate`. All that it may know has a default; adaptive refinement goes by
-            `bound_h1` and `indicators`, or passes on the `reason` why there are none.
+            The `Certificate`. All that it may know has a default. Adaptive refinement goes by its
+            `indicators`, with a tolerance by `bound_h1` as well; where there is no bound, `reason`
+            says why.
         """

@@ -34,7 +34,7 @@ from ..arrays import FloatArray, Int32Array, summed
 from ..errors import InputError, insist_on_kind, together
 from ..hints import meant
 from ..jit import compiled
-from ..mesh.domain import PARTS, Domain, Parts, named
+from ..mesh.domain import PARTS, Domain, Parts, facet_entities, named
 from ..mesh.materials import Materials
 from ..mesh.shared import bounding_box
 from .conditions import (
@@ -52,7 +52,7 @@ from .conditions import (
 )
 from .simplified import simplified
 from .snapshot import Snapshot
-from .space import facet_entities, ufl_element
+from .space import ufl_element
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from ..arrays import BoolArray, FloatArray, Int32Array, Int64Array
 from ..compat import cell_nodes, facet_nodes
+from ..mesh.domain import facet_entities
 from ..mesh.plane import cross
-from .space import facet_entities
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,8 @@ from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array
 from ..fem.cells import barycentric_coordinates
 from ..fem.physics import Imposed
-from ..fem.space import facet_corners, facet_entities, function_space
+from ..fem.space import facet_corners, function_space
+from ..mesh.domain import facet_entities
 from ..mesh.exchange import Exchange
 from ..mesh.shared import shared_maximum, shared_sum
 

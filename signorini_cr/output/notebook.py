@@ -6,7 +6,7 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
-from ..rounding import at_most, interval, known
+from ..rounding import at_most, digits_of, interval
 from . import plots
 from .canvas import as_png, grouped
 
@@ -31,10 +31,10 @@ def as_html(solution: Solution) -> str:
         "element": solution.element,
         "cells": grouped(solution.cells),
         "degrees of freedom": grouped(solution.dofs),
-        "energy J(u_h)": known(solution.energy, wide, 4 if wide is None else 7),
+        "energy J(u_h)": digits_of(solution.energy, wide, 4 if wide is None else 7),
         "facets in contact": f"{grouped(contact.number_active)} of {grouped(contact.number)}",
-        f"{size} in contact": known(contact.length, facet),
-        "contact force": known(contact.force, None, 4),
+        f"{size} in contact": digits_of(contact.length, facet),
+        "contact force": digits_of(contact.force, None, 4),
         "Newton steps, linear iterations": f"{iterations.newton}, {iterations.linear}",
     }
     if certificate is None:

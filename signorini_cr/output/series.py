@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from ..errors import on_root
-from ..rounding import at_most, counted, interval, known
+from ..rounding import at_most, counted, digits_of, interval
 from . import checkpoint
 from .files import Where, Writer, write_files, write_text
 from .meanings import OF_STEPS
@@ -125,8 +125,8 @@ def _force(record: Mapping[str, Any]) -> str:
     force = record["force"]
     for found in record["quantities"].values():
         if is_plain_force(found) and math.isclose(found["value"], force, rel_tol=1e-9):
-            return known(force, found["upper"] - found["lower"], 4)
-    return short(force, 4) if abs(force) < 1e4 else known(force, None, 4)
+            return digits_of(force, found["upper"] - found["lower"], 4)
+    return short(force, 4) if abs(force) < 1e4 else digits_of(force, None, 4)
 
 
 def search_header() -> str:
@@ -200,7 +200,7 @@ def over_time(records: Sequence[Mapping[str, Any]], units: Units) -> list[str]:
 def times(records: Sequence[Mapping[str, Any]]) -> str:
     """Say how long the steps have taken."""
     total = sum(record["seconds"] for record in records)
-    whole, each = (known(seconds, None, 2) for seconds in (total, total / len(records)))
+    whole, each = (digits_of(seconds, None, 2) for seconds in (total, total / len(records)))
     return f"{whole}{GLUE}s for {counted(len(records), 'step')}, {each}{GLUE}s a step"
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..quantities import KINDS
-from ..rounding import at_most, counted, interval, known, rounded_up
+from ..rounding import at_most, counted, digits_of, interval, rounded_up
 from .meanings import PRINTED
 from .sheets import as_csv
 from .units import GLUE, PLAIN, Units
@@ -65,11 +65,11 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     wide = None if force["reason"] is not None else force["upper"] - force["lower"]
     line = (
         f"contact on {contact['active']} of {counted(contact['facets'], 'facet')}, length"
-        f" {known(contact['length'], facet)}{units.after('x')}, force"
-        f" {known(contact['force'], wide, 4 if wide is None else 6)}{units.after('force')}"
+        f" {digits_of(contact['length'], facet)}{units.after('x')}, force"
+        f" {digits_of(contact['force'], wide, 4 if wide is None else 6)}{units.after('force')}"
     )
     points = [
-        "(" + f",{GLUE}".join(known(value, facet, least=0) for value in point) + ")"
+        "(" + f",{GLUE}".join(digits_of(value, facet, least=0) for value in point) + ")"
         for point in contact["transitions"]
     ]
     if points:
@@ -162,7 +162,7 @@ def times(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _time(seconds: float) -> str:
-    return known(seconds, None, 2)
+    return digits_of(seconds, None, 2)
 
 
 def table_row(record: Mapping[str, Any], first: Mapping[str, Any] | None = None) -> str:
@@ -283,7 +283,7 @@ def energy(record: Mapping[str, Any], otherwise: int = 7) -> str:
     ends = record.get("energy_bounds", {})  # steps that an older version has left have none
     low, high = ends.get("lower"), ends.get("upper")
     wide = None if low is None or high is None else high - low
-    return known(record["energy"], wide, otherwise if wide is None else 7)
+    return digits_of(record["energy"], wide, otherwise if wide is None else 7)
 
 
 def short(value: float | None, digits: int = 3) -> str:

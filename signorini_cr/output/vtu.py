@@ -27,7 +27,8 @@ from mpi4py import MPI
 from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root, raise_together
-from ..fem.space import facet_corners, facet_entities, vertex_values
+from ..fem.space import facet_corners, vertex_values
+from ..mesh.domain import facet_entities
 from .files import Where, as_path, disk_errors
 
 if TYPE_CHECKING:

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import ufl
 from mpi4py import MPI
+from ufl.core.expr import Expr
 
 from ..arrays import FloatArray
-from ..fem.conditions import Condition, Contact, Dirichlet, Neumann, Robin
-from ..fem.problem import Data, Expr, Material, Problem, as_expression
+from ..fem.conditions import Condition, Contact, Data, Dirichlet, Neumann, Robin
+from ..fem.problem import Material, Problem, as_expression
 from ..mesh import families
 from ..mesh.domain import Domain, Polygon
 

@@ -13,9 +13,10 @@ from mpi4py import MPI
 from .. import compat
 from ..arrays import FloatArray, Int32Array
 from ..data.diffusion import diffusion
-from ..fem.conditions import changed
-from ..fem.problem import Data, Forms, as_expression
-from ..fem.space import facet_entities, facet_quadrature, vertex_values
+from ..fem.conditions import Data, changed
+from ..fem.problem import Forms, as_expression
+from ..fem.space import facet_quadrature, vertex_values
+from ..mesh.domain import facet_entities
 from ..solution import Solution
 
 

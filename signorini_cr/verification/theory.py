@@ -26,11 +26,11 @@ from dolfinx.mesh import exterior_facet_indices
 from mpi4py import MPI
 
 from ..arrays import Int32Array
-from ..fem.conditions import as_number, facets_of
-from ..fem.problem import Data, Forms, Problem
-from ..fem.space import facet_entities, facet_quadrature, facet_to_dof, function_space
+from ..fem.conditions import Data, as_number, facets_of
+from ..fem.problem import Forms, Problem
+from ..fem.space import facet_quadrature, facet_to_dof, function_space
 from ..jit import compiled
-from ..mesh.domain import Domain
+from ..mesh.domain import Domain, facet_entities
 from ..solution import Solution
 from .exact import Example
 from .norms import facet_values

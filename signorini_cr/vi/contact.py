@@ -20,7 +20,7 @@ from ..fem.physics import OnMesh
 from ..fem.space import ghosted_vector
 from ..garbage import release
 from ..multigrid.parents import Layout
-from ..rounding import counted, known
+from ..rounding import counted, digits_of
 from .active import ActiveSet
 from .solver import Iterations
 from .stopping import NOISE
@@ -103,10 +103,10 @@ class ContactFacts:
 
     def __repr__(self) -> str:
         """Describe the contact in a line."""
-        length = known(self.length, self.length / max(self.number_active, 1))  # to within a facet
+        facet = self.length / max(self.number_active, 1)  # the length is known to within one
         return (
             f"<ContactFacts: {self.number_active} of {counted(self.number, 'facet')}, "
-            f"length {length}, force {known(self.force, None, 4)}>"
+            f"length {digits_of(self.length, facet)}, force {digits_of(self.force, None, 4)}>"
         )
 
     @property
@@ -213,11 +213,11 @@ def _at_facets(
     state = seen(np.where(at_dofs.active.mask, 1.0, -1.0))
     below, above = system.obstacles_at_vertices
     local = data.at_vertices(u, facets)
-    means = dofs.shape[1] > 1
+    of_ends = not layout.cr
     return {
         "names": data.domain.names_of(facets),
-        "obstacle": below.mean(axis=1) if means else _bound(system.lower[dofs[:, 0]]) + offset,
-        "upper": above.mean(axis=1) if means else _bound(system.upper[dofs[:, 0]]) + offset,
+        "obstacle": below.mean(axis=1) if of_ends else _bound(system.lower[dofs[:, 0]]) + offset,
+        "upper": above.mean(axis=1) if of_ends else _bound(system.upper[dofs[:, 0]]) + offset,
         "u": local.mean(axis=1) + offset,
         "pressure": seen(pressure).mean(axis=1),
         "active": (state.min(axis=1) >= 0.0) & (state.max(axis=1) > 0.0),

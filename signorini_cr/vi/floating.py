@@ -96,12 +96,12 @@ class Floating:
             amount = f"of {forces[-1, bad]:g}"
             if abs(forces[-1, bad]) <= doubt[bad] and forces[:, bad].any():
                 amount = "that can't be told from 0"
-            alone = number[bad] == V.dofmap.index_map.size_global * V.dofmap.index_map_bs
+            block = V.dofmap.index_map_bs
+            alone = number[bad] == V.dofmap.index_map.size_global * block
+            falls = "the domain falls" if block == 1 else "the unknowns fall"
             complaint = (
-                ("there is " if alone else f"the domain falls into pieces, and {where} has ")
-                + "no Dirichlet facet, no loss of heat, no reaction, and "
-                + _of_contact(below[bad], above[bad], amount)
-            )
+                "there is " if alone else f"{falls} into pieces, and {where} has "
+            ) + f"{system.words.held}, and {_of_contact(below[bad], above[bad], amount)}"
         raise_together(V.mesh.comm, complaint)
 
     def _sums(self, comm: MPI.Comm, piece: IndexArray, *values: FloatArray) -> FloatArray:

@@ -23,13 +23,9 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.cells import barycentric_coordinates
-from ..fem.space import (
-    facet_corners,
-    facet_entities,
-    ghosted_vector,
-    simplex_measures,
-)
+from ..fem.space import facet_corners, ghosted_vector, simplex_measures
 from ..garbage import release
+from ..mesh.domain import facet_entities
 from ..multigrid.parents import Layout
 from ..multigrid.transfer import Ancestor, prolongate
 from .active import ActiveSet

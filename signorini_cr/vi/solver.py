@@ -307,17 +307,17 @@ class NewtonTest:
         small = self._small(snes, step, norm)
         before, self._forces = self._forces, self._linear.forces()
         if step == 0:
-            done = self._is_solved_by_the_start(norm, small)
+            done = self._accept_start(norm, small)
             return Reason.CONVERGED_FNORM_ABS if done else Reason.ITERATING
         force_error, imbalance = self.force_error, self.imbalance
         self._forget()
-        facts = self._contact_facts(before)
-        if self._is_large(snes, step, norm, small) or self._looks_at_the_set(step, small, facts):
+        facts = self._step_forces(before)
+        if self._is_large(snes, step, norm, small) or self._go_on_for_the_set(step, small, facts):
             return Reason.ITERATING
         noise = self._measure(snes, norm, facts)
         if self.force_error <= self._slack * FORCES and self.imbalance <= self._slack * FLOWS:
             return Reason.CONVERGED_FNORM_ABS
-        if self._has_another_set(facts, noise) or self._refines(force_error, imbalance):
+        if self._try_another_set(facts, noise) or self._refine(force_error, imbalance):
             return Reason.ITERATING
         return self._as_far_as_it_goes(snes.getSolution())
 
@@ -330,8 +330,11 @@ class NewtonTest:
         self._slack = max(1.0, small / self._target)
         return float(small)
 
-    def _is_solved_by_the_start(self, norm: float, small: float) -> bool:
-        """Tell whether no step is needed: by our own tolerance one is made, to look at the set."""
+    def _accept_start(self, norm: float, small: float) -> bool:
+        """Note that nothing is wrong if no step is needed; return whether that is so.
+
+        By our own tolerance one is made, to look at the set.
+        """
         enough = norm == 0.0 or (self._slack > 1.0 and norm <= small)
         if enough:
             self.imbalance = 0.0
@@ -351,8 +354,8 @@ class NewtonTest:
         finest = self._cycle.finest
         return step == 1 or norm > NOISE * finest.rounding(snes.getSolution(), active)
 
-    def _looks_at_the_set(self, step: int, small: float, facts: _ContactFacts) -> bool:
-        """Tell whether a step is made only because dofs are in the wrong set."""
+    def _go_on_for_the_set(self, step: int, small: float, facts: _StepForces) -> bool:
+        """Count a step that is made only as dofs are in the wrong set; return whether it is."""
         allowed = SET_STEPS if step <= SET_STEPS else 1
         wrong = facts.misclassified_norm > SET_TOLERANCE * small
         if self._for_the_set >= allowed or not wrong:
@@ -360,7 +363,7 @@ class NewtonTest:
         self._for_the_set += 1
         return True
 
-    def _measure(self, snes: PETSc.SNES, norm: float, facts: _ContactFacts) -> FloatArray:
+    def _measure(self, snes: PETSc.SNES, norm: float, facts: _StepForces) -> FloatArray:
         """Work out what may be wrong; return what of the forces is rounding; collective."""
         x, residual = snes.getSolution(), snes.getFunction()[0]
         errors, noise = self._force_errors(x, norm, facts)
@@ -369,8 +372,12 @@ class NewtonTest:
         self.imbalance = self._stiffness.imbalance(x, self._b, residual, active)
         return noise
 
-    def _has_another_set(self, facts: _ContactFacts, noise: FloatArray) -> bool:
-        """Tell whether dofs in the wrong set are what is wrong, and were so not too often."""
+    def _try_another_set(self, facts: _StepForces, noise: FloatArray) -> bool:
+        """Count a step that is made for another set; return whether it is.
+
+        That is so where dofs in the wrong set are what is wrong, and were so not too often. What
+        was measured in this set says nothing of that one.
+        """
         allowed = np.maximum(self._slack * FORCES * facts.sizes, noise)
         if not (facts.misclassified > allowed).any():
             return False
@@ -380,8 +387,8 @@ class NewtonTest:
         self.force_error = self.imbalance = np.inf
         return True
 
-    def _refines(self, force_error: float, imbalance: float) -> bool:
-        """Tell whether to solve once more in the same set, as that has helped.
+    def _refine(self, force_error: float, imbalance: float) -> bool:
+        """Have the linear solver leave less in the same set, if that has helped; return whether.
 
         Args:
             force_error: As it was a step before.
@@ -409,8 +416,15 @@ class NewtonTest:
     def settle(self, vectors: Vectors, bounds: Bounds) -> None:
         """Go on to twice the digits where double precision is not enough; collective."""
         assert self._data is not None
-        there = self._linear, self._cycle.operator, bounds, self._stiffness, vectors
-        extended = Extended(*there, self._masses, self._data.offset)
+        extended = Extended(
+            self._linear,
+            self._cycle.operator,
+            bounds,
+            self._stiffness,
+            vectors,
+            self._masses,
+            self._data.offset,
+        )
         try:
             settled = extended.settle(self._data.rounding, self._data.loads, self._slack)
             active = extended.active.dofs
@@ -426,7 +440,7 @@ class NewtonTest:
             self.failure = self._lost_in_rounding(x, settled.from_data)
 
     def _force_errors(
-        self, x: PETSc.Vec, norm: float, facts: _ContactFacts
+        self, x: PETSc.Vec, norm: float, facts: _StepForces
     ) -> tuple[FloatArray, FloatArray]:
         """Estimate the errors of the forces of each class, in parts, and their rounding."""
         stiffness, slack = self._stiffness, self._slack
@@ -514,7 +528,7 @@ class NewtonTest:
             "stopped"
         )
 
-    def _contact_facts(self, before: FloatArray) -> _ContactFacts:
+    def _step_forces(self, before: FloatArray) -> _StepForces:
         """Sum up contact forces; collective."""
         forces, active = self._forces, self._linear.active_now()
         misclassified = active.mask != self._linear.active.mask
@@ -529,11 +543,11 @@ class NewtonTest:
         ]
         squares, sums, moved, wrong = summed(self._stiffness.comm, np.array(facts))
         sizes = np.maximum(sums, self._stiffness.least)
-        return _ContactFacts(active, float(np.sqrt(squares.sum())), sums, sizes, moved, wrong)
+        return _StepForces(active, float(np.sqrt(squares.sum())), sums, sizes, moved, wrong)
 
 
 @dataclass(frozen=True, eq=False)
-class _ContactFacts:
+class _StepForces:
     """Forces after a Newton step, over all ranks; sums have one figure a class of stiffness.
 
     Attributes:

@@ -113,6 +113,7 @@ class System:
     Attributes:
         offset: What is to be added to the solution to have u; 0 in most cases.
         drifts: Whether that is the constant that c and b hold against the loads.
+        words: The physics' words, for messages.
         operator: A as the solver uses it.
         A: Matrix of a_h with the rows and columns of Γ0's dofs replaced by the identity's.
         b: χ less the Dirichlet values' share by dof, the values themselves in their rows, ghosts up
@@ -143,7 +144,7 @@ class System:
         Raises:
             InputError: Data are not finite, or κ is not above 0.
         """
-        self._data, self._like, V = data, like, data.V
+        self._data, self._like, self.words, V = data, like, data.words, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
         self.drifts = False
         known = None if like is None or like.drifts else like
@@ -158,7 +159,8 @@ class System:
         if like is None:
             self.A = _assembled(data.a, self._bc(self.u_D), layout)
             self.operator = ConstrainedMatrix(self.A, self.bounded)
-            _require_positive(comm, self.operator.whole_diagonal)
+            positive = bool((self.operator.whole_diagonal > 0.0).all())
+            raise_together(comm, None if positive else f"data: {self.words.positive}")
         else:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi().copy())
@@ -167,7 +169,7 @@ class System:
         same = like if shares else None
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
-        _require_finite(comm, "f, g or coefficient", self.b)
+        _require_finite(comm, self.words.load, self.b)
         trivial = self._trivial() if same is None else same._known_trivial
         self.residual_scale = self._scale(trivial)
         if self.is_trivial:  # as far as numbers go
@@ -557,14 +559,6 @@ def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
     return A
 
 
-def _require_positive(comm: MPI.Comm, diagonal: FloatArray) -> None:
-    complaint = (
-        "data: the coefficient must be finite and above 0 everywhere, reactions and coefficients of"
-        " parts finite"
-    )
-    raise_together(comm, None if (diagonal > 0.0).all() else complaint)
-
-
 def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:
     """Take data on the boundary as the element does: CR facet means, P1 values at vertices.
 
@@ -577,7 +571,7 @@ def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArra
     for data in imposed:
         dofs = unknowns(V, data.facets, data.components)
         # Π_h K ⊂ K_h holds with facet means for any α and u_D
-        of_dofs = data.means[:, None] if dofs.shape[1] == 1 else data.ends
+        of_dofs = data.means[:, None] if Layout.of_space(V).cr else data.ends
         # before the maximum over the ranks, which a NaN may lose
         _require_finite(V.mesh.comm, data.key, of_dofs)
         np.maximum.at(values.x.array, dofs, of_dofs)

@@ -13,7 +13,8 @@ from signorini_cr.data import quadrature
 from signorini_cr.data.quadrature import Rule, Trace, Volume
 from signorini_cr.fem.cells import Cells
 from signorini_cr.fem.pointwise import Samples
-from signorini_cr.fem.space import facet_entities, function_space
+from signorini_cr.fem.space import function_space
+from signorini_cr.mesh.domain import facet_entities
 
 FORMULAS = {
     "polynomial": lambda x: x[0] ** 3 - 2 * x[0] * x[1] + 0.1,

@@ -10,12 +10,12 @@ from signorini_cr.errors import InputError
 from signorini_cr.fem.fields import discontinuous
 from signorini_cr.fem.space import (
     closure_dofs,
-    facet_entities,
     facet_measures,
     facet_to_dof,
     function_space,
     vertex_values,
 )
+from signorini_cr.mesh.domain import facet_entities
 
 
 @pytest.fixture(params=[GhostMode.none, GhostMode.shared_facet], ids=lambda mode: mode.name)

@@ -9,7 +9,7 @@ from helpers import DEMOS, on_a_slope
 from mpi4py import MPI
 
 from signorini_cr import plots
-from signorini_cr.rounding import at_most, known
+from signorini_cr.rounding import at_most, digits_of
 
 WORLD = MPI.COMM_WORLD
 
@@ -39,7 +39,7 @@ def test_a_notebook_shows_a_table_and_a_picture(dim, monkeypatch):
     again = solution._repr_html_()
     assert "<img" not in again
     low, high = certificate.energy
-    for told in (at_most(certificate.bound_h1), known(solution.energy, high - low)):
+    for told in (at_most(certificate.bound_h1), digits_of(solution.energy, high - low)):
         assert f'<td style="text-align:right">{told}</td>' in again
 
 
