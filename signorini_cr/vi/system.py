@@ -14,17 +14,17 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg.blas import dasum
 
-from ..arrays import BoolArray, FloatArray, IndexArray, Int32Array, summed
+from ..arrays import FloatArray, IndexArray, Int32Array, summed
 from ..errors import InputError, raise_together
-from ..fem.physics import Imposed, OnMesh
-from ..fem.space import facet_measures, ghosted_vector, unknowns
+from ..fem.physics import OnMesh
+from ..fem.space import facet_measures, ghosted_vector
 from ..fem.walk import Walk
 from ..garbage import release
 from ..multigrid.constrained import ConstrainedMatrix, with_entries
 from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import MATRICES, defaults
-from .bounds import Bounds
+from .boundary import Boundary, extent, require_finite
 from .stopping import windows
 
 LEAST_SCALE = 1e-5
@@ -40,15 +40,9 @@ NOTHING = 1e-100
 BESIDE = 1e-16
 """The same in parts of the bounds, beside which it would be lost in rounding."""
 
-FAR = 16.0
-"""Values so many times as far from 0 as from one another are told from their middle."""
-
 DRIFT = 100.0
 """So many times as far from 0 as loads may bend u is where c and b alone hold it, if they are weak.
 """
-
-APART = 1e-15
-"""Distance of two bounds that are the same, in parts of the largest."""
 
 DATUM = 2.0 * 2.0**-53
 """Rounding of a mean of data over a facet, or of a load, in parts of it."""
@@ -146,16 +140,17 @@ class System:
         """
         self._data, self._like, self.words, V = data, like, data.words, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
-        self.drifts = False
-        known = None if like is None or like.drifts else like
-        if (
-            known is not None
-            and data.fixed is known._data.fixed
-            and data.bounds is known._data.bounds
-        ):
-            self._take_boundary(known)
+        if like is not None and data.fixed is like._data.fixed and data.bounds is like._data.bounds:
+            read: Boundary = like._read
         else:
-            self._read_boundary(layout.size[0])
+            read = Boundary.of(data)
+        self._read: Boundary = read
+        self.u_D: fem.Function = read.u_D
+        self.dirichlet: Int32Array = read.dirichlet
+        self.bounded: Int32Array = read.bounded
+        self.bounded_facets: Int32Array = read.facets
+        self.contact_dofs: Int32Array = read.dofs
+        self.obstacles_at_vertices: FloatArray = read.obstacles
         if like is None:
             self.A = _assembled(data.a, self._bc(self.u_D), layout)
             self.operator = ConstrainedMatrix(self.A, self.bounded)
@@ -164,79 +159,36 @@ class System:
         else:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi().copy())
-        self._take_balance()
+        self.offset, self.drifts = self._balance(read)
+        boundary = read if self.offset == read.offset else read.with_offset(self.offset)
+        self.lower, self.upper, self.bounds = boundary.lower, boundary.upper, boundary.bounds
         shares = like is not None and self.u_D is like.u_D and self.offset == like.offset
         same = like if shares else None
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
-        _require_finite(comm, self.words.load, self.b)
+        require_finite(comm, self.words.load, self.b)
         trivial = self._trivial() if same is None else same._known_trivial
         self.residual_scale = self._scale(trivial)
         if self.is_trivial:  # as far as numbers go
             self.b[: len(trivial[0])], self.b[len(trivial[0]) :] = trivial[0], 0.0
             layout.shared_sum(self.b)
 
-    def _read_boundary(self, owned: int) -> None:
-        """Take values and bounds from the data; collective.
-
-        Args:
-            owned: Number of owned dofs.
-        """
-        data, V = self._data, self._data.V
-        on_dirichlet, self.u_D = _imposed(data.fixed, V)
-        floors, ceilings = ([b for b in data.bounds if b.sign == sign] for sign in (1, -1))
-        self._read_contact(data.bounds)
-        bounded = np.zeros_like(on_dirichlet)
-        self.lower, self.upper = (
-            np.full(len(bounded), infinite) for infinite in (PETSc.NINFINITY, PETSc.INFINITY)
-        )
-        for bound, imposed, sign in (self.lower, floors, 1.0), (self.upper, ceilings, -1.0):
-            if not imposed:
-                continue
-            there, values = _imposed(imposed, V)
-            # Where the two parts meet in a P1 vertex the Dirichlet value holds
-            dofs = np.flatnonzero(there & ~on_dirichlet)
-            bound[dofs] = sign * values.x.array[dofs]
-            bounded[dofs] = True
-        self.dirichlet = np.flatnonzero(on_dirichlet).astype(np.int32)
-        self._take_offset()
-        self._part_bounds(np.flatnonzero(bounded))
-        self.bounded = np.flatnonzero(bounded[:owned]).astype(np.int32)
-        self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
-
-    def _part_bounds(self, bounded: IndexArray) -> None:
-        """Lift β by a little where it is α: the side that u is on tells which of them holds it."""
-        lower, upper = self.lower[bounded], self.upper[bounded]
-        both = np.abs(np.concatenate([lower, upper]))
-        size = float(both[both < PETSc.INFINITY].max(initial=0.0))
-        size = self.u_D.function_space.mesh.comm.allreduce(size, op=MPI.MAX)
-        least = max(APART * size, 1e-290)
-        self.upper[bounded] = np.where(upper > lower, upper, lower + least)
-
-    def _take_offset(self) -> None:
-        """Choose the offset, and take it off u_D and the bounds; collective."""
-        comm, values = self.u_D.function_space.mesh.comm, self.u_D.x.array[self.dirichlet]
-        bottom, top = _range(comm, values)
-        if bottom > top:
-            each = np.concatenate([self.lower, self.upper])
-            bottom, top = _range(comm, each[np.abs(each) < PETSc.INFINITY])
-        middle = 0.5 * (bottom + top)
-        self.offset = middle if abs(middle) > FAR * 0.5 * (top - bottom) else 0.0
-        if self.offset:
-            self.u_D.x.array[self.dirichlet] -= self.offset
-            for bound in (self.lower, self.upper):
-                bound[np.abs(bound) < PETSc.INFINITY] -= self.offset
-
-    def _take_balance(self) -> None:
-        """Make the constant u with a_h(u, 1) = χ(1) the offset where u is near it; collective.
+    def _balance(self, read: Boundary) -> tuple[float, bool]:
+        """Choose the constant u with a_h(u, 1) = χ(1) for the offset if u is near it; collective.
 
         With c ≪ κ, u is f/c but for a part of f/κ. Rounding of A u would hide the loads. It would,
         too, beside c α or b α for an α that is far away, which is no offset then.
+
+        Args:
+            read: The boundary with the offset that it has by itself.
+
+        Returns:
+            `offset` and `drifts`.
         """
-        comm = self._data.V.mesh.comm
-        held = comm.allreduce(len(self.dirichlet) > 0, op=MPI.LOR)
+        comm, as_it_is = self._data.V.mesh.comm, (read.offset, False)
+        held = comm.allreduce(len(read.dirichlet) > 0, op=MPI.LOR)
         if held or (of_constants := self._of_constants()) is None:
-            return
+            return as_it_is
         owned = self.A.getLocalSize()[0]
         of_one, chi = of_constants[:owned], self.chi[:owned]
         lost, net, loads = summed(comm, np.array([of_one.sum(), chi.sum(), np.abs(chi).sum()]))
@@ -244,28 +196,14 @@ class System:
         softest = comm.allreduce(float(diagonal.min(initial=np.inf)), op=MPI.MIN)
         with np.errstate(all="ignore"):
             constant, bend = net / lost, loads / softest
-        drifts = DRIFT * bend < abs(constant) < np.inf
-        if not drifts and not abs(constant) < abs(constant - self.offset):
-            return
-        lowest, highest = self.lower + self.offset, self.upper + self.offset
+        drifts = bool(DRIFT * bend < abs(constant) < np.inf)
+        if not drifts and not abs(constant) < abs(constant - read.offset):
+            return as_it_is
+        lowest, highest = read.lower + read.offset, read.upper + read.offset
         inside = bool((lowest <= constant).all() and (constant <= highest).all())
         if not comm.allreduce(inside, op=MPI.LAND):
-            return  # a bound holds u
-        before = self.offset
-        self.drifts, self.offset = drifts, constant if drifts else 0.0
-        self.lower, self.upper = self.lower.copy(), self.upper.copy()  # they may be another's
-        for bounds in (self.lower, self.upper):
-            bounds[np.abs(bounds) < PETSc.INFINITY] -= self.offset - before
-        self.bounds = Bounds(self.lower[self.bounded], self.upper[self.bounded])
-
-    def _take_boundary(self, like: System) -> None:
-        """Take values and bounds from a system of the same data."""
-        self.u_D, self.dirichlet, self.offset = like.u_D, like.dirichlet, like.offset
-        self.lower, self.upper = like.lower, like.upper
-        self.bounded, self.bounds = like.bounded, like.bounds
-        self.bounded_facets: Int32Array = like.bounded_facets
-        self.contact_dofs: Int32Array = like.contact_dofs
-        self.obstacles_at_vertices: FloatArray = like.obstacles_at_vertices
+            return as_it_is  # a bound holds u
+        return (float(constant), True) if drifts else (0.0, False)
 
     def _lifting(self) -> FloatArray:
         """Sum what u_D and the offset add to b, ghosts up to date, shape (dofs,); collective."""
@@ -337,7 +275,7 @@ class System:
     def _middle(self) -> float:
         """Compute the number that u_D is around; collective."""
         values = self.u_D.x.array[self.dirichlet]
-        bottom, top = _range(self.u_D.function_space.mesh.comm, values)
+        bottom, top = extent(self.u_D.function_space.mesh.comm, values)
         return 0.5 * (bottom + top) if bottom <= top else 0.0
 
     def _scale(self, trivial: Sequence[FloatArray]) -> float:
@@ -413,26 +351,6 @@ class System:
         """Impose values on Γ0, where all unknowns of a node are set."""
         block = values.function_space.dofmap.index_map_bs
         return fem.dirichletbc(values, np.unique(self.dirichlet // block))
-
-    def _read_contact(self, bounds: Sequence[Imposed]) -> None:
-        """Note what the owned facets of Γ1 have, in ascending order."""
-        V = self._data.V
-        topology = V.mesh.topology
-        owned = topology.index_map(topology.dim - 1).size_local
-        none, only = np.empty(0, dtype=np.int32), np.zeros(1, dtype=np.int32)
-        rows = [(none, only), *((each.facets, each.components) for each in bounds)]
-        facets = np.concatenate([each for each, _ in rows])
-        dofs = np.concatenate([unknowns(V, *row)[:, :, 0] for row in rows])
-        # with bounds on both sides a facet is there twice
-        self.bounded_facets, first = np.unique(facets[facets < owned], return_index=True)
-        self.contact_dofs = dofs[facets < owned][first]
-        size = len(self.bounded_facets), topology.dim
-        self.obstacles_at_vertices = np.stack([np.full(size, -np.inf), np.full(size, np.inf)])
-        for each in bounds:
-            own = each.facets < owned
-            row = self.obstacles_at_vertices[0 if each.sign > 0 else 1]
-            at = np.searchsorted(self.bounded_facets, each.facets[own])
-            row[at] = each.sign * each.ends[own, :, 0]
 
     def row_sums(self) -> FloatArray:
         """Sum up the owned rows of A: a_h(1, ·) but where a neighbour is on Γ0."""
@@ -540,12 +458,6 @@ def _sum_of_sizes(values: FloatArray) -> float:
     return float(dasum(values)) if len(values) else 0.0
 
 
-def _range(comm: MPI.Comm, values: FloatArray) -> tuple[float, float]:
-    """Find the least and the largest of all ranks' values; ∞ and −∞ where there are none."""
-    bottom = comm.allreduce(float(values.min(initial=np.inf)), op=MPI.MIN)
-    return bottom, comm.allreduce(float(values.max(initial=-np.inf)), op=MPI.MAX)
-
-
 def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
     """Assemble the matrix of a_h, with the identity's rows and columns on Γ0; collective."""
     with defaults(MATRICES, prefix=""):
@@ -557,37 +469,3 @@ def _assembled(a: fem.Form, bc: fem.DirichletBC, layout: Layout) -> PETSc.Mat:
     A.assemble()
     A.setOption(PETSc.Mat.Option.SPD, True)
     return A
-
-
-def _imposed(imposed: Sequence[Imposed], V: fem.FunctionSpace) -> tuple[BoolArray, fem.Function]:
-    """Take data on the boundary as the element does: CR facet means, P1 values at vertices.
-
-    Returns:
-        Which dofs have some, and a Function with the values there.
-    """
-    values = fem.Function(V)
-    on_part = np.zeros_like(values.x.array)
-    values.x.array[:] = PETSc.NINFINITY
-    for data in imposed:
-        dofs = unknowns(V, data.facets, data.components)
-        # Π_h K ⊂ K_h holds with facet means for any α and u_D
-        of_dofs = data.means[:, None] if Layout.of_space(V).cr else data.ends
-        # before the maximum over the ranks, which a NaN may lose
-        _require_finite(V.mesh.comm, data.key, of_dofs)
-        np.maximum.at(values.x.array, dofs, of_dofs)
-        on_part[dofs] = 1.0
-    # A rank may own a dof of the part without owning any of its facets
-    for array in (values.x.array, on_part):
-        Layout.of_space(V).shared_maximum(array)
-    values.x.array[on_part == 0.0] = 0.0
-    return on_part > 0.0, values
-
-
-def _require_finite(comm: MPI.Comm, key: str, values: FloatArray) -> None:
-    raise_together(
-        comm,
-        None
-        if (np.abs(values) < PETSc.INFINITY).all()
-        else f"data: {key} is not finite, or too large, at some point of the mesh; "
-        "where(condition, a, b), or ufl.conditional, can set a value apart",
-    )
