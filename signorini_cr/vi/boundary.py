@@ -77,8 +77,9 @@ class Boundary:
             bound[at] = sign * values.x.array[at]
             has_one[at] = True
         offset = _middle_far_away(V.mesh.comm, u_D.x.array[dirichlet], lower, upper)
-        u_D.x.array[dirichlet] -= offset
-        lower, upper = _less(lower, offset), _less(upper, offset)
+        if offset:
+            u_D.x.array[dirichlet] -= offset
+            lower, upper = _less(lower, offset), _less(upper, offset)
         _part(V.mesh.comm, lower, upper, has_one)
         bounded = np.flatnonzero(has_one[: Layout.of_space(V).size[0]]).astype(np.int32)
         return cls(u_D, dirichlet, lower, upper, bounded, offset, *_contact(data.bounds, V))
