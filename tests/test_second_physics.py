@@ -396,4 +396,4 @@ def test_arrays_stay_the_physics_own(monkeypatch):
             return values
 
         monkeypatch.setattr(DiffusionOnMesh, name, kept)
-    assert solved() == expected
+    assert solved() == pytest.approx(expected, rel=1e-9)
