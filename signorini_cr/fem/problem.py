@@ -228,7 +228,7 @@ def _expression(data: Data, x: Expr, called: str, in_cells: bool = False) -> Exp
             for kind, words in _NO_DATA.items():
                 if isinstance(each, kind) and (in_cells or kind is not GeometricFacetQuantity):
                     raise ValueError(f"it holds {words}")
-            if isinstance(each, GeometricQuantity) and not isinstance(each, _KNOWN_OF_CELLS):
+            if isinstance(each, GeometricQuantity) and not isinstance(each, _GEOMETRY):
                 raise ValueError(f"it holds {type(each).__name__}, which can't be evaluated")
             if isinstance(each, IntValue):
                 float(each)  # which may be too large
@@ -248,7 +248,7 @@ _NO_DATA: dict[type, str] = {
     GeometricFacetQuantity: "what facets have, as their normal",
 }
 
-_KNOWN_OF_CELLS = (
+_GEOMETRY = (
     ufl.SpatialCoordinate,
     ufl.FacetNormal,
     ufl.CellVolume,
@@ -258,7 +258,7 @@ _KNOWN_OF_CELLS = (
     ufl.MaxCellEdgeLength,
     ufl.JacobianDeterminant,
 )
-"""Geometry that data may hold."""
+"""Geometry that data may hold, the normal on facets alone."""
 
 
 class Kernel:
