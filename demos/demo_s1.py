@@ -27,7 +27,7 @@ from study import Study, comm, levels_wanted
 
 from signorini_cr import exact, plots, solve_levels
 from signorini_cr.output.report import level_record, table_header, table_row
-from signorini_cr.output.tables import certified, legend, markdown_table
+from signorini_cr.output.tables import certificate_lines, legend, markdown_table
 
 study = Study("demo_s1", "S1 on unstructured meshes")
 levels = levels_wanted(6)
@@ -52,7 +52,7 @@ for solution in solve_levels(exact.S1.problem, domain, levels):
     study.tell(table_row(records[-1], records[0]))
 study.parts.append(markdown_table(records).strip())
 study.tell("\n" + textwrap.fill(legend(records[0]), 80) + "\n")
-head, *figures = certified(records[-1])
+head, *figures = certificate_lines(records[-1])
 study.tell(textwrap.fill(head, 80))
 for figure in figures:
     study.tell(textwrap.fill(figure, 80, initial_indent="  ", subsequent_indent="    "))

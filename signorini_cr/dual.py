@@ -60,16 +60,15 @@ def solved(dual: Problem, level: Level) -> Iterator[Dual]:
     meshes = (NestedMesh(physics, each.domain, each.parents) for each in level.meshes)
     level = Level(tuple(meshes))
     system = level.system
-    u = system.start()
-    load, found = (ghosted_vector(level.V, each) for each in (system.b, u.x.array))
+    less = system.start()
+    load, found = (ghosted_vector(level.V, each) for each in (system.b, less.x.array))
     solve_once(system.A, load, found, DUAL, ESTIMATE_PREFIX)
-    u.x.scatter_forward()
-    u.x.array[:] += system.offset
+    less.x.scatter_forward()
     release(load, found)
     try:
-        yield Dual(level, u)
+        yield Dual(level, system.with_offset(less))
     finally:
-        level.tidy()
+        level.meshes[-1].tidy()
 
 
 def certified(dual: Problem, level: Level) -> Certificate:

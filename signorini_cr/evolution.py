@@ -29,6 +29,7 @@ from .data.quadrature import Rule, Volume
 from .diffusion import Diffusion
 from .errors import InputError, insist_on_count, insist_on_kind, raise_together, to_float
 from .fem.conditions import Data
+from .fem.layout import Layout
 from .fem.problem import Problem, as_expression, carry
 from .fem.snapshot import Snapshot
 from .levels import LevelMonitor, Start, check_arguments, solve_level
@@ -37,7 +38,6 @@ from .mesh.balance import Refined
 from .mesh.domain import Domain
 from .mesh.refinement import check_refinable, refine
 from .multigrid.hierarchy import Hierarchy, NestedMesh
-from .multigrid.parents import Layout
 from .restart import Restart
 from .solution import Solution
 from .vi.level import Level
@@ -116,9 +116,9 @@ class Solver:
         self._held = self._level.floating is None
         system = self._level.system
         self._stack.callback(self._hierarchy.free)
-        # what has served a single solve will not stay for many
-        again = self._held and self._solved != 1
-        lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, again)
+        # A matrix that has served a single solve will not be kept for many either
+        for_many = self._held and self._solved != 1
+        lent = self._hierarchy.multigrid(system.operator, system.owned_dirichlet, for_many)
         self._cycle = self._stack.enter_context(lent)
         self._assembled, self._solved = self.physics.a.snapshot(), 0
 
@@ -362,11 +362,7 @@ def solve_in_time(
         NotConverged: A step was not solved, or would not fit into ``max_time``; or the mesh would
             not fit into the memory there is.
     """
-    end, steps, done = _checked_steps(end, steps, done, scheme, time)
-    if (restart is None) != (done == 0):
-        raise InputError(
-            "restart: what to go on from and done, the number of that step, are both needed"
-        )
+    end, steps, done = _checked_steps(end, steps, done, restart, scheme, time)
     check_arguments(problem, domain)
     problem = problem.called_once()  # though a scheme may take a second solver
     capacity, own = _capacities(problem, capacity)
@@ -452,7 +448,7 @@ class _Stepper:
 
 
 def _checked_steps(
-    end: float, steps: int, done: int, scheme: str, time: object
+    end: float, steps: int, done: int, restart: object, scheme: str, time: object
 ) -> tuple[float, int, int]:
     """Insist on times and on a scheme that there can be, and return the times."""
     end = to_float("end", end)
@@ -462,6 +458,10 @@ def _checked_steps(
     insist_on_kind("done", done, Integral, "a whole number")
     if not 0 <= done <= steps:
         raise InputError(f"done is {done}; it must be the number of a step, or 0")
+    if (restart is None) != (done == 0):
+        raise InputError(
+            "restart: what to go on from and done, the number of that step, are both needed"
+        )
     if steps > MOST_STEPS or not np.isfinite(steps / end):
         raise InputError(f"end is {end}; {steps} steps would be too short for numbers to tell")
     if end > sys.float_info.max / steps:

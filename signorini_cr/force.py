@@ -17,7 +17,7 @@ from .estimate.force import (
     Certified,
     Interval,
     against,
-    interval,
+    force_interval,
     lost_of_norms,
     made_of,
     of_bumps,
@@ -27,7 +27,7 @@ from .estimate.force import (
 )
 from .estimate.settled import Settled, in_p1, left_by
 from .estimate.weights import Weighed, Weight, ranges, scalar
-from .fem.cells import measures
+from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin
 from .fem.problem import Forms, Problem
 from .hints import meant
@@ -88,9 +88,10 @@ def _interval(
 ) -> Interval:
     """Take the better ends of both intervals, with the data as they were; collective."""
     made = made_of(solution)
+    cells = made.cells()
     with made.level.as_made():
-        found = interval(solution, conditions, weight)
-        other = _corrected(made, solution, conditions, weight)
+        found = force_interval(made, cells, conditions, weight)
+        other = _corrected(made, cells, solution, conditions, weight)
     if other is None:
         return found
     lower, upper = max(found.lower, other[0]), min(found.upper, other[1])
@@ -114,7 +115,11 @@ class _ByPhi(NamedTuple):
 
 
 def _corrected(
-    made: Made, solution: Certified, conditions: Sequence[Condition], weight: Data | None
+    made: Made,
+    cells: Cells,
+    solution: Certified,
+    conditions: Sequence[Condition],
+    weight: Data | None,
 ) -> tuple[float, float] | None:
     """Bound ∫ λ over parts by a(v, φ) − χ(φ), a-harmonic φ; None where contact begins or ends.
 
@@ -122,9 +127,8 @@ def _corrected(
 
     a(u − v, φ) is a product of two errors, and what Γ1 leaves: y·n of φ's flux times u − v where
     there is contact, φ times λ where there is none. With a weight ω φ has its values at vertices,
-    and ℓ is what it lacks, as in `interval`.
+    and ℓ is what it lacks, as in `force_interval`.
     """
-    cells = made.cells()
     settled = Settled.of(made, cells)
     known = [condition for condition in conditions if condition not in settled.free]
     if settled.mixed and known:
@@ -133,15 +137,16 @@ def _corrected(
     none: FloatArray = np.zeros((cells.tdim + 1, cells.number))
     found: _ByPhi | None = _ByPhi(0.0, 0.0, none, none)
     if known:
-        found = _by_phi(made, solution, settled, conditions, known, omega)
+        found = _by_phi(made, cells, solution, settled, conditions, known, omega)
     if found is None:
         return None
-    reach = found.reach + _left_on_contact(made, settled, conditions, omega, found)
+    reach = found.reach + _left_on_contact(made, cells, settled, conditions, omega, found)
     return float(found.middle - reach), float(found.middle + reach)
 
 
 def _by_phi(
     made: Made,
+    cells: Cells,
     solution: Certified,
     settled: Settled,
     conditions: Sequence[Condition],
@@ -152,13 +157,14 @@ def _by_phi(
 
     Args:
         made: v and y.
+        cells: The mesh.
         solution: Of the problem.
         settled: Where there is contact for certain, and where there is none.
         conditions: The parts.
         known: Those of them with contact, or on which u is set.
         omega: ω; None for 1.
     """
-    cells, bound = made.cells(), solution.certificate.bound_companion
+    bound = solution.certificate.bound_companion
     assert bound is not None
     forms = made.data.forms
     value = 1.0 if omega is None else omega
@@ -193,13 +199,14 @@ def _by_phi(
         weighed.square,
         missed + unsure(made, at, slack, weighed) + weighed.unsure,
     )
-    reach = made.loose * (np.sqrt(energy) + lost) + more + product
+    reach = made.loose_and_lift * (np.sqrt(energy) + lost) + more + product
     reach += 2.0 * made.reach * (np.sqrt(lifted) + lost)
     return _ByPhi(force + work, reach, at, phi.through(cells))
 
 
 def _left_on_contact(
     made: Made,
+    cells: Cells,
     settled: Settled,
     conditions: Sequence[Condition],
     omega: Expr | None,
@@ -209,12 +216,12 @@ def _left_on_contact(
 
     Args:
         made: v and y.
+        cells: The mesh.
         settled: Where there is contact for certain, and where there is none.
         conditions: The parts that are asked for.
         omega: ω; None for 1.
         found: φ.
     """
-    cells, data = made.cells(), made.data
     through_facets, off = np.zeros((2, len(cells.exterior)))
     loss = np.zeros((2, len(cells.exterior)))
     loss[:, made.segments.facets.dofs] = made.segments.loss, made.segments.most
@@ -226,7 +233,7 @@ def _left_on_contact(
         lost = loss[:, None, side.dofs] * measures(cells, side) * trace
         through_facets[side.dofs] = np.abs(flows + lost).max(axis=(0, 1))
         if omega is not None and chosen and condition in settled.free:
-            ends = ranges(data.compiled.trace(omega), cells, side)
+            ends = ranges(made.data.compiled.trace(omega), cells, side)
         off[side.dofs] = np.max([np.abs(trace - end).max(axis=0) for end in ends], axis=0)
     return settled.unknown(made, cells, through_facets, off)
 

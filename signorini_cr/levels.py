@@ -27,7 +27,7 @@ from .vi.contact import contact_facts
 from .vi.floating import Floating
 from .vi.level import Level
 from .vi.nested import known_start, nested_start
-from .vi.solver import Indefinite, SystemData, solve_vi
+from .vi.solver import Indefinite, solve_vi
 from .vi.system import System
 
 LevelMonitor = Callable[[int, int, float, int, int], None]
@@ -167,7 +167,6 @@ def solve_physics(
         # so it is on finer meshes, of which none needs a system
         nothing_floats = level.floating is None
         for refined in restart.meshes(domain):
-            level.tidy()
             hierarchy.add(*refined)
             level = Level(hierarchy.meshes, nothing_floats=nothing_floats)
         start = Start(known=restart.function(level.V, 0))
@@ -183,7 +182,6 @@ def solve_physics(
             raise
         if following is None:
             break
-        level.tidy()
         hierarchy.add(*following)
         level = Level(hierarchy.meshes, nothing_floats=level.floating is None)
         start = Start()
@@ -248,17 +246,17 @@ def solve_level(
     clock = time.perf_counter()
     system = level.system
     clock, seconds["assemble"] = time.perf_counter(), time.perf_counter() - clock
-    u, residual = system.start(), fem.Function(level.V)
+    less, residual = system.start(), fem.Function(level.V)  # u_h less the offset
     if level.floating is not None:
         level.floating.check(system, level.data.inflow())
     # or u is the solution already; or near it, and another u has too many digits of the offset
     if not (system.is_trivial or system.drifts):
         if start.known is not None:
-            known_start(start.known, level, u)
+            known_start(start.known, level, less)
         elif start.coarser is not None:
-            nested_start(start.coarser, level, u, start.before)
+            nested_start(start.coarser, level, less, start.before)
     if level.floating is not None:
-        level.floating.hold(system, u)
+        level.floating.hold(system, less)
     told = None
     if monitor is not None:
         insist_on_function("monitor", monitor)
@@ -266,29 +264,21 @@ def solve_level(
     try:
         with (
             lend(system) as cycle,
-            system.vectors(u, residual) as vectors,
+            system.vectors(less, residual) as vectors,
         ):
-            data = SystemData(
-                row_sums=system.row_sums,
-                masses=system.masses,
-                rounding=system.data_rounding,
-                rounded=system.data_rounded(),
-                loads=system.chi[system.bounded],
-                offset=system.offset,
-                windows=system.windows,
+            iterations = solve_vi(
+                cycle, vectors, system.residual_scale, monitor=told, system=system
             )
-            iterations = solve_vi(cycle, vectors, system.residual_scale, monitor=told, data=data)
     except NotConverged as failure:
         doubt = level.physics.not_definite
         if doubt is not None and isinstance(failure, Indefinite):
             raise InputError(f"{doubt}; level {level.number} shows it") from None
         raise NotConverged(failure.reason, level.number) from None
-    for function in (u, residual):
+    for function in (less, residual):
         function.x.scatter_forward()
     clock, seconds["solve"] = time.perf_counter(), time.perf_counter() - clock
-    contact = contact_facts(level.data, system, u, residual, iterations)
-    if system.offset:  # the solver works with u less a number, where that is large
-        u.x.array[:] += system.offset
+    contact = contact_facts(level.data, system, less, residual, iterations)
+    u = system.with_offset(less)
     owned = system.A.getLocalSize()[0]
     with level.as_made():  # whatever a monitor has done to the data
         square = level.data.squared_energy_norm(u)

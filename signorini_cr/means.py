@@ -19,11 +19,11 @@ from .estimate.sums import INTEGRAL_ROUNDING
 from .estimate.weights import scalar
 from .fem.cells import Cells, measures
 from .fem.conditions import Condition, Data, Dirichlet, Robin, facets_of
+from .fem.layout import Layout
 from .fem.problem import Forms, Problem
 from .fem.space import function_space
 from .hints import meant
 from .mesh.domain import Domain, named
-from .mesh.shared import shared_sum
 
 DOMAIN = "domain"
 """The place that all of Ω is, unless u has a mean on something else that is called so."""
@@ -231,14 +231,12 @@ def _corrected(
     assert dual.bound_companion is not None
     domain, forms = cells.domain, made.data.forms
     V = function_space(domain.mesh, "P1")
-    z, marks = fem.Function(V), fem.Function(V)
+    z = fem.Function(V)
     dofs = V.dofmap.list[: cells.number]
     z.x.array[dofs] = of_z.vertices[cells.vertices].T
     z.x.scatter_forward()
     facets = facets_of(domain, [*forms.fixed, *forms.bounded])
-    marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, facets)] = 1.0
-    seen = shared_sum(domain.mesh, V.dofmap.index_map, marks.x.array)
-    phi = extended(z, np.flatnonzero(seen > 0).astype(np.int32), made)
+    phi = extended(z, Layout.of_space(V).nodes_at(facets), made, cells)
     with_phi = np.ascontiguousarray(phi.x.array[dofs].T)
     inside = np.ascontiguousarray(z.x.array[dofs].T) - with_phi
     work, missed, _ = against(made, cells, inside)
@@ -250,7 +248,7 @@ def _corrected(
         square(made, cells, inside),
         square(made, cells, with_phi),
     )
-    reach = made.loose * np.sqrt(size) + made.reach * np.sqrt(of_phi) + missed
+    reach = made.loose_and_lift * np.sqrt(size) + made.reach * np.sqrt(of_phi) + missed
     return [(float(-work - 0.5 * other), float(reach + dual.bound_companion * bound))]
 
 
@@ -296,7 +294,7 @@ def _settled(
         off[side.dofs] = np.abs(trace_of(cells, side, at)).max(axis=0)
     work, missed, _ = against(made, cells, at)
     work, missed, size = cells.total(work, missed, square(made, cells, at))
-    reach = made.loose * np.sqrt(size) + missed + bound * dual.bound_companion
+    reach = made.loose_and_lift * np.sqrt(size) + missed + bound * dual.bound_companion
     if settled.held:
         reach += bound * left_by(of_z, made)
     reach += settled.unknown(made, cells, through, off)

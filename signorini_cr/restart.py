@@ -20,12 +20,12 @@ from mpi4py import MPI
 from . import compat
 from .arrays import BoolArray, FloatArray, Int32Array, found_in
 from .errors import InputError
+from .fem.layout import Layout
 from .mesh.balance import Refined, balance
 from .mesh.domain import Domain, exterior_facets
 from .mesh.refinement import refine, refine_edges
 from .mesh.shared import shared_maximum
 from .multigrid.hierarchy import NestedMesh
-from .multigrid.parents import Layout
 from .solution import Solution
 
 Places = npt.NDArray[np.complex128]

@@ -52,13 +52,13 @@ class Solution:
 
     def __repr__(self) -> str:
         """Describe it in a line; the certificate only if it is made, as making it is collective."""
-        contact, certificate = self.contact, self.__dict__.get("certificate")
+        contact, certificate = self.contact, self.certificate_if_made
         force = digits_of(contact.force, None, 4)
         line = (
             f"<Solution: {self.element}, {self.dofs} dofs, {contact.number_active} of "
             f"{counted(contact.number, 'facet')} in contact, force {force}"
         )
-        bound = certificate and certificate.bound_h1
+        bound = None if certificate is None else certificate.bound_h1
         return line + (">" if bound is None else f", error at most {at_most(bound)}>")
 
     def _repr_html_(self) -> str:
@@ -118,7 +118,12 @@ class Solution:
                 certificate: Certificate = self.level.physics.certify(self)
                 return certificate
         finally:
-            self.level.tidy()
+            self.level.meshes[-1].tidy()
+
+    @property
+    def certificate_if_made(self) -> Certificate | None:
+        """The certificate if somebody has asked for it; not collective."""
+        return vars(self).get("certificate")
 
     def force_bounds(self) -> tuple[float, float]:
         """Bound the contact force of u itself by two numbers; collective.
@@ -160,7 +165,7 @@ class Solution:
             with self._estimating():
                 yield
         finally:
-            self.level.tidy()
+            self.level.meshes[-1].tidy()
 
     @contextmanager
     def _estimating(self) -> Iterator[None]:

@@ -24,6 +24,7 @@ from signorini_cr import InputError, Polygon, Problem, Robin, compat, solve_leve
 from signorini_cr.adaptive import adaptively
 from signorini_cr.data.diffusion import DiffusionOnMesh
 from signorini_cr.estimate.certificate import Certificate
+from signorini_cr.fem.layout import Layout
 from signorini_cr.fem.physics import Imposed, Words
 from signorini_cr.fem.snapshot import Snapshot
 from signorini_cr.fem.space import facet_corners, facet_measures
@@ -32,7 +33,6 @@ from signorini_cr.limits import Limits
 from signorini_cr.mesh.domain import facet_entities
 from signorini_cr.mesh.refinement import refine
 from signorini_cr.mesh.shared import shared_sum
-from signorini_cr.multigrid.parents import Layout
 from signorini_cr.restart import Restart
 
 pytestmark = pytest.mark.ranks

@@ -25,7 +25,7 @@ from ..output import report as output
 from ..output import strip
 from ..output.checkpoint import NAME as RESTART
 from ..output.checkpoint import read_checkpoint
-from ..output.files import write_files, write_text
+from ..output.files import text_writer, write_files
 from ..output.page import run_page
 from ..output.tables import short
 from ..output.units import GLUE
@@ -165,11 +165,8 @@ class Run:
         def make() -> str:
             return run_page(self.folder, self.case.source, report, self.args.words, self.problem)
 
-        def draw(path: Path) -> None:
-            on_root(self.comm, write_text, path, make)
-
         name = "report.html"
-        write_files(self.folder, {name: draw}, comm=self.comm)
+        write_files(self.folder, {name: text_writer(self.comm, make)}, comm=self.comm)
         return name
 
 

@@ -151,7 +151,7 @@ def _conclude(run: Run, finest: Solution, names: str) -> None:
     screen.text(tables.legend(records[0], units))
     screen.line("")
     screen.text(tables.facts(records[-1], units))
-    screen.items(*tables.certified(records[-1], units))
+    screen.items(*tables.certificate_lines(records[-1], units))
     tell_of_tolerance(run.case, records[-1]["bound_h1"], screen)
     endless = run.case.mode == "adaptive" and run.case.adaptive["tolerance"] == 0.0
     if endless and Shares.of(finest).rounded(run.comm):

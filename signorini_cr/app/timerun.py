@@ -270,9 +270,9 @@ class Steps:
         screen.text(series.legend(units))
         screen.line("")
         screen.text(f"at the end {tables.facts(finest, units)}")
-        for sentence in (series.certified(records), *series.over_time(records, units)):
+        for sentence in (series.certificate_line(records), *series.over_time(records, units)):
             screen.text(sentence)
-        head, *figures = tables.certified(finest, units)
+        head, *figures = tables.certificate_lines(finest, units)
         screen.items(f"the last step's own problem, {head}", *figures)
         tell_of_tolerance(run.case, bound, screen)
         screen.text(series.times(records))

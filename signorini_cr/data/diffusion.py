@@ -39,8 +39,8 @@ class Moments:
     """A mesh as arrays and the loads integrated on it: large, and each made when first asked for.
 
     They live as long as a mesh is worked on. χ asks for them first and the certificate last; then
-    whoever has the mesh's level calls its `tidy`, as a solution does after its certificate and the
-    drivers do before they make the next mesh, and there is a new, empty object in this one's place.
+    the mesh is tidied, by a solution after its certificate and by the hierarchy before the next
+    mesh, and there is a new, empty object in this one's place.
 
     Attributes:
         compiled: The data, whatever the mesh.
@@ -245,7 +245,8 @@ class DiffusionOnMesh:
     def reacting(self, w: FloatArray) -> tuple[Volume, Volume]:
         """Return f − c u_h and c u_h², from u_h at the cells' vertices, shape (d + 1, cells).
 
-        They hold until the next call: both are formulas in a function that then becomes another.
+        They hold until the next call of this or of `losing`: all are formulas in one function,
+        which then becomes another.
         """
         self._put(w)
         return self.compiled.with_reaction
@@ -254,6 +255,8 @@ class DiffusionOnMesh:
         self, w: FloatArray
     ) -> tuple[tuple[NeumannMoments, ...], tuple[NeumannMoments, ...]]:
         """Return `edges`, with g − b u_h for g where b varies within facets, and b u_h² there.
+
+        As of `reacting`, they hold until the next call of either.
 
         Args:
             w: u_h at the cells' vertices, shape (d + 1, cells).

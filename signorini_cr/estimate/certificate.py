@@ -32,7 +32,7 @@ from .cubic import cubed, with_cubics
 from .curl import improve, promising
 from .cusps import Cusps
 from .duality import DualityGap, Within, integrate, of_gradients
-from .flux import Flux, balance, carried_to_contact, equilibrate, field_squares, relax, unbalanced
+from .flux import Flux, carried_to_contact, equilibrate, field_squares, rebalance, relax, unbalanced
 from .functional import Functional, Masses
 from .lifting import below
 from .loss import Loss, half
@@ -177,7 +177,7 @@ class Made:
         missed: What quadrature may have missed of f and g, shape (cells,) or ().
         reach: Radius of the ball around the middle of p and b that A(u − u_h) is in, with loose
             ends.
-        loose: These and ‖Aℓ‖ alone.
+        loose_and_lift: These and ‖Aℓ‖ alone.
         lift: Bounds of ℓ, which v lacks.
         bounded: Facet dofs of Γ1, which the last row of lift is about.
         on_contact_alone: Whether part of the domain is held by contact alone: the residual is then
@@ -211,7 +211,7 @@ class Made:
     forces: dict[int, float]
     missed: FloatArray
     reach: float
-    loose: float
+    loose_and_lift: float
     lift: Lifted
     bounded: IndexArray
     on_contact_alone: bool
@@ -404,7 +404,7 @@ def _balanced(known: _Known) -> tuple[float, float]:
     if flux.taken_up is not None and not c.ndim:
         return 0.0, 0.0
     left = unbalanced(known.level, cells, flux.unbalanced, kappa.eigenvalues.low, known.size, c)
-    carried = balance(cells, flux, kappa.bounds.low, known.size, left)
+    carried = rebalance(cells, flux, kappa.bounds.low, known.size, left)
     if carried:
         left = unbalanced(known.level, cells, flux.unbalanced, kappa.eigenvalues.low, known.size, c)
     return left, carried
@@ -704,7 +704,7 @@ def _made(known: _Known, v: Companion, ball: _Ball, lift: float) -> Made:
         forces=_forces(alpha, flux),
         missed=_missed(known.cells, certain, segments) if some else np.array(0.0),
         reach=float(ball.bound - ball.near / 2 + ball.loose + lift / 2),
-        loose=float(ball.loose + lift),
+        loose_and_lift=float(ball.loose + lift),
         lift=v.lift,
         bounded=alpha.side.dofs,
         on_contact_alone=flux.carried is not None,

@@ -77,7 +77,7 @@ class Companion:
     contact: FloatArray
     lift: Lifted
     reason: str | None
-    boundary: Boundary
+    boundary: Prescribed
     cusps: Cusps | None = None
     thirds: FloatArray | None = None
     bubbles: FloatArray | None = None
@@ -136,7 +136,7 @@ def companion(
     draft = _started(functional, u_D, floors, flux, on_obstacle)
     largest = max(1e-300, float(np.abs(draft.vertices).max(initial=0.0)))
     scale = max(cells.comm.allgather(largest))
-    boundary = Boundary(u_D, alpha, scale, goal, highest, functional.masses)
+    boundary = Prescribed(u_D, alpha, scale, goal, highest, functional.masses)
     wrong = boundary.contradictions(cells, draft.vertices)
     excess, cusps = functional.excess(draft.vertices), None
     if cells.tdim == 2 and sweeps > 0:
@@ -211,7 +211,7 @@ def _improved(
 
 
 @dataclass(frozen=True, eq=False)
-class Boundary:
+class Prescribed:
     """Values that v has to have on Γ0, and the obstacle that it has to be above on Γ1.
 
     Attributes:
@@ -393,7 +393,7 @@ def _lift(
     v: FloatArray,
     bumps: FloatArray,
     thirds: FloatArray,
-    boundary: Boundary,
+    boundary: Prescribed,
     obstacle: bool,
 ) -> Lift:
     """Bring what u_D or α have beyond v into the cells."""

@@ -22,7 +22,7 @@ from ..data.quadrature import Coefficient
 from ..fem.cells import Cells, at_points, blocks, corner_points, dot_rows, pick, poincare, sum_rows
 from .companion import Companion, bend_squares, on_facet
 from .flux import Flux, field_squares
-from .heights import distance
+from .heights import mean_square
 from .shapes import local_thirds, quadrature
 from .sums import INTEGRAL_ROUNDING, Sums
 
@@ -243,7 +243,7 @@ class DualityGap:
             return
         d = self.cells.tdim
         mass = pick(self.reaction, block) * self.cells.volume[block]
-        apart = pick(self.most, block) * self.cells.volume[block] * distance(c, height)
+        apart = pick(self.most, block) * self.cells.volume[block] * mean_square(c, height)
         totals.energy += 0.5 * float(np.sum(apart))
         if self.most is self.reaction:
             size = sum_rows(W) ** 2 + dot_rows(W, W)
@@ -252,7 +252,7 @@ class DualityGap:
             totals.energy_slack += INTEGRAL_ROUNDING * own
         else:
             less = pick(self.most - self.reaction, block) * self.cells.volume[block]
-            totals.energy_slack += 0.5 * float(np.sum(less * distance(c, height)))
+            totals.energy_slack += 0.5 * float(np.sum(less * mean_square(c, height)))
         totals.companion += float(np.sum(apart))
         sums.apart[block] = apart
         sums.zeroth[block] += apart

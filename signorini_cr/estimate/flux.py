@@ -386,7 +386,7 @@ def unbalanced(
     return min(taken_up, float(bound + _carried(plain, left, kappa_min, size, reaction)))
 
 
-def balance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
+def rebalance(cells: Cells, flux: Flux, kappa_min: FloatArray, size: float, bound: float) -> float:
     """Add to y what the cells lack, carried to Γ0 cell by cell, where that is worth it; collective.
 
     Args:

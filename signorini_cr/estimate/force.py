@@ -16,16 +16,16 @@ from ..data.loads import reacts, trace_of
 from ..errors import InputError
 from ..fem.cells import Cells, dot_rows, measures, sum_rows
 from ..fem.conditions import Condition, Data, facets_of
+from ..fem.layout import Layout
 from ..fem.space import function_space, ghosted_vector
 from ..garbage import release
 from ..jit import compiled
-from ..mesh.shared import shared_sum
 from ..options import DUAL, ESTIMATE_PREFIX, solve_once
 from ..vi.solved import Solved
 from .certificate import UNDERFLOW, Certificate, Made
 from .companion import bend_squares
 from .duality import apart
-from .heights import distance
+from .heights import mean_square
 from .weights import Weighed, Weight
 
 NO_BOUNDS = "what flows through the part has no bounds"
@@ -71,8 +71,8 @@ def made_of(solution: Certified) -> Made:
     return certificate.made
 
 
-def interval(
-    solution: Certified, conditions: Sequence[Condition], weight: Data | None = None
+def force_interval(
+    made: Made, cells: Cells, conditions: Sequence[Condition], weight: Data | None = None
 ) -> Interval:
     """Bound ∫ λ over parts, or ∫ λ ω with a weight ω; collective.
 
@@ -81,15 +81,13 @@ def interval(
     the figures deserve; that costs about as much as the solve. With a weight ω it is φ + ℓ that is
     ω on the parts, see `Weight`.
     """
-    made = made_of(solution)
-    if made.level.domain.mesh.topology.dim != 2:
+    if cells.tdim != 2:
         raise InputError(f"{NO_BOUNDS}: {SPATIAL}")
-    cells = made.cells()
     given = None if weight is None else Weight.of(made, cells, conditions, weight)
     if given is None:
-        phi = _weight(solution, conditions)
+        phi = indicator(made, cells, conditions)
     else:
-        phi = extended(given.values, given.known, made)
+        phi = extended(given.values, given.known, made, cells)
     at = np.ascontiguousarray(phi.x.array[phi.function_space.dofmap.list[: cells.number]].T)
     work, off, slack = against(made, cells, at)
     (energy,) = cells.total(square(made, cells, at))
@@ -189,7 +187,7 @@ def against(made: Made, cells: Cells, at: FloatArray) -> tuple[float, float, Flo
             means[made.cusps.at] += dot_rows(made.cusps.moments, at[:, made.cusps.at])
         work += made.reaction * cells.volume * means
     if made.most_reaction is not made.reaction:
-        sizes = distance(v - w, height) * (total**2 + dot_rows(at, at)) / 12.0
+        sizes = mean_square(v - w, height) * (total**2 + dot_rows(at, at)) / 12.0
         off += float(((made.most_reaction - made.reaction) * cells.volume) @ np.sqrt(sizes))
     slack = np.abs(made.left * total) / (d + 1)
     if made.taken_up is not None:
@@ -233,11 +231,11 @@ def of_bumps(dual: Made, cells: Cells) -> float:
     steep = 16 / 9 * dot_rows(height, plain.apply(height, everywhere))
     steep += bend_squares(plain, height, everywhere)
     found = float(np.sum(dual.most * steep))
-    area = cells.volume * distance(np.zeros_like(height), height)
+    area = cells.volume * mean_square(np.zeros_like(height), height)
     return found + float(np.sum(dual.most_reaction * area))
 
 
-def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
+def _form(V: fem.FunctionSpace, made: Made, cells: Cells) -> fem.Form:
     """Return about a in P1, with data in functions: one form for all problems, compiled once."""
     mesh, edge = V.mesh, made.segments
     constants = fem.functionspace(mesh, ("DG", 0))
@@ -246,56 +244,48 @@ def _form(V: fem.FunctionSpace, made: Made) -> fem.Form:
     loss.x.array[edge.facets.cells] = edge.loss
     for function in (reaction, loss):
         function.x.scatter_forward()
-    kappa = made.cells().coefficient(made.kappa)
+    kappa = cells.coefficient(made.kappa)
     u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
     inside = ufl.inner(kappa * ufl.grad(u), ufl.grad(w)) + reaction * u * w
     found: fem.Form = compiled(mesh.comm, fem.form, inside * ufl.dx + loss * u * w * ufl.ds)
     return found
 
 
-def _weight(solution: Certified, conditions: Sequence[Condition]) -> fem.Function:
+def indicator(made: Made, cells: Cells, conditions: Sequence[Condition]) -> fem.Function:
     """Make a P1 function, 1 on some parts, 0 on the rest of Γ0 and Γ1, with nearly least ‖Aφ‖."""
-    domain = solution.domain
-    mesh, fdim = domain.mesh, domain.mesh.topology.dim - 1
-    made = made_of(solution)
-    V, forms = function_space(mesh, "P1"), made.data.forms
-    phi, marks = fem.Function(V), fem.Function(V)
+    domain, forms = cells.domain, made.data.forms
+    V = function_space(domain.mesh, "P1")
+    values, layout = fem.Function(V), Layout.of_space(V)
     others = [c for c in (*forms.fixed, *forms.bounded) if c not in conditions]
-    parts = []
-    for each in (conditions, others):
-        marks.x.array[:] = 0.0
-        marks.x.array[fem.locate_dofs_topological(V, fdim, facets_of(domain, each))] = 1.0
-        seen = shared_sum(mesh, V.dofmap.index_map, marks.x.array)
-        parts.append(np.flatnonzero(seen > 0).astype(np.int32))
-    chosen, rest = parts
-    both, zeros = mesh.comm.allreduce(np.array([len(np.intersect1d(chosen, rest)), len(rest)]))
+    chosen, rest = (layout.nodes_at(facets_of(domain, each)) for each in (conditions, others))
+    both, zeros = cells.comm.allreduce(np.array([len(np.intersect1d(chosen, rest)), len(rest)]))
     if both > 0:
         all_of_it = len(conditions) == len(forms.bounded) and not any(
             condition.fixed is not None for condition in conditions
         )
         raise InputError(f"{NO_BOUNDS}: {TOUCHES if all_of_it else MEETS}")
     if zeros == 0 and forms.of_one is None:
-        phi.x.array[:] = 1.0
-        return phi
-    marks.x.array[:] = 0.0
-    marks.x.array[chosen] = 1.0
-    return extended(marks, np.concatenate(parts), made)
+        values.x.array[:] = 1.0
+        return values
+    values.x.array[chosen] = 1.0
+    return extended(values, np.concatenate([chosen, rest]), made, cells)
 
 
-def extended(values: fem.Function, known: Int32Array, made: Made) -> fem.Function:
+def extended(values: fem.Function, known: Int32Array, made: Made, cells: Cells) -> fem.Function:
     """Extend values given at some dofs to a P1 function φ with nearly the least ‖Aφ‖; collective.
 
     Args:
         values: A P1 function.
         known: Local dofs at which φ is the same, ghosts included.
         made: What A is made of.
+        cells: The mesh.
     """
     V = values.function_space
-    bc, form, phi = fem.dirichletbc(values, known), _form(V, made), fem.Function(V)
+    bc, form, phi = fem.dirichletbc(values, known), _form(V, made, cells), fem.Function(V)
     A, b = assemble_matrix(form, [bc]), np.zeros_like(phi.x.array)
     A.assemble()
     fem.apply_lifting(b, [form], [[bc]])
-    shared_sum(V.mesh, V.dofmap.index_map, b)
+    Layout.of_space(V).shared_sum(b)
     b[known] = values.x.array[known]
     load, found = (ghosted_vector(V, array) for array in (b, phi.x.array))
     solve_once(A, load, found, DUAL, ESTIMATE_PREFIX)

@@ -200,7 +200,7 @@ def promise_of_vertices(
     return float(cells.total(np.sum(down**2 * free_vertices[owned] / weight))[0])
 
 
-def distance(c: FloatArray, height: FloatArray | None) -> FloatArray:
+def mean_square(c: FloatArray, height: FloatArray | None) -> FloatArray:
     """Compute means of (v − u_h)² over simplices of one, two or three dimensions, shape (n,).
 
     Args:

@@ -22,7 +22,6 @@ class Pairing:
     """ψ against functions, on a rank or on all of them.
 
     Attributes:
-        extent: Of the place.
         total: ∫ ψ.
         missed: How far that may be from the truth, rounding included.
         of_u: ∫ ψ u_h.
@@ -31,7 +30,6 @@ class Pairing:
         scale: Bound of ∫ |ψ v|, or thereabouts, for rounding.
     """
 
-    extent: float
     total: float
     missed: float
     of_u: float
@@ -91,7 +89,6 @@ def in_cells(made: Made, cells: Cells, psi: Certain, there: FloatArray) -> Pairi
     lifted, _, areas, _ = made.lift
     unsure = np.abs(means) * missed + swing * root * rough + volume * spread * odd
     return Pairing(
-        float(volume @ there),
         float(volume @ load.mean),
         float(np.sum(missed) + INTEGRAL_ROUNDING * (root @ norm)),
         float(volume @ against),
@@ -125,7 +122,6 @@ def on_side(made: Made, cells: Cells, psi: Segments) -> Pairing:
     norm = np.sqrt(over(psi.values**2)) + psi.rough
     unsure = psi.change(*own_v) + norm @ own[facets.dofs]
     return Pairing(
-        float(np.sum(length)),
         float(np.sum(psi.through)),
         float(np.sum(psi.missed) + INTEGRAL_ROUNDING * np.sum(over(np.abs(psi.values)))),
         float(np.sum(over(psi.values * u))),

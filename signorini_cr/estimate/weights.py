@@ -21,10 +21,10 @@ from ..data.quadrature import OnFacets, OnParts, Trace
 from ..errors import InputError
 from ..fem.cells import BoundaryFacets, Cells, measures, pick
 from ..fem.conditions import Condition, Data, as_number, facets_of
+from ..fem.layout import Layout
 from ..fem.problem import Forms, as_expression, carry
 from ..fem.space import function_space
 from ..mesh.domain import Domain
-from ..mesh.shared import shared_sum
 from .certificate import Made
 from .lifting import JUMP, Cubic, Lift, lift
 
@@ -97,19 +97,19 @@ class Weight:
         parts = OnParts.of([OnFacets.of(each, trace, domain) for each in conditions], cells)
         V, side, ends = function_space(domain.mesh, "P1"), parts.side, parts.ends
         own = V.dofmap.list[side.cells[:, None], cells.others[side.local]].T
-        values, marks = fem.Function(V), fem.Function(V)
-        for function, amounts in ((values, ends), (marks, np.ones_like(ends))):
-            np.add.at(function.x.array, own, amounts)
-            shared_sum(domain.mesh, V.dofmap.index_map, function.x.array)
-        chosen = marks.x.array > 0.0
-        values.x.array[chosen] /= marks.x.array[chosen]
+        values, layout = fem.Function(V), Layout.of_space(V)
+        count = np.zeros_like(values.x.array)
+        for array, amounts in ((values.x.array, ends), (count, np.ones_like(ends))):
+            np.add.at(array, own, amounts)
+            layout.shared_sum(array)
+        chosen = count > 0.0
+        values.x.array[chosen] /= count[chosen]
         known = (*conditions, *free)
         others = facets_of(
             domain, [c for c in (*data.forms.fixed, *data.forms.bounded) if c not in known]
         )
-        marks.x.array[:] = 0.0
-        marks.x.array[fem.locate_dofs_topological(V, cells.tdim - 1, others)] = 1.0
-        rest = shared_sum(domain.mesh, V.dofmap.index_map, marks.x.array) > 0.0
+        rest = np.zeros(len(count), dtype=bool)
+        rest[layout.nodes_at(others)] = True
         found = [np.ravel(row) for p in parts.parts for row in (p.ends, p.middle, p.inside)]
         seen = np.concatenate(found or [np.zeros(0)])
         largest = float(np.abs(seen[np.isfinite(seen)]).max(initial=0.0))

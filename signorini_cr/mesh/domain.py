@@ -641,7 +641,7 @@ class Polygon:
         labels = np.array([self.parts[name] for name in names], dtype=np.int32)
         numbers = numbered_materials(list(self.materials))
         what = loops, labels, size, self.materials, numbers
-        return _distribute(comm, self.parts, numbers, gmshmesh.triangulate, *what)
+        return distribute(comm, self.parts, numbers, gmshmesh.triangulate, *what)
 
     def _insist_on_size(self, size: float) -> None:
         """Refuse a length that no facet can have."""
@@ -687,10 +687,10 @@ def read_gmsh(
     parts, numbers = numbered(names), numbered_materials(materials)
     needed = [name for name in parts if name not in PARTS] if names else USUAL
     what = Path(path), parts, needed, numbers
-    return _distribute(comm, parts, numbers, gmshmesh.read, *what)
+    return distribute(comm, parts, numbers, gmshmesh.read, *what)
 
 
-def _distribute(
+def distribute(
     comm: MPI.Comm,
     parts: Mapping[str, int],
     numbers: Mapping[str, int],

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from ..arrays import FloatArray, Int32Array, Int64Array
 from ..errors import InputError, insist_on_kind, to_float
-from .domain import Domain, Polygon, _distribute
+from .domain import Domain, Polygon, distribute
 from .gmshmesh import Triangulation
 from .plane import distance
 from .polygon import inside
@@ -59,7 +59,7 @@ def structured(
         )
     if polygon.materials:
         raise InputError("squares do not follow the edges of materials; Polygon.mesh does")
-    return _distribute(comm, polygon.parts, {}, _squares, polygon, number, shift, jitter, seed)
+    return distribute(comm, polygon.parts, {}, _squares, polygon, number, shift, jitter, seed)
 
 
 def _squares(polygon: Polygon, n: float, shift: float, jitter: float, seed: int) -> Triangulation:

@@ -32,10 +32,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..arrays import Int32Array
+from ..fem.layout import Layout
 from ..garbage import release
 from .bottom import Bottom, is_small
 from .constrained import ConstrainedMatrix, numbers_of
-from .parents import Layout
 from .smoothing import smoother
 from .transfer import Transfer
 from .whole import Whole

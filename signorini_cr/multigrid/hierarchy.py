@@ -26,6 +26,7 @@ from dolfinx.fem.petsc import assemble_matrix
 from petsc4py import PETSc
 
 from ..arrays import FloatArray, IndexArray, Int32Array
+from ..fem.layout import Layout
 from ..fem.physics import OnMesh, Physics
 from ..garbage import hold, release, sweep
 from ..mesh.domain import Domain
@@ -40,7 +41,7 @@ from .cycle import (
     galerkin_products,
     is_galerkin_product,
 )
-from .parents import Layout, Parents
+from .parents import Parents
 from .pattern import empty_matrix
 from .transfer import Transfer, inclusion, prolongation
 from .whole import Whole, suits_whole
@@ -71,6 +72,14 @@ class NestedMesh:
     def data(self) -> OnMesh:
         """The physics on this mesh."""
         return self.physics.on(self.domain) if self.given is None else self.given
+
+    def tidy(self) -> None:
+        """Drop what only assembly and certificate need; who asks for that again makes it anew.
+
+        Solutions do so after their certificate and after each quantity of interest.
+        """
+        if "data" in vars(self):  # else nobody has asked for it yet
+            self.data.tidy()
 
     @property
     def V(self) -> fem.FunctionSpace:
@@ -105,7 +114,7 @@ class Hierarchy:
         parent_cell: Int32Array | IndexArray,
         exchange: Exchange | None = None,
     ) -> None:
-        """Add a mesh.
+        """Add a mesh; the finest so far makes room.
 
         Args:
             domain: The mesh, whose cells lie in those of the finest so far, and boundary parts;
@@ -114,6 +123,7 @@ class Hierarchy:
             exchange: The same.
         """
         finest = self.meshes[-1]
+        finest.tidy()
         coarse, pattern = finest.domain.mesh, None
         if domain.descent and domain.descent[-1].mesh() is coarse:
             pattern = domain.descent[-1].pattern

@@ -14,8 +14,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..arrays import FloatArray, IndexArray
+from ..fem.layout import Layout
 from ..mesh.shared import shared_sum
-from .parents import Layout
 
 
 def empty_matrix(dofs: Layout) -> PETSc.Mat:

@@ -15,10 +15,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..arrays import IndexArray, Int32Array
+from ..fem.layout import Layout
 from ..garbage import release
 from ..options import read_word
 from .constrained import numbers_of, rows_of
-from .parents import Layout
 
 OVER_RELAXATION = 1.3
 """ω where nothing is against it."""

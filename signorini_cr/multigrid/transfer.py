@@ -19,10 +19,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..arrays import FloatArray, Int32Array
+from ..fem.layout import Layout
 from ..garbage import release
 from ..mesh.shared import ghosted, shared_sum
 from .constrained import rows_of
-from .parents import Layout, Parents
+from .parents import Parents
 
 
 class Transfer:

@@ -199,6 +199,11 @@ def write_text(path: Path, make: Callable[[], str]) -> None:
         path.write_text(make(), encoding="utf-8")
 
 
+def text_writer(comm: MPI.Comm, make: Callable[[], str]) -> Writer:
+    """Return what writes the text that `make` returns on rank 0."""
+    return lambda path: on_root(comm, write_text, path, make)
+
+
 def _nearest(path: Path) -> Path:
     """Return the path itself if it is there, or else the nearest folder it would be made in."""
     # a link that leads nowhere is there, too

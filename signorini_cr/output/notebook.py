@@ -22,8 +22,8 @@ def as_html(solution: Solution) -> str:
     domains in space or of several unknowns a facet, nor without Matplotlib.
     """
     contact, iterations = solution.contact, solution.iterations
-    certificate = solution.__dict__.get("certificate")
-    bracket = certificate and certificate.energy
+    certificate = solution.certificate_if_made
+    bracket = None if certificate is None else certificate.energy
     wide = bracket and bracket[1] - bracket[0]
     facet = contact.length / contact.number_active if contact.number_active else None
     size = "length" if solution.domain.mesh.topology.dim == 2 else "area"

@@ -71,13 +71,13 @@ def run_page(
     statement = "".join(
         f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in problem.items()
     )
-    head, *figures = tables.certified(level, units)
+    head, *figures = tables.certificate_lines(level, units)
     if steps is None:
         known = [tables.facts(level, units), head]
     else:
         known = [
             f"At the end {tables.facts(level, units)}",
-            series.certified(steps),
+            series.certificate_line(steps),
             *series.over_time(steps, units),
             f"the last step's own problem, {head}",
         ]

@@ -32,7 +32,7 @@ from ..means import NO_MEAN
 from ..memory import ran_out_of_memory
 from ..options import OptionRefused
 from . import checkpoint, plots
-from .files import Where, Writer, write_files, write_text
+from .files import Where, Writer, text_writer, write_files
 from .sheets import SHEETS
 from .strip import Moment, plot_strip
 from .tables import levels_csv, markdown_table
@@ -377,10 +377,7 @@ def _texts(report: Record, solution: Solution) -> dict[str, Writer]:
     """Prepare the report, which vouches for what lies beside it, and the tables; collective."""
     comm, records = solution.domain.mesh.comm, report["levels"]
     facets = solution.contact.table() or {}
-
-    def text(make: Callable[[], str]) -> Writer:
-        return lambda path: on_root(comm, write_text, path, make)
-
+    text = partial(text_writer, comm)
     return {
         REPORT: text(lambda: report_json(report)),
         "levels.csv": text(lambda: levels_csv(records)),

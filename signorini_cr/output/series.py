@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from mpi4py import MPI
 from ..errors import on_root
 from ..rounding import at_most, counted, digits_of, interval
 from . import checkpoint
-from .files import Where, Writer, write_files, write_text
+from .files import Where, Writer, text_writer, write_files
 from .meanings import OF_STEPS
 from .report import FIELDS, REPORT, bounded, energy_bounds, plain, report_json
 from .strip import Moment, as_arrays, from_arrays
@@ -166,7 +167,7 @@ def legend(units: Units) -> str:
     return explained({name: OF_STEPS[name][0] for name, *_ in COLUMNS}, MEASURED, units)
 
 
-def certified(records: Sequence[Mapping[str, Any]]) -> str:
+def certificate_line(records: Sequence[Mapping[str, Any]]) -> str:
     """Say what is certain about the steps."""
     bounds = [record["bound_h1"] for record in records if record["bound_h1"] is not None]
     if len(bounds) < len(records):
@@ -253,7 +254,7 @@ def write_search(
     facts = {"said": said, "levels": report["search"]}
     begins = len(report["search"]) == 1
     writers: dict[str, Writer] = {
-        REPORT: lambda path: on_root(comm, write_text, path, lambda: report_json(report)),
+        REPORT: text_writer(comm, lambda: report_json(report)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),
     }
     write_files(folder, writers, former if begins else (), comm, begins)
@@ -287,10 +288,7 @@ def write_steps(
     """
     comm, records = solution.domain.mesh.comm, report["times"]
     begins = len(records) == 1
-
-    def text(make: Callable[[], str]) -> Writer:
-        return lambda path: on_root(comm, write_text, path, make)
-
+    text = partial(text_writer, comm)
     writers: dict[str, Writer] = {
         REPORT: text(lambda: report_json(report)),
         checkpoint.NAME: lambda path: checkpoint.write_checkpoint(path, restart, facts, comm),

@@ -86,7 +86,7 @@ def facts(record: Mapping[str, Any], units: Units = PLAIN) -> str:
     return line
 
 
-def certified(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:
+def certificate_lines(record: Mapping[str, Any], units: Units = PLAIN) -> list[str]:
     """Say what is certain about a level, rounded so that it stays certain.
 
     Args:

@@ -13,9 +13,9 @@ from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..errors import raise_together
+from ..fem.layout import Layout
 from ..fem.physics import Imposed, OnMesh
 from ..fem.space import unknowns
-from ..multigrid.parents import Layout
 from .bounds import Bounds
 
 FAR = 16.0
@@ -80,7 +80,7 @@ class Boundary:
         if offset:
             u_D.x.array[dirichlet] -= offset
             lower, upper = _less(lower, offset), _less(upper, offset)
-        _part(V.mesh.comm, lower, upper, has_one)
+        _keep_apart(V.mesh.comm, lower, upper, has_one)
         bounded = np.flatnonzero(has_one[: Layout.of_space(V).size[0]]).astype(np.int32)
         return cls(u_D, dirichlet, lower, upper, bounded, offset, *_contact(data.bounds, V))
 
@@ -113,7 +113,7 @@ def _middle_far_away(
     return middle if abs(middle) > FAR * 0.5 * (top - bottom) else 0.0
 
 
-def _part(comm: MPI.Comm, lower: FloatArray, upper: FloatArray, there: BoolArray) -> None:
+def _keep_apart(comm: MPI.Comm, lower: FloatArray, upper: FloatArray, there: BoolArray) -> None:
     """Lift β by a little where it is α: the one that is nearer to u holds it; collective."""
     low, high = lower[there], upper[there]
     both = np.abs(np.concatenate([low, high]))

@@ -16,10 +16,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..arrays import BoolArray, FloatArray, Int32Array, summed
+from ..fem.layout import Layout
 from ..fem.physics import OnMesh
 from ..fem.space import ghosted_vector
 from ..garbage import release
-from ..multigrid.parents import Layout
 from ..rounding import counted, digits_of
 from .active import ActiveSet
 from .solver import Iterations

@@ -96,7 +96,7 @@ class Extended:
         self._remainder, self._work, self._nothing = (vectors.x.duplicate() for _ in range(3))
         for each in (self._remainder, self._nothing):
             each.set(0.0)
-        stiffness.exact = True
+        stiffness.sum_from_differences()
         stiffness.sort(vectors.x, vectors.b)
 
     def settle(self, rounding: DataRounding, loads: FloatArray, slack: float) -> Outcome:

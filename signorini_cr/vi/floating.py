@@ -20,8 +20,8 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import FloatArray, IndexArray, Int32Array, summed
 from ..errors import raise_together
+from ..fem.layout import Layout
 from ..mesh.planar import pieces
-from ..multigrid.parents import Layout
 from .active import ActiveSet
 from .stopping import NOISE
 from .system import System

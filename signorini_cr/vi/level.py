@@ -74,13 +74,6 @@ class Level:
         """The physics on this mesh."""
         return self.meshes[-1].data
 
-    def tidy(self) -> None:
-        """Drop what only assembly and certificate needed; who asks for that again makes it anew.
-
-        Solutions do so once they have their certificate, and drivers before the next mesh.
-        """
-        self.data.tidy()
-
     @cached_property
     def system(self) -> System:
         """The assembled variational inequality."""

@@ -23,10 +23,10 @@ from petsc4py import PETSc
 from .. import compat
 from ..arrays import BoolArray, FloatArray, Int32Array
 from ..fem.cells import barycentric_coordinates
+from ..fem.layout import Layout
 from ..fem.space import facet_corners, ghosted_vector, simplex_measures
 from ..garbage import release
 from ..mesh.domain import facet_entities
-from ..multigrid.parents import Layout
 from ..multigrid.transfer import Ancestor, prolongate
 from .active import ActiveSet
 from .level import Level

@@ -6,7 +6,6 @@ from typing import Protocol
 
 from dolfinx import fem
 
-from ..fem.problem import Problem
 from ..mesh.domain import Domain
 from .contact import ContactFacts
 from .level import Level
@@ -32,9 +31,3 @@ class Solved(Found, Protocol):
 
     residual: fem.Function
     contact: ContactFacts
-    energy: float
-    seconds: dict[str, float]
-
-    @property
-    def problem(self) -> Problem:
-        """The data."""

@@ -20,17 +20,17 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..arrays import FloatArray, IndexArray, summed
+from ..arrays import FloatArray, summed
 from ..errors import InputError, NotConverged, fail_together
 from ..garbage import release
 from ..multigrid.cycle import Multigrid
 from ..options import NEWTON, PREFIX, REDUCED_PREFIX, defaults, explained, read, read_number
 from .active import ActiveSet
 from .bounds import Bounds
-from .extended import DataRounding, Extended
+from .extended import Extended
 from .reduced import LINEAR_SHARE, SET_SHARE, ReducedSolver
 from .stopping import FLOWS, FORCES, GAIN, LOST, NOISE, ROUNDED, STORED, TOUCHING, Stiffness
-from .system import DATUM, Vectors
+from .system import DATUM, System, Vectors
 
 TOLERANCE = 1e-8
 """Norm that the residual may have, in parts of that at the most trivial start."""
@@ -102,36 +102,13 @@ class Iterations:
     extended: bool
 
 
-@dataclass(frozen=True, eq=False)
-class SystemData:
-    """Figures of the data that make the system.
-
-    Attributes:
-        row_sums: `System.row_sums`.
-        masses: `System.masses`; it is asked where it may count.
-        rounding: `System.data_rounding`.
-        rounded: Bound of what that may change, summed up, `System.data_rounded`.
-        loads: χ in the bounded dofs, shape (n,).
-        offset: `System.offset`.
-        windows: `System.windows`.
-    """
-
-    row_sums: Callable[[], FloatArray]
-    masses: Callable[[], FloatArray | None]
-    rounding: DataRounding
-    rounded: float
-    loads: FloatArray
-    offset: float
-    windows: IndexArray
-
-
 def solve_vi(
     cycle: Multigrid,
     vectors: Vectors,
     scale: float,
     *,
     monitor: Monitor | None = None,
-    data: SystemData | None = None,
+    system: System | None = None,
 ) -> Iterations:
     """Solve the variational inequality in place; collective.
 
@@ -147,7 +124,7 @@ def solve_vi(
         scale: Norm that the residual is measured against, `System.residual_scale`; the same for
             all starts.
         monitor: Called after each step.
-        data: What there is to know of the data; without it all equations are of one class of
+        system: What is solved, if its data may be asked; else all equations are of one class of
             stiffness, all contact is one neighbourhood, and what is lost in rounding stays so.
 
     Raises:
@@ -160,7 +137,7 @@ def solve_vi(
     wanted = max(read_number("snes_atol", target), 1e-30 * target)
     snes = PETSc.SNES().create(cycle.matrix.getComm())
     comm = snes.getComm().tompi4py()
-    known = (None, None) if data is None else (data.row_sums, data.windows)
+    known = (None, None) if system is None else (system.row_sums, system.windows)
     stiffness = Stiffness(cycle.finest, *known)
     bounds = Bounds(*(each.array_r[cycle.operator.dofs] for each in (vectors.lower, vectors.upper)))
     linear = ReducedSolver(
@@ -172,7 +149,7 @@ def solve_vi(
         stiffness,
         max(1.0, wanted / target),
     )
-    test = NewtonTest(cycle, vectors.b, linear, stiffness, target, data)
+    test = NewtonTest(cycle, vectors.b, linear, stiffness, target, system)
     things: tuple[PETSc.Object, ...] = ()
     try:
         things = _prepare(snes, linear, stiffness, vectors, target)
@@ -287,11 +264,13 @@ class NewtonTest:
         linear: ReducedSolver,
         stiffness: Stiffness,
         target: float,
-        data: SystemData | None,
+        system: System | None,
     ):
         """Start the tests; target is what the residual may be unless options say otherwise."""
         self._cycle, self._b, self._target = cycle, b, target
-        self._linear, self._stiffness, self._data = linear, stiffness, data
+        self._linear, self._stiffness, self._system = linear, stiffness, system
+        # now, as a monitor may change the data
+        self._rounded = 0.0 if system is None else system.data_rounded()
         self._start, self._slack = np.inf, 1.0
         self._for_the_set = self._passes = self._swaps = 0
         self._forces = linear.forces()
@@ -384,7 +363,7 @@ class NewtonTest:
         self._swaps += 1
         if self._swaps >= SWAPS:
             return False
-        self.force_error = self.imbalance = np.inf
+        self._forget()
         return True
 
     def _refine(self, force_error: float, imbalance: float) -> bool:
@@ -405,7 +384,7 @@ class NewtonTest:
 
     def _as_far_as_it_goes(self, x: PETSc.Vec) -> int:
         """End where rounding has the last word: go to twice the digits, put up with it, or fail."""
-        if self._data is not None:
+        if self._system is not None:
             self.doubtful = True
             return int(PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS)
         if max(self.force_error, self.imbalance) <= self._slack * ROUNDED:
@@ -415,7 +394,7 @@ class NewtonTest:
 
     def settle(self, vectors: Vectors, bounds: Bounds) -> None:
         """Go on to twice the digits where double precision is not enough; collective."""
-        assert self._data is not None
+        assert self._system is not None
         extended = Extended(
             self._linear,
             self._cycle.operator,
@@ -423,10 +402,12 @@ class NewtonTest:
             self._stiffness,
             vectors,
             self._masses,
-            self._data.offset,
+            self._system.offset,
         )
         try:
-            settled = extended.settle(self._data.rounding, self._data.loads, self._slack)
+            settled = extended.settle(
+                self._system.data_rounding, self._system.bounded_loads, self._slack
+            )
             active = extended.active.dofs
         except NotConverged as failure:
             self.failure = failure.reason
@@ -492,11 +473,11 @@ class NewtonTest:
             active: Its active set.
             total: The sum of the forces.
         """
-        if self._data is None:
+        if self._system is None:
             return 0.0
         sizes = np.abs(x.array_r[active.bounded]) + self._offset
         own = float((self._cycle.operator.diagonal * sizes)[active.mask].sum())
-        rounded = self._data.rounded + 2.0 * DATUM * float(self._stiffness.comm.allreduce(own))
+        rounded = self._rounded + 2.0 * DATUM * float(self._stiffness.comm.allreduce(own))
         # where it may count: no entry is larger than the largest on the diagonal
         sizes = x.norm(PETSc.NormType.NORM_1) + x.getSize() * self._offset
         most = ENTRIES * DATUM * self._stiffness.stiffest * sizes
@@ -508,11 +489,11 @@ class NewtonTest:
     @cached_property
     def _masses(self) -> FloatArray | None:
         """`System.masses`; collective."""
-        return None if self._data is None else self._data.masses()
+        return None if self._system is None else self._system.masses()
 
     @property
     def _offset(self) -> float:
-        return 0.0 if self._data is None else abs(self._data.offset)
+        return 0.0 if self._system is None else abs(self._system.offset)
 
     def _lost_in_rounding(self, x: PETSc.Vec, from_data: bool = False) -> str:
         """Say to users what is lost in rounding."""

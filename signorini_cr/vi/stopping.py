@@ -104,10 +104,7 @@ class Stiffness:
         bounded: Class of each dof with a bound, shape (n,).
         made_of: What the rows of these are made of, summed over each class, shape (classes,).
         least: What forces are measured against at least, shape (classes,).
-        exact: Whether A x is summed up from differences where there is one class only, too.
     """
-
-    exact = False
 
     def __init__(
         self,
@@ -139,6 +136,7 @@ class Stiffness:
         self.least: FloatArray = np.zeros(self.number)
         self._window = np.zeros(len(grid.operator.dofs), np.intp) if window is None else window
         self._differences: PETSc.Mat | None = None
+        self._always = False
         self._find_row_sums = row_sums
         if row_sums is not None and self._kinds > 1:
             self._free, self._class = np.ones(len(entries), dtype=bool), self._classes(entries)
@@ -200,9 +198,13 @@ class Stiffness:
         values = self._grid.operator.magnitude(x)
         return self.totals(values if which is None else np.where(which, values, 0.0))
 
+    def sum_from_differences(self) -> None:
+        """Sum up A x from differences from now on, where there is one class only, too."""
+        self._always = True
+
     def residual(self, x: PETSc.Vec, b: PETSc.Vec, r: PETSc.Vec) -> None:
         """Compute r = A x − b; collective, where the matrix must be whole for the first time."""
-        if self.exact and self._differences is None and self._find_row_sums is not None:
+        if self._always and self._differences is None and self._find_row_sums is not None:
             self._take_differences(self._find_row_sums)
         if self._differences is None:
             self._grid.matrix.mult(x, r)

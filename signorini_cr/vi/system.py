@@ -16,12 +16,12 @@ from scipy.linalg.blas import dasum
 
 from ..arrays import FloatArray, IndexArray, Int32Array, summed
 from ..errors import InputError, raise_together
+from ..fem.layout import Layout
 from ..fem.physics import OnMesh
 from ..fem.space import facet_measures, ghosted_vector
 from ..fem.walk import Walk
 from ..garbage import release
 from ..multigrid.constrained import ConstrainedMatrix, with_entries
-from ..multigrid.parents import Layout
 from ..multigrid.pattern import empty_matrix
 from ..options import MATRICES, defaults
 from .boundary import Boundary, extent, require_finite
@@ -140,9 +140,8 @@ class System:
         """
         self._data, self._like, self.words, V = data, like, data.words, data.V
         comm, layout = V.mesh.comm, Layout.of_space(V)
-        if like is not None and data.fixed is like._data.fixed and data.bounds is like._data.bounds:
-            read: Boundary = like._read
-        else:
+        read = None if like is None else like._boundary_for(data)
+        if read is None:
             read = Boundary.of(data)
         self._read: Boundary = read
         self.u_D: fem.Function = read.u_D
@@ -159,11 +158,12 @@ class System:
         else:
             self.A, self.operator = like.A, like.operator
         self.chi = layout.shared_sum(data.chi().copy())
-        self.offset, self.drifts = self._balance(read)
+        self.offset, self.drifts = self._choose_offset(read)
         boundary = read if self.offset == read.offset else read.with_offset(self.offset)
         self.lower, self.upper, self.bounds = boundary.lower, boundary.upper, boundary.bounds
-        shares = like is not None and self.u_D is like.u_D and self.offset == like.offset
-        same = like if shares else None
+        # What A does to the same values is known
+        known = like is not None and like._read is read and like.offset == self.offset
+        same = like if known else None
         self.b = self.chi + (self._lifting() if same is None else same._known_lifting)
         self.b[self.dirichlet] = self.u_D.x.array[self.dirichlet]
         require_finite(comm, self.words.load, self.b)
@@ -173,7 +173,24 @@ class System:
             self.b[: len(trivial[0])], self.b[len(trivial[0]) :] = trivial[0], 0.0
             layout.shared_sum(self.b)
 
-    def _balance(self, read: Boundary) -> tuple[float, bool]:
+    def _boundary_for(self, data: OnMesh) -> Boundary | None:
+        """Return the values and bounds that this was made of if other data have the same."""
+        same = data.fixed is self._data.fixed and data.bounds is self._data.bounds
+        return self._read if same else None
+
+    def with_offset(self, less: fem.Function) -> fem.Function:
+        """Return u_h.
+
+        Args:
+            less: u_h less the offset, ghosts up to date; the same function where that is 0.
+        """
+        if not self.offset:
+            return less
+        u = fem.Function(less.function_space)
+        u.x.array[:] = less.x.array + self.offset
+        return u
+
+    def _choose_offset(self, read: Boundary) -> tuple[float, bool]:
         """Choose the constant u with a_h(u, 1) = χ(1) for the offset if u is near it; collective.
 
         With c ≪ κ, u is f/c but for a part of f/κ. Rounding of A u would hide the loads. It would,
@@ -381,6 +398,11 @@ class System:
         found: FloatArray = around.array_r.copy()
         release(pattern, here, around)
         return found
+
+    @property
+    def bounded_loads(self) -> FloatArray:
+        """χ in the bounded dofs, shape (n,)."""
+        return self.chi[self.bounded]
 
     def data_rounded(self) -> float:
         """Bound what rounding of u_D and of the loads may change in b, summed up; collective."""

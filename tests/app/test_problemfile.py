@@ -18,7 +18,7 @@ from signorini_cr.errors import InputError
 from signorini_cr.levels import solve, solve_levels
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Polygon
 from signorini_cr.output.report import level_record
-from signorini_cr.output.tables import certified
+from signorini_cr.output.tables import certificate_lines
 from signorini_cr.output.units import Units
 
 SQUARE = """
@@ -452,7 +452,7 @@ all = { mean = "domain" }
     measured = Units(u="K", force="W")
     wanted = {"heat": {**found["low"], "kind": "flux"}, "low": found["low"]}
     bounds = {"contact": {"force_bounds": {"reason": "x"}}, "quantities": wanted}
-    told = "; ".join(certified(solution_record | bounds, measured))
+    told = "; ".join(certificate_lines(solution_record | bounds, measured))
     assert re.search(r"heat is in \[[^]]*\]\sW, .*; low is in \[[^]]*\]\sK, ", told)
     named = read(text.replace("[material.low]", "[material.domain]").replace('"low"', '"domain"'))
     renamed = {name: ("mean", "domain", None) for name in ("low", "all")}
@@ -488,7 +488,7 @@ all = { integral = "domain", weight = "x - y" }
         assert each["weighted"] and each["reason"] is None
         assert each["lower"] <= exact[name] <= each["upper"]
         assert each["upper"] - each["lower"] < 1e-8
-    told = "; ".join(certified(record, Units(u="K", force="W")))
+    told = "; ".join(certificate_lines(record, Units(u="K", force="W")))
     assert re.search(r"tilt is in \[[^]]*\]\sK,", told)
     assert re.search(r"push is in \[[^]]*\];", told) and re.search(r"all is in \[[^]]*\]$", told)
     for old, new, said in [

@@ -789,7 +789,7 @@ def test_what_is_worth_carrying(size):
     left = np.random.default_rng(WORLD.rank).normal(size=cells.number)
     y = SimpleNamespace(excess=np.ones((3, cells.number)), left=left.copy(), unbalanced=left.copy())
     kappa = np.array(2.0)
-    found = flux.balance(cells, y, kappa, size, 1e3)
+    found = flux.rebalance(cells, y, kappa, size, 1e3)
     if size == 1e9:
         assert found == 0.0 and np.array_equal(y.left, left) and np.all(y.excess == 1.0)
         return
@@ -799,8 +799,8 @@ def test_what_is_worth_carrying(size):
     assert np.allclose(y.left, 0.0, atol=1e-12) and np.allclose(y.excess, 1.0 + fluxes)
     # no more than it costs otherwise
     y.left = left.copy()
-    assert flux.balance(cells, y, kappa, 0.0, found * 0.99) == 0.0
-    assert flux.balance(cells, y, kappa, 0.0, found * 1.01) > 0.0
+    assert flux.rebalance(cells, y, kappa, 0.0, found * 0.99) == 0.0
+    assert flux.rebalance(cells, y, kappa, 0.0, found * 1.01) > 0.0
 
 
 # ---- minima

@@ -38,7 +38,7 @@ from signorini_cr.diffusion import Diffusion
 from signorini_cr.estimate import certificate as module
 from signorini_cr.estimate import cusps
 from signorini_cr.estimate.certificate import certify
-from signorini_cr.estimate.force import _weight, interval
+from signorini_cr.estimate.force import force_interval, indicator, made_of
 from signorini_cr.force import force_bounds
 from signorini_cr.means import mean
 from signorini_cr.mesh.families import structured
@@ -515,7 +515,7 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     reach = bound - near / 2 + loose + np.sqrt(lift) / 2
     made = certificate.made
     assert np.isclose(made.reach, reach, rtol=1e-7)
-    assert np.isclose(made.loose, loose + np.sqrt(lift), rtol=1e-7)
+    assert np.isclose(made.loose_and_lift, loose + np.sqrt(lift), rtol=1e-7)
     # the ball's radius squared is what the two products on Γ1 and the distance from κ∇u add up to
     assert np.isclose(made.complementary, rest**2, rtol=1e-7)
     assert np.isclose(made.above, total["contact"], rtol=1e-7)
@@ -533,17 +533,11 @@ def test_force():
     data = {"f": lambda x: -9 + 3 * x[0], "g": lambda x: 0.4 - x[1]}
     problem = Problem(**data, obstacle=bowl, coefficient=2.0)
     solution = solve(problem, polygon.mesh(0.12))
-    certificate = solution.certificate
-    found = again(
-        solution,
-        certificate,
-        2.0,
-        *data.values(),
-        phi=_weight(solution, diffusion(solution.level.data).forms.bounded),
-    )
+    certificate, made = solution.certificate, made_of(solution)
+    of_contact = made, made.cells(), diffusion(solution.level.data).forms.bounded
+    found = again(solution, certificate, 2.0, *data.values(), phi=indicator(*of_contact))
     agrees(certificate, found)
-    bounded = diffusion(solution.level.data).forms.bounded
-    _, low, high = interval(solution, bounded)
+    _, low, high = force_interval(*of_contact)
     assert np.isclose((low + high) / 2, found.force, rtol=1e-6)
     assert np.isclose((high - low) / 2, found.reach, rtol=1e-6)
     # There is contact all along, and a dual solution tells more
@@ -552,9 +546,9 @@ def test_force():
     # A cusp pulls at a cell's vertices: half of ∫ κ∇ψ·∇φ
     pull = SimpleNamespace(at=np.array([0]), pulls=lambda _: (np.full((3, 1), 0.02), None))
     object.__setattr__(certificate.made, "cusps", pull)
-    phi = _weight(solution, diffusion(solution.level.data).forms.bounded)
+    phi = indicator(*of_contact)
     change = 0.01 * phi.x.array[phi.function_space.dofmap.list[0]].sum()
-    middle = sum(interval(solution, bounded)[1:]) / 2
+    middle = sum(force_interval(*of_contact)[1:]) / 2
     assert np.isclose(middle, found.force + WORLD.allreduce(change), rtol=1e-6)
 
 

@@ -34,11 +34,11 @@ from signorini_cr import (
 from signorini_cr.data.quadrature import Trace
 from signorini_cr.diffusion import Diffusion
 from signorini_cr.fem.conditions import Condition
+from signorini_cr.fem.layout import Layout
 from signorini_cr.fem.problem import Forms
 from signorini_cr.fem.space import ghosted_vector
 from signorini_cr.means import mean
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
-from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.transfer import inclusion
 from signorini_cr.vi.level import Level
 

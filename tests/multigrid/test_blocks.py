@@ -10,9 +10,10 @@ from dolfinx import fem
 from dolfinx.fem.petsc import assemble_matrix
 
 from signorini_cr import compat, exact
+from signorini_cr.fem.layout import Layout
 from signorini_cr.fem.space import function_space, ghosted_vector
 from signorini_cr.mesh.refinement import refine
-from signorini_cr.multigrid.parents import Layout, Parents
+from signorini_cr.multigrid.parents import Parents
 from signorini_cr.multigrid.pattern import empty_matrix
 from signorini_cr.multigrid.smoothing import GaussSeidel
 from signorini_cr.multigrid.transfer import inclusion, prolongate, prolongation

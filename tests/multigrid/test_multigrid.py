@@ -23,6 +23,7 @@ from petsc4py import PETSc
 
 from signorini_cr import NotConverged, Polygon, Problem, exact, garbage, solve, solve_levels
 from signorini_cr.diffusion import Diffusion
+from signorini_cr.fem.layout import Layout
 from signorini_cr.fem.space import function_space, ghosted_vector
 from signorini_cr.mesh.domain import CONTACT, DIRICHLET, NEUMANN, Domain
 from signorini_cr.mesh.refinement import SIMILAR, refine, refine_marked
@@ -30,7 +31,7 @@ from signorini_cr.multigrid import bottom
 from signorini_cr.multigrid.constrained import ConstrainedMatrix
 from signorini_cr.multigrid.cycle import Grid, Multigrid, is_galerkin_product
 from signorini_cr.multigrid.hierarchy import Hierarchy, NestedMesh, conforming
-from signorini_cr.multigrid.parents import Layout, Parents
+from signorini_cr.multigrid.parents import Parents
 from signorini_cr.multigrid.smoothing import GaussSeidel
 from signorini_cr.multigrid.transfer import Ancestor, inclusion, prolongate, prolongation
 from signorini_cr.options import AMG

@@ -9,9 +9,9 @@ from dolfinx.mesh import GhostMode, create_rectangle, create_unit_cube
 from mpi4py import MPI
 
 from signorini_cr import Polygon, exact
+from signorini_cr.fem.layout import Layout
 from signorini_cr.fem.space import function_space
 from signorini_cr.mesh.refinement import refine
-from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.pattern import empty_matrix
 
 pytestmark = pytest.mark.ranks

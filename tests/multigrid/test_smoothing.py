@@ -7,9 +7,9 @@ from petsc4py import PETSc
 
 from signorini_cr import InputError, Polygon, Problem, exact, solve_levels
 from signorini_cr.diffusion import Diffusion
+from signorini_cr.fem.layout import Layout
 from signorini_cr.multigrid.constrained import rows_of
 from signorini_cr.multigrid.hierarchy import NestedMesh, conforming
-from signorini_cr.multigrid.parents import Layout
 from signorini_cr.multigrid.smoothing import OVER_RELAXATION, GaussSeidel, Jacobi
 from signorini_cr.multigrid.transfer import inclusion
 from signorini_cr.options import PREFIX

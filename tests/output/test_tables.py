@@ -7,7 +7,7 @@ import pytest
 from signorini_cr.output import series
 from signorini_cr.output.meanings import OF_STEPS, PRINTED
 from signorini_cr.output.tables import (
-    certified,
+    certificate_lines,
     facts,
     legend,
     levels_csv,
@@ -50,7 +50,7 @@ def test_three_digits_fit_into_a_column(value, told):
 @pytest.mark.parametrize("bound", [0.26683801, 1.0, 0.1, 0.999999, 2.5e-7])
 def test_what_is_printed_as_certain_is_certain(factor, bound):
     ends = {end: factor * value for end, value in RECORD["energy_bounds"].items()}
-    text = plain(certified(RECORD | {"bound_h1": factor * bound, "energy_bounds": ends}))
+    text = plain(certificate_lines(RECORD | {"bound_h1": factor * bound, "energy_bounds": ends}))
     number = r"(-?[\d.]+(?:e[+-]?\d+)?)"
     least = float(re.search(f"at most {number};", text)[1])
     low, high, wide = map(float, re.search(rf"\[{number}, {number}\], {number} %", text).groups())
@@ -63,8 +63,8 @@ def test_what_is_printed_as_certain_is_certain(factor, bound):
 
 
 def test_the_energy_norm_is_told_where_it_is_another_one():
-    assert "norm of the energy" not in plain(certified(RECORD))
-    told = plain(certified(RECORD | {"bound_energy_norm": 0.98765432}))
+    assert "norm of the energy" not in plain(certificate_lines(RECORD))
+    told = plain(certificate_lines(RECORD | {"bound_energy_norm": 0.98765432}))
     assert "; in the norm of the energy it is at most 0.988; J(u)" in told
 
 
@@ -85,13 +85,13 @@ def test_some_levels_have_a_bound_and_others_none(exact):
 
 def test_no_bound_no_figures():
     record = RECORD | {"bound_h1": None, "bound_reason": "no flux"}
-    assert certified(record) == ["no bound of the error: no flux"]
+    assert certificate_lines(record) == ["no bound of the error: no flux"]
 
 
 @pytest.mark.parametrize("lower, upper", [(0.24871234, 0.25131234), (0.0, 3.1), (0.25, 0.25)])
 def test_the_force_that_is_printed_is_certain(lower, upper):
     bounds = {"lower": lower, "upper": upper, "reason": None}
-    text = plain(certified(RECORD | {"contact": {"force_bounds": bounds}}))
+    text = plain(certificate_lines(RECORD | {"contact": {"force_bounds": bounds}}))
     low, high = map(float, re.search(r"the contact force is in \[(.*?), (.*?)\]", text).groups())
     assert low <= lower and upper <= high
     assert high - low <= 1.21 * (upper - lower)
@@ -101,12 +101,12 @@ def test_no_force_but_a_reason():
     bounds = {"lower": None, "upper": None, "reason": "they touch"}
     inflow = {"value": 1.0, "lower": 0.9, "upper": 1.1, "reason": None}
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"inflow": inflow}}
-    text = plain(certified(record))
+    text = plain(certificate_lines(record))
     assert "; the contact force has no bounds: they touch; inflow is in [0.90, 1.10]" in text
 
 
 def test_what_is_certain_is_a_line_each():
-    assert [line.split()[0] for line in certified(RECORD)] == [
+    assert [line.split()[0] for line in certificate_lines(RECORD)] == [
         *("certified:", "‖∇_h(u", "J(u)", "the")
     ]
 
@@ -120,7 +120,7 @@ def test_one_step_is_one():
         ([some, none], "1 of 2 steps has", "1 step", "4 s for 2 steps, 2 s a step"),
         ([none, none], "2 of 2 steps have", "2 steps", "4 s for 2 steps, 2 s a step"),
     ):
-        assert series.certified(records) == f"{bound} no bound of the error"
+        assert series.certificate_line(records) == f"{bound} no bound of the error"
         (said,) = series.over_time(records, Units())
         assert said == f"m has no bounds in {means}: they touch"
         assert plain(series.times(records)) == time
@@ -135,7 +135,7 @@ def test_the_contact_force_under_another_name_is_told_once(change, once):
     bounds = {"lower": 0.9, "upper": 1.1, "reason": None}
     push = {"kind": "force", "weighted": False, "value": 1.0, **bounds, **change}
     record = RECORD | {"contact": {"force_bounds": bounds}, "quantities": {"push": push}}
-    lines = [plain(line) for line in certified(record)]
+    lines = [plain(line) for line in certificate_lines(record)]
     told = "the contact force is in [0.90, 1.10], 20 % wide"
     assert lines[3] == (f"{told} (this is push)" if once else told)
     assert lines[-1].startswith("push is in ") is not once
@@ -215,7 +215,7 @@ def test_a_table_has_the_columns_that_its_first_row_has():
 
 
 def test_nothing_breaks_between_a_number_and_its_unit():
-    text = "".join(certified(RECORD, Units(force="N")))
+    text = "".join(certificate_lines(RECORD, Units(force="N")))
     assert "\u00a0% wide" in text and ",\u00a0-2.68" in text
 
 
@@ -223,7 +223,7 @@ def test_units_stand_where_their_figures_are():
     units = Units(x="mm", force="N/mm")
     bounds = {"lower": 0.9, "upper": 1.1, "reason": None}
     record = RECORD | {"contact": {"active": 2, "length": 1.0, "force_bounds": bounds}}
-    bare, told = plain(certified(record)), plain(certified(record, units))
+    bare, told = plain(certificate_lines(record)), plain(certificate_lines(record, units))
     assert told == bare.replace("1.10],", "1.10] N/mm,") != bare
     entries = dict(entry.split(": ") for entry in plain(legend(record, units)).split("; "))
     assert {name for name in entries if entries[name].endswith(" in mm")} == {"h", "contact"}
