@@ -23,7 +23,6 @@ import numpy as np
 from study import Study, canvas, levels_wanted, name_curves
 
 from signorini_cr import Polygon, Problem, exact, plots, solve_adaptive, solve_levels
-from signorini_cr.output.errorplot import plot_error
 from signorini_cr.output.report import level_record, table_header, table_row
 from signorini_cr.rounding import at_most
 
@@ -92,7 +91,7 @@ for name, solution in finest.items():
     study.show(f"{file}-solution.png", f"{name}: the solution.")
     plots.plot_mesh(small[name].domain, study.folder / f"{file}-mesh.png", name)
     study.show(f"{file}-mesh.png", f"{name}: a mesh that adapted.")
-    plot_error(small[name], study.folder / f"{file}-error.png", name)
+    plots.plot_error(small[name], study.folder / f"{file}-error.png", name)
     study.show(f"{file}-error.png", f"{name}: where the error sits.")
 
 

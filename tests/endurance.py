@@ -24,8 +24,7 @@ import ufl
 from mpi4py import MPI
 
 from signorini_cr import Polygon, Problem, solve_adaptive, solve_levels
-from signorini_cr.output.errorplot import plot_error
-from signorini_cr.output.plots import plot_contact, plot_mesh, plot_solution
+from signorini_cr.output.plots import plot_contact, plot_error, plot_mesh, plot_solution
 from signorini_cr.output.report import level_record, make_report, write_output
 
 WORLD = MPI.COMM_WORLD

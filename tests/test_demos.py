@@ -19,8 +19,7 @@ from helpers import DEMOS, command, is_picture, script, start, tagged
 from mpi4py import MPI
 
 import signorini_cr
-from signorini_cr import InputError, exact, solve, solve_adaptive
-from signorini_cr.output.errorplot import plot_error
+from signorini_cr import exact, solve_adaptive
 
 pytestmark = pytest.mark.slow
 
@@ -208,14 +207,6 @@ def test_a_demo_starts_as_its_users_start_it(tmp_path):
     told = " ".join(done.stdout.split())
     assert told.endswith("demo_seepage.md and, beside it, seepage.png, seepage-heads.png")
     assert is_picture(tmp_path / "seepage.png")
-
-
-def test_picture_of_the_error(shared_tmp_path):
-    domain = exact.S1.structured(6)
-    plot_error(solve(exact.S1.problem, domain), shared_tmp_path / "error.png", "S1")
-    assert is_picture(shared_tmp_path / "error.png")
-    with pytest.raises(InputError, match="no bound to draw"):
-        plot_error(solve(exact.S1.problem, domain, "P1"), shared_tmp_path / "none.png")
 
 
 @pytest.mark.serial

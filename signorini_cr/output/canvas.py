@@ -22,6 +22,7 @@ from .units import PLAIN, Units, literal
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import XAxis, YAxis
+    from matplotlib.collections import PolyCollection
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.transforms import Transform
@@ -145,11 +146,13 @@ def draw_lines(axes: Axes, segments: FloatArray | Sequence[FloatArray], **style:
     axes.add_collection(LineCollection(list(segments), **style), autolim=False)
 
 
-def draw_cells(axes: Axes, corners: FloatArray, **style: Any) -> None:
+def draw_cells(axes: Axes, corners: FloatArray, **style: Any) -> PolyCollection:
     """Fill triangles given by their corners, shape (n, 3, 2), beneath everything else."""
     from matplotlib.collections import PolyCollection
 
-    axes.add_collection(PolyCollection(list(corners), zorder=0, **style), autolim=False)
+    cells = PolyCollection(list(corners), zorder=0, **style)
+    axes.add_collection(cells, autolim=False)
+    return cells
 
 
 def contour_heights(limits: tuple[float, float]) -> FloatArray:

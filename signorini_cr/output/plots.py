@@ -22,9 +22,11 @@ from mpi4py import MPI
 from ..arrays import FloatArray
 from ..compat import cell_nodes
 from ..errors import InputError, on_root
+from ..fem.layout import Layout
 from ..fem.space import closure_dofs, facet_measures
 from ..mesh.domain import CONTACT, DIRICHLET, NEUMANN, PARTS, Domain, named
-from ..multigrid.parents import Layout
+from ..mesh.plane import cross
+from ..rounding import at_most
 from .canvas import (
     BLUE,
     GREY,
@@ -269,6 +271,66 @@ def plot_contact(
         return figure
 
     return drawn(comm, draw)
+
+
+def plot_error(
+    solution: Solution, path: Where | None = None, title: str = "", ax: Axes | None = None
+) -> Figure | SubFigure | None:
+    """Draw where the error sits: the cells' shares of the certified bound, as densities.
+
+    The density of a cell is the root of its share of the bound's square over its area: adaptive
+    refinement makes it even where the solution is smooth. Its unit is that of ∇u.
+
+    Args:
+        solution: On a plane domain.
+        path: The PNG to write, if any.
+        title: What the picture is of, say the problem's name.
+        ax: Axes to draw on, on rank 0.
+
+    Raises:
+        InputError: The domain is not plane, there is no bound, or the file can't be written.
+    """
+    domain, mesh, certificate = solution.domain, plane(solution.domain), solution.certificate
+    if certificate.bound_h1 is None or certificate.indicators is None:
+        raise InputError(f"there is no bound to draw: {certificate.reason}")
+    bound, number = at_most(certificate.bound_h1), len(certificate.indicators)
+    corners = mesh.geometry.x[cell_nodes(mesh)[:number, :3], :2]
+    area = 0.5 * np.abs(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    density = np.sqrt(np.maximum(certificate.indicators, 0.0) / area)
+    triangles, values = _gather(mesh.comm, corners), _gather(mesh.comm, density)
+    boundary = np.concatenate([_segments(domain, part) for part in domain.parts.values()])
+    touching, _ = contact_lines(solution.contact)
+
+    def draw() -> Figure | SubFigure:
+        from matplotlib.colors import LogNorm
+
+        figure, axes, width = plane_axes(boundary.reshape(-1, 2), room=1.5, ax=ax)
+        # A corner has few cells of very high density: they must not take all colours
+        bottom, top = np.quantile(np.maximum(values, 1e-300), (0.005, 0.995))
+        cells = draw_cells(
+            axes,
+            triangles,
+            array=np.clip(values, bottom, top),
+            norm=LogNorm(bottom, max(top, 1.0001 * bottom)),
+            edgecolors="white" if len(values) < 10_000 else "face",
+            linewidths=np.clip(15 / np.sqrt(len(values)), 0.1, 0.5),
+            rasterized=True,
+        )
+        draw_lines(axes, chains(boundary), color="black", linewidth=1.5, joinstyle="round")
+        if len(touching):
+            draw_lines(axes, chains(touching), color=RED, linewidth=4.5, zorder=3, label="contact")
+            legend(figure, ncols=1, ax=ax)
+        beside = axes.inset_axes((1.0 + 0.15 / width, 0.0, 0.25 / width, 1.0))
+        bar = figure.colorbar(cells, cax=beside)
+        log_ticks(bar.ax.yaxis)
+        bar.set_label(r"$|\nabla(u-u_h)|$ by a cell's share of the bound", fontsize=12)
+        known = f"where the error sits, at most {bound} in all"
+        axes.set_title(headline(title, known), fontsize=14)
+        fit(ax, bar.ax)
+        save(figure, path)
+        return figure
+
+    return drawn(mesh.comm, draw)
 
 
 def convergence_series(records: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -12,11 +12,11 @@ from mpi4py import MPI
 from ..arrays import FloatArray, Int64Array
 from ..compat import cell_nodes
 from ..errors import InputError
+from ..fem.layout import Layout
 from ..fem.space import function_space, vertex_values
 from ..mesh.domain import Domain
-from ..multigrid.parents import Layout
 
-AT_ONCE = 2**20
+AT_ONCE = 2**16
 """Pairs of a pixel and a cell near it that are looked at in one go."""
 
 EDGE = 1e-9

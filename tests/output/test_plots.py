@@ -11,7 +11,7 @@ from dolfinx.mesh import (
     exterior_facet_indices,
     meshtags,
 )
-from helpers import SQUARE, rectangle
+from helpers import SQUARE, is_picture, rectangle
 from mpi4py import MPI
 
 from signorini_cr import (
@@ -23,6 +23,7 @@ from signorini_cr import (
     Polygon,
     Problem,
     Robin,
+    exact,
     plots,
     solve,
 )
@@ -274,6 +275,29 @@ def test_convergence_draws_what_there_is(tmp_path):
         assert plots.convergence_series(nothing) == []
         with pytest.raises(InputError, match="two levels"):
             plots.plot_convergence(nothing, path)
+
+
+def test_the_error_is_where_the_cells_shares_are(shared_tmp_path):
+    """Squares of the colours' values, times the areas, sum up to the bound's square."""
+    path = shared_tmp_path / "error.png"
+    solution = solve(exact.S1.problem, exact.S1.structured(6))
+    figure = plots.plot_error(solution, path, "S1")
+    assert is_picture(path)
+    assert (figure is None) == (WORLD.rank > 0)
+    if figure is None:
+        return
+    (cells, *_) = figure.axes[0].collections
+    x, y = np.stack([path.vertices[:3] for path in cells.get_paths()]).transpose(2, 1, 0)
+    area = 0.5 * np.abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
+    assert len(area) == 2 * 12 * 6 and np.isclose(area.sum(), 2.0)
+    # but for the two cells of 144 whose colours are cut off
+    total = np.sum(np.asarray(cells.get_array()) ** 2 * area)
+    assert np.isclose(total, solution.certificate.bound_h1**2, rtol=0.02)
+
+
+def test_no_picture_of_an_error_without_a_bound():
+    with pytest.raises(InputError, match="no bound to draw"):
+        plots.plot_error(solve(exact.S1.problem, exact.S1.structured(2), "P1"))
 
 
 def test_what_can_not_be_drawn_is_told_on_all_ranks(shared_tmp_path):
