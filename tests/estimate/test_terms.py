@@ -466,7 +466,7 @@ def test_how_the_bound_is_put_together(kappa, monkeypatch):
     share = 1.0 if WORLD.rank == 0 else 0.0
     made_up = {
         "unbalanced": left_over,
-        "balance": 0.0,
+        "rebalance": 0.0,
         "_rounding": rounding,
         "_hidden": (hidden, hidden_energy),
         "_lifted": tuple(share * one for one in (lift, lift_energy, lift_far, lift_near)),
