@@ -70,6 +70,7 @@ class Grid:
         operator: Its matrix, with the identity in the rows and columns of the dofs on Γ0.
         dofs: Its dofs.
         dirichlet: Its owned dofs on Γ0, local numbers.
+        solver: What solves on it, or nearly so.
         transfer: What writes functions of the next coarser space in this one, None at the bottom.
         left_out: Owned dofs that are left out at present: those on Γ0, and the constrained ones.
     """
@@ -79,31 +80,52 @@ class Grid:
         operator: ConstrainedMatrix,
         dofs: Layout,
         dirichlet: Int32Array,
+        solver: Bottom | TwoGrids | Whole,
         transfer: Transfer | None = None,
-        sweeps: int = SWEEPS,
-        alone: bool = False,
-        whole: bool = False,
     ):
-        """Prepare a space for the cycle; collective.
+        """Take a space into the cycle, by what solves on it; see `at_bottom` and `above`."""
+        self.operator, self.dofs, self.dirichlet = operator, dofs, dirichlet
+        self.solver, self.transfer, self.left_out = solver, transfer, dirichlet
+
+    @classmethod
+    def at_bottom(
+        cls,
+        operator: ConstrainedMatrix,
+        dofs: Layout,
+        dirichlet: Int32Array,
+        alone: bool = False,
+    ) -> Grid:
+        """Prepare a space that has no coarser one below it; collective.
 
         Args:
             operator: Its matrix, the identity in the rows and columns of the dofs on Γ0.
             dofs: Its dofs.
             dirichlet: Its owned dofs on Γ0, local numbers.
-            transfer: What writes functions of the next coarser space in this one, if there is one.
-            sweeps: Number of sweeps of the smoother before and after.
             alone: Whether this takes the place of a chain.
-            whole: Whether it does so from the beginning, by `Whole`.
         """
-        self.operator, self.dofs, self.dirichlet = operator, dofs, dirichlet
-        self.transfer, self._sweeps, self.left_out = transfer, sweeps, dirichlet
-        self.solver: Bottom | TwoGrids | Whole
-        if whole:
-            self.solver = Whole(self.matrix, operator.dofs)
-        elif transfer is None:
-            self.solver = Bottom(self.matrix, dofs.cells.shape[1] - 1, alone)
-        else:
-            self.solver = TwoGrids(self.matrix, dofs, transfer, sweeps)
+        solver = Bottom(operator.matrix, dofs.cells.shape[1] - 1, alone)
+        return cls(operator, dofs, dirichlet, solver)
+
+    @classmethod
+    def above(
+        cls,
+        operator: ConstrainedMatrix,
+        dofs: Layout,
+        dirichlet: Int32Array,
+        transfer: Transfer,
+        sweeps: int = SWEEPS,
+    ) -> Grid:
+        """Prepare a space above a coarser one; collective.
+
+        Args:
+            operator: As for `at_bottom`.
+            dofs: Its dofs.
+            dirichlet: Its owned dofs on Γ0, local numbers.
+            transfer: What writes functions of the coarser space in this one.
+            sweeps: Number of sweeps of the smoother before and after.
+        """
+        solver = TwoGrids(operator.matrix, dofs, transfer, sweeps)
+        return cls(operator, dofs, dirichlet, solver, transfer)
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -152,7 +174,9 @@ class Grid:
     def remade(self, matrix: PETSc.Mat) -> Grid:
         """Make the same space with another matrix; the transfer is shared, nothing else is."""
         operator = ConstrainedMatrix(matrix, self.operator.dofs)
-        return Grid(operator, self.dofs, self.dirichlet, self.transfer, self._sweeps)
+        if self.transfer is None:
+            return Grid.at_bottom(operator, self.dofs, self.dirichlet)
+        return Grid.above(operator, self.dofs, self.dirichlet, self.transfer)
 
 
 class TwoGrids:
@@ -244,7 +268,7 @@ class Multigrid:
         Not in a block of `constrained`, which the replacement would know nothing of; collective.
         """
         fine = self.finest
-        self._replacement = Grid(fine.operator, fine.dofs, fine.dirichlet, alone=True)
+        self._replacement = Grid.at_bottom(fine.operator, fine.dofs, fine.dirichlet, alone=True)
         self.grids, self.given_up = [self._replacement], True
 
     @contextmanager

@@ -176,32 +176,32 @@ class Hierarchy:
         if again and suits_whole(
             operator.matrix, mesh.domain.mesh.topology.dim, len(operator.dofs)
         ):
-            grid = Grid(operator, dofs, dirichlet, whole=True)
-            if isinstance(grid.solver, Whole) and grid.solver.is_accurate():
-                return grid
-            _free(grid)
+            whole = Whole(operator.matrix, operator.dofs)
+            if whole.is_accurate():
+                return Grid(operator, dofs, dirichlet, whole)
+            whole.free()
         if self._given_up or not (dofs.cr or mesh.parents):
-            return Grid(operator, dofs, dirichlet, alone=self._given_up)
+            return Grid.at_bottom(operator, dofs, dirichlet, self._given_up)
         while len(self._chain) < max(len(self.meshes) - 1, 1):
             self._add_conforming(self.meshes[len(self._chain)])
         below = self._chain[-1]
         if mesh.parents is None:
-            return Grid(operator, dofs, dirichlet, inclusion(below.dofs, dofs))
+            return Grid.above(operator, dofs, dirichlet, inclusion(below.dofs, dofs))
         transfer = prolongation(below.dofs, dofs, mesh.parents)
         if not (mesh.physics.galerkin or is_galerkin_product(below, operator.matrix, transfer)):
             self._remake_chain(operator.matrix, transfer)
         sweeps = LONG_SWEEPS if dofs.cr else SWEEPS
-        return Grid(operator, dofs, dirichlet, transfer, sweeps)
+        return Grid.above(operator, dofs, dirichlet, transfer, sweeps)
 
     def _add_conforming(self, mesh: NestedMesh) -> None:
         """Add P1 on the mesh that is the next finer one to the chain."""
         operator, dofs, dirichlet = conforming(mesh)
         self._operators.append(operator)
         if mesh.parents is None:
-            self._chain.append(Grid(operator, dofs, dirichlet))
+            self._chain.append(Grid.at_bottom(operator, dofs, dirichlet))
         else:
             transfer = prolongation(self._chain[-1].dofs, dofs, mesh.parents)
-            self._chain.append(Grid(operator, dofs, dirichlet, transfer))
+            self._chain.append(Grid.above(operator, dofs, dirichlet, transfer))
 
     @defaults(MATRICES, prefix="")
     def _remake_chain(self, finer: PETSc.Mat, transfer: Transfer) -> None:

@@ -88,7 +88,7 @@ def grid(dirichlet=(0, 19), scale=1.0):
     matrix.scale(scale)
     operator = ConstrainedMatrix(matrix, np.array([4, 8, 11], np.int32))
     dofs = SimpleNamespace(cells=np.zeros((0, 3), np.int32))
-    return Grid(operator, dofs, np.array(dirichlet, np.int32))
+    return Grid.at_bottom(operator, dofs, np.array(dirichlet, np.int32))
 
 
 def test_rounding_of_a_grid():

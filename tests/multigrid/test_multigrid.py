@@ -322,7 +322,7 @@ def test_the_same_solution_as_a_direct_solver(
     options("pc_type", "lu")
     options("pc_factor_mat_solver_type", "mumps")
     monkeypatch.setattr(solver, "TOLERANCE", 1e-13)
-    grid = Grid(system.operator, Layout.of_space(V), system.owned_dirichlet)
+    grid = Grid.at_bottom(system.operator, Layout.of_space(V), system.owned_dirichlet)
     with system.vectors(u, r) as vectors:
         cold = solve_vi(Multigrid([grid]), vectors, system.residual_scale)
     assert cold.newton > 1
@@ -561,9 +561,9 @@ def test_a_coefficient_that_jumps_inside_coarse_cells(element, jump, options):
         transfer = prolongation(layout, Layout.of_space(level.V), level.parents)
         assert is_galerkin_product(cycle.grids[1], level.system.A, transfer)
     if element == "P1":
-        own = Grid(below.system.operator, layout, below.system.owned_dirichlet)
+        own = Grid.at_bottom(below.system.operator, layout, below.system.owned_dirichlet)
     else:
-        own = Grid(*conforming(below.meshes[-1]))
+        own = Grid.at_bottom(*conforming(below.meshes[-1]))
     assert not is_galerkin_product(own, level.system.A, transfer)
 
     options("pc_type", AMG)
