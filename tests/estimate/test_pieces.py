@@ -650,6 +650,13 @@ def test_rounding():
     expected = of_hats * np.abs(heights[cells.facets]).max(axis=0) ** 2 / kappa.bounds.low
     found = certificate._rounding(cells, kappa, np.array(5.0), 0 * w, load, fluxes)
     assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
+    # lengths measured by a tensor's inverse lose as many digits as its eigenvalues lie apart
+    cells.stretch = np.ones(1)
+    low, high = rng.uniform(1, 2, cells.number), rng.uniform(2, 9, cells.number)
+    kappa.eigenvalues = SimpleNamespace(low=low, high=high)
+    found = certificate._rounding(cells, kappa, np.array(5.0), 0 * w, load, fluxes)
+    expected = expected * (high / low) ** 2
+    assert np.isclose(found, 64 * 2.0**-52 * np.sqrt(expected.sum()), atol=0.0)
 
 
 def test_size_of_the_bound():

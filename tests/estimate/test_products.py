@@ -1234,6 +1234,31 @@ def test_what_contact_carries(signed, c, sinks):
 
 
 @pytest.mark.serial
+def test_each_facets_force_must_carry_its_share():
+    """What is left of the equation and what quadrature has missed, together, on each for itself."""
+    domain = square(3)
+    cells = Cells(domain, fem.functionspace(domain.mesh, ("CR", 1)), ())
+    rng, side, none = np.random.default_rng(26), cells.sides[1], np.array(0.0)
+    by_facet = np.where(cells.facets == side.dofs[0], 20.0, 1.0).max(axis=0)  # else it has little
+    left, missed = by_facet * rng.uniform(1, 2, cells.number), rng.uniform(0.5, 1, cells.number)
+    kappa = rng.uniform(1, 3, cells.number)
+    y = SimpleNamespace(contact=np.array([99.0, 99.0, 0.0]), touching=np.ones(3, bool))
+    y.unbalanced = left
+    parts = [
+        flux.carried_to_contact(cells, y, amounts, kappa, side, none, signed)
+        for amounts, signed in ((left, True), (missed, False))
+    ]
+    norm, change = (sum(rows) for rows in zip(*parts, strict=True))
+    assert change[:2].min() > 5.0 and change[2] == 0.0
+    of_kappa = SimpleNamespace(eigenvalues=SimpleNamespace(low=kappa))
+    for factors, enough in (((1.01, 1.01), True), ((0.99, 1.01), False), ((1.01, 0.99), False)):
+        y.contact = np.append(factors * change[:2], 0.0)
+        found = certificate._carried_to_contact(cells, of_kappa, none, y, side, missed)
+        assert np.isclose(found, norm if enough else np.inf)
+        assert np.allclose(y.carried, change)
+
+
+@pytest.mark.serial
 def test_what_cells_with_a_reaction_carry():
     """‖κ^{-1/2} q‖ and what c takes up of what arrives; ∞ where nothing takes it."""
     domain = square(3)
