@@ -72,6 +72,7 @@ SPRUNG = Problem(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", ["CR", "P1"])
 def test_another_kind_is_solved_right(element):
     domain = Polygon(SQUARE.vertices, PARTS).mesh(0.25)
@@ -130,6 +131,7 @@ def on_the_square(conditions, size=0.25, **data):
     return Problem(conditions=dict(zip(NAMES, conditions, strict=True)), **data), domain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", ["CR", "P1"])
 @pytest.mark.parametrize("c", [0.0, 30.0])
 def test_all_kinds_at_once_converge_as_theory_says(element, c):
