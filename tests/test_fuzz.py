@@ -255,6 +255,7 @@ def check_ufl(text: str) -> None:
 
 @pytest.mark.serial
 @few
+@example("-((min(x, pi)) ** (1e300))")
 @given(expressions)
 def test_ufl_agrees_with_numpy(text: str) -> None:
     check_ufl(text)

@@ -77,12 +77,20 @@ def _inside(function: Callable[[Any], Any], value: Any) -> Any:
     """Take ``function(value)`` into the branches of a conditional.
 
     Differentiation then stays within a branch: the derivative of ``max(0, x)**1.5`` for x < 0 is 0
-    rather than the 0 times infinity of the chain rule.
+    rather than the 0 times infinity of the chain rule. Where a branch is a number of which there is
+    no function, as in ``sqrt(where(x > 0, x, -1))``, the conditional stays within: that branch may
+    be taken nowhere.
     """
-    if isinstance(value, ufl.classes.Conditional):
-        condition, yes, no = value.ufl_operands
-        return ufl.conditional(condition, _inside(function, yes), _inside(function, no))
-    return function(value)
+    if not isinstance(value, ufl.classes.Conditional):
+        return function(value)
+    condition, *branches = value.ufl_operands
+    try:
+        found = [_inside(function, branch) for branch in branches]
+    except (ArithmeticError, ValueError):  # UFL works it out as Python does
+        return function(value)
+    if any(isinstance(ufl.as_ufl(each), ufl.constantvalue.ComplexValue) for each in found):
+        return function(value)
+    return ufl.conditional(condition, *found)
 
 
 # name: (arguments as the user counts them, NumPy, UFL); None means two or more.

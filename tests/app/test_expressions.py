@@ -31,6 +31,8 @@ GOOD = [
     "where(x > 0, log(x), 0) + where(1 < 2, x, 1/x) + where(2 != 2, 1, y)",
     "where(x >= 0 and 1 > 0, 1, 2) + where(x < 0 or 0 > 1, 1, 2)",
     "0*x + x*0 + 0/(x + 9)",
+    "sqrt(where(x > -5, 3 + x, -1)) + where(x < 9, 3 + x, -1)**0.5 + where(y > -3, 3 + y, 0)**-2",
+    "min(x, pi)**1e300 + sqrt(where(x > -5, where(y < -5, 2, 4 + x), -1))",
 ]
 PYTHON = {name: getattr(math, name) for name in "sqrt exp log sin cos tan sinh cosh tanh".split()}
 PYTHON |= {name: getattr(math, name) for name in "asin acos atan atan2 pi".split()}
@@ -81,6 +83,8 @@ def test_both_readings_agree_with_python(text: str) -> None:
         ("abs(x)**3", "6*abs(x)"),
         ("(x**2 + y**2)**0.75 * cos(1.5*atan2(y, x))", "0"),
         ("where(x > 0, x**6*sin(pi/x)**2, 0)", None),
+        ("sqrt(where(x > -5, 3 + x, -1))", "-0.25*(3 + x)**-1.5"),
+        ("where(x > 9, 0, where(x > 8, y, 3 + x))**-2", "6*(3 + x)**-4"),
     ],
 )
 def test_derivatives_stay_within_the_branches(text: str, laplacian: str | None) -> None:
