@@ -1108,7 +1108,7 @@ def test_contact_term_with_liftings(monkeypatch):
     through = rng.uniform(size=3) * [1, 1, 0]
     more = np.array([0.5, 0.0, 0.0])
     y = SimpleNamespace(contact=through, carried=more)
-    boundary = companion.Boundary(u_D, alpha, 1.0, 1e-3, 1.0)
+    boundary = companion.Prescribed(u_D, alpha, 1.0, 1e-3, 1.0)
     contact, (at, steep, area, edge), reasons = boundary.lifted(cells, y, v, bumps, 0 * bumps)
     side, found = sides[True], lifts[True]
     for i in range(3):
