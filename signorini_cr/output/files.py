@@ -193,7 +193,7 @@ def _clear(folder: Path) -> None:
         os.close(lock)
 
 
-def write_text(path: Path, make: Callable[[], str]) -> None:
+def _write_text(path: Path, make: Callable[[], str]) -> None:
     """Write what `make` returns; called on one rank."""
     with disk_errors(path):
         path.write_text(make(), encoding="utf-8")
@@ -201,7 +201,7 @@ def write_text(path: Path, make: Callable[[], str]) -> None:
 
 def text_writer(comm: MPI.Comm, make: Callable[[], str]) -> Writer:
     """Return what writes the text that `make` returns on rank 0."""
-    return lambda path: on_root(comm, write_text, path, make)
+    return lambda path: on_root(comm, _write_text, path, make)
 
 
 def _nearest(path: Path) -> Path:

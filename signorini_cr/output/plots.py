@@ -495,10 +495,8 @@ def _smooth(solution: Solution, limits: tuple[float, float]) -> tuple[fem.Functi
         high = comm.allreduce(float(middles.max(initial=-np.inf)), op=MPI.MAX)
         if not 0.0 <= high - low <= _SAME * (limits[1] - limits[0]):
             continue
-        there = np.zeros(len(u.x.array))
-        there[closure_dofs(u.function_space, facets)] = 1.0
         values.append(0.5 * (low + high))
-        u.x.array[layout.shared_sum(there) > 0.0] = values[-1]
+        u.x.array[layout.nodes_at(facets)] = values[-1]
     return u, values
 
 

@@ -229,9 +229,4 @@ def _front(solution: Solved) -> BoolArray:
     """Tell whether contact begins or ends at a vertex, for all local ones; collective."""
     contact, p1 = solution.contact, Layout.of_p1(solution.domain.mesh)
     ends = p1.ends(contact.facets)
-    there = np.ones(p1.size[0] + p1.index_map.num_ghosts, dtype=bool)
-    for which in (contact.active, ~contact.active):
-        count = np.zeros(len(there))
-        np.add.at(count, ends[which], 1.0)
-        there &= p1.shared_sum(count) > 0.0
-    return there
+    return p1.named(ends[contact.active]) & p1.named(ends[~contact.active])

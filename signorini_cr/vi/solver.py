@@ -394,7 +394,8 @@ class NewtonTest:
 
     def settle(self, vectors: Vectors, bounds: Bounds) -> None:
         """Go on to twice the digits where double precision is not enough; collective."""
-        assert self._system is not None
+        system = self._system
+        assert system is not None
         extended = Extended(
             self._linear,
             self._cycle.operator,
@@ -402,12 +403,11 @@ class NewtonTest:
             self._stiffness,
             vectors,
             self._masses,
-            self._system.offset,
+            system.offset,
         )
         try:
-            settled = extended.settle(
-                self._system.data_rounding, self._system.bounded_loads, self._slack
-            )
+            loads = system.chi[system.bounded]
+            settled = extended.settle(system.data_rounding, loads, self._slack)
             active = extended.active.dofs
         except NotConverged as failure:
             self.failure = failure.reason

@@ -399,11 +399,6 @@ class System:
         release(pattern, here, around)
         return found
 
-    @property
-    def bounded_loads(self) -> FloatArray:
-        """χ in the bounded dofs, shape (n,)."""
-        return self.chi[self.bounded]
-
     def data_rounded(self) -> float:
         """Bound what rounding of u_D and of the loads may change in b, summed up; collective."""
         owned, fixed = self.A.getLocalSize()[0], self.owned_dirichlet
